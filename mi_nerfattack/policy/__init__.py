@@ -1,0 +1,1 @@
+"""Image-based driving policies: network, adapter, training. Imports torch."""

@@ -1,0 +1,24 @@
+"""Vehicle models, their integration in time, reference paths and the expert."""
+
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
+from mi_nerfattack.vehicle.expert import LaneFollower
+from mi_nerfattack.vehicle.integrators import (
+    RK4,
+    AbstractIntegrator,
+    ExplicitEuler,
+    ImplicitMidpoint,
+)
+from mi_nerfattack.vehicle.route import Route, smooth_absolute
+
+__all__ = [
+    "RK4",
+    "AbstractDynamics",
+    "AbstractIntegrator",
+    "Ackermann",
+    "Dubins",
+    "ExplicitEuler",
+    "ImplicitMidpoint",
+    "LaneFollower",
+    "Route",
+    "smooth_absolute",
+]

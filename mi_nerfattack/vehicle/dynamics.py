@@ -1,0 +1,143 @@
+"""Kinematic vehicle models with a state of position and heading.
+
+A state is a Dr.Jit array of three rows, `(px, py, theta)` in metres and radians,
+theta counter-clockwise from +x; each row holds the n vehicles of a batch. Any
+floating-point type of any backend works (`Array3f`, `Array3f64`, LLVM or CUDA,
+with or without derivatives). A control is one such row, (n,).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from mi_nerfattack.errors import InputError
+
+
+def soft_limit(value: Any, limit: float) -> Any:
+    """Limit a value smoothly: `x / (1 + (x/limit)^8)^(1/8)`.
+
+    The function is odd, strictly increasing, equal to its argument within 0.05 % up
+    to half the limit and to 0.92 of the limit at the limit; its derivative is
+    `(1 + (x/limit)^8)^(-9/8)`, never zero, so that a saturated control can still be
+    moved by a gradient. A hyperbolic tangent would change the gain of a controller
+    by 10 % at half the limit.
+
+    Args:
+        value: Dr.Jit array, any shape, in the unit of `limit`.
+        limit: positive bound that the result approaches.
+
+    Returns:
+        Array of the same shape, between -limit and limit.
+    """
+    ratio = value / limit
+    inside = dr.abs(ratio) < 1
+    # Of the ratio and its inverse the one that is at most 1: nothing overflows.
+    small = dr.select(inside, ratio, 1 / dr.select(inside, 1, ratio))
+    scale = 1 / dr.sqrt(dr.sqrt(dr.sqrt(1 + dr.square(dr.square(dr.square(small))))))
+    return limit * scale * dr.select(inside, ratio, dr.sign(ratio))
+
+
+def require_positive(owner: str, **values: float) -> None:
+    """Raise `InputError` unless every value is finite and greater than zero."""
+    for name, value in values.items():
+        if not 0 < value < float("inf"):
+            raise InputError(f"{owner}.{name}: {value!r} is not a positive number")
+
+
+@dataclass(frozen=True)
+class AbstractDynamics(ABC):
+    """Continuous-time vehicle model `dx/dt = f(x, u)` with a scalar control.
+
+    Write your own by giving `derivative` and `saturate` in Dr.Jit operations; every
+    derivative that the adjoint needs follows from automatic differentiation.
+    """
+
+    @abstractmethod
+    def derivative(self, state: Any, control: Any) -> Any:
+        """Compute the time derivative of the state.
+
+        Args:
+            state: (3, n), metres and radians.
+            control: (n,), within its limits: call `saturate` before.
+
+        Returns:
+            (3, n), metres per second and radians per second.
+        """
+
+    @abstractmethod
+    def saturate(self, control: Any) -> Any:
+        """Limit a commanded control (n,) smoothly to what the vehicle can do."""
+
+
+@dataclass(frozen=True)
+class Dubins(AbstractDynamics):
+    """Vehicle of fixed speed steered by its heading rate.
+
+    `dx/dt = (v cos theta, v sin theta, u)`. Source: appendix A.7.
+
+    Args:
+        speed: v, metres per second.
+        max_heading_rate: limit of |u|, radians per second.
+    """
+
+    speed: float = 5.0
+    max_heading_rate: float = 1.5
+
+    def __post_init__(self) -> None:
+        require_positive(
+            "Dubins", speed=self.speed, max_heading_rate=self.max_heading_rate
+        )
+
+    def derivative(self, state: Any, control: Any) -> Any:
+        """Compute (3, n) from state (3, n) and heading rate (n,) in rad/s."""
+        sin, cos = dr.sincos(state[2])
+        return type(state)(self.speed * cos, self.speed * sin, control)
+
+    def saturate(self, control: Any) -> Any:
+        """Limit the heading rate (n,) with `soft_limit`."""
+        return soft_limit(control, self.max_heading_rate)
+
+
+@dataclass(frozen=True)
+class Ackermann(AbstractDynamics):
+    """Bicycle model of fixed speed steered by the angle of its front wheels.
+
+    `dx/dt = (v cos theta, v sin theta, v/l tan u)`, referred to the rear axle.
+    Source: appendix A.8, with the tangent of the steering angle where the printed
+    equation has that of the heading.
+
+    Args:
+        speed: v, metres per second.
+        wheelbase: l, metres.
+        max_steer: limit of |u|, radians, below pi/2.
+    """
+
+    speed: float = 5.0
+    wheelbase: float = 2.7
+    max_steer: float = 0.6
+
+    def __post_init__(self) -> None:
+        require_positive(
+            "Ackermann",
+            speed=self.speed,
+            wheelbase=self.wheelbase,
+            max_steer=self.max_steer,
+        )
+        if self.max_steer >= dr.pi / 2:
+            raise InputError(
+                f"Ackermann.max_steer: {self.max_steer!r} rad; it must be below pi/2"
+            )
+
+    def derivative(self, state: Any, control: Any) -> Any:
+        """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""
+        sin, cos = dr.sincos(state[2])
+        heading_rate = self.speed / self.wheelbase * dr.tan(control)
+        return type(state)(self.speed * cos, self.speed * sin, heading_rate)
+
+    def saturate(self, control: Any) -> Any:
+        """Limit the steering angle (n,) with `soft_limit`."""
+        return soft_limit(control, self.max_steer)

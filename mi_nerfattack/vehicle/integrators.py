@@ -1,0 +1,207 @@
+"""Time steps of a vehicle model, and the constraint that each step satisfies.
+
+A step solves `G(x_prev, x, u) = 0` for x. The adjoint method (appendix A.9-A.11)
+needs the derivatives of G with respect to all three; `residual` is G, written in
+Dr.Jit operations and therefore differentiable in forward and reverse mode.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import drjit as dr
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+
+
+@dataclass(frozen=True)
+class AbstractIntegrator(ABC):
+    """One-step method with a zero-order hold on the control.
+
+    `explicit` says that `dG/dx` is the identity, in which case the adjoint has no
+    system to solve.
+    """
+
+    explicit: ClassVar[bool]
+
+    @abstractmethod
+    def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
+        """Advance the state by one step.
+
+        Args:
+            dynamics: vehicle model.
+            x: (3, n) state, metres and radians.
+            u: (n,) control held over the step, already saturated.
+            dt: seconds.
+
+        Returns:
+            (3, n) state; derivatives with respect to `x` and `u` are tracked.
+        """
+
+    @abstractmethod
+    def residual(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> Any:
+        """Evaluate G (3, n), in the state's units, zero where `x` is the step."""
+
+
+@dataclass(frozen=True)
+class ExplicitEuler(AbstractIntegrator):
+    """`x + dt f(x, u)`: first order, one evaluation. Cheapest; cuts every arc."""
+
+    explicit: ClassVar[bool] = True
+
+    def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
+        """Advance (3, n) by dt seconds."""
+        return x + dt * dynamics.derivative(x, u)
+
+    def residual(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> Any:
+        """Evaluate `x - step(x_prev)`."""
+        return x - self.step(dynamics, x_prev, u, dt)
+
+
+@dataclass(frozen=True)
+class RK4(AbstractIntegrator):
+    """Classical Runge-Kutta method: fourth order, four evaluations."""
+
+    explicit: ClassVar[bool] = True
+
+    def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
+        """Advance (3, n) by dt seconds."""
+        k1 = dynamics.derivative(x, u)
+        k2 = dynamics.derivative(x + 0.5 * dt * k1, u)
+        k3 = dynamics.derivative(x + 0.5 * dt * k2, u)
+        k4 = dynamics.derivative(x + dt * k3, u)
+        return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def residual(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> Any:
+        """Evaluate `x - step(x_prev)`."""
+        return x - self.step(dynamics, x_prev, u, dt)
+
+
+@dataclass(frozen=True)
+class ImplicitMidpoint(AbstractIntegrator):
+    """`x = x_prev + dt f((x_prev + x)/2, u)`: second order, A-stable, symmetric.
+
+    Newton's method with a fixed number of iterations, recorded as one kernel; the
+    remaining residual is then checked, which waits for the device once a step. Not
+    worth its cost for a Dubins car; meant for stiff models of your own.
+
+    Args:
+        iterations: Newton iterations; the error squares with each.
+    """
+
+    explicit: ClassVar[bool] = False
+    iterations: int = 4
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InputError(
+                f"ImplicitMidpoint.iterations: {self.iterations!r}; at least 1"
+            )
+
+    def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
+        """Advance (3, n) by dt seconds.
+
+        Raises:
+            InputError: Newton's method has not converged to rounding error.
+        """
+        x_prev, control = dr.detach(x), dr.detach(u)
+        x_next = x_prev + dt * dynamics.derivative(x_prev, control)
+        for _ in range(self.iterations):
+            defect = self.residual(dynamics, x_prev, x_next, control, dt)
+            columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
+            x_next -= solve_columns(columns, defect)
+        self._check(dynamics, x_prev, x_next, control, dt)
+        if not dr.grad_enabled(x, u):
+            return x_next
+        # One more iteration with a constant Jacobian: the value stays, and its
+        # derivative is that of the implicit function, -(dG/dx)^-1 dG/d(x_prev, u).
+        columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
+        return x_next - solve_columns(
+            columns, self.residual(dynamics, x, x_next, u, dt)
+        )
+
+    def residual(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> Any:
+        """Evaluate `x - x_prev - dt f((x_prev + x)/2, u)`."""
+        return x - x_prev - dt * dynamics.derivative(0.5 * (x_prev + x), u)
+
+    def _jacobian(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> list[Any]:
+        """Compute the columns of dG/dx = 1 - dt/2 df/dx at the midpoint."""
+        midpoint = 0.5 * (x_prev + x)
+        identity = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
+        slopes = state_jacobian(dynamics, midpoint, u)
+        return [
+            type(x)(*unit) - 0.5 * dt * slope
+            for unit, slope in zip(identity, slopes, strict=True)
+        ]
+
+    def _check(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> None:
+        """Raise `InputError` unless the residual is a rounding error."""
+        scale = 1 + dr.max(dr.abs(x_prev)) + dr.max(dr.abs(x))
+        epsilon = dr.epsilon(dr.value_t(type(x)))
+        defect = dr.max(dr.abs(self.residual(dynamics, x_prev, x, u, dt)))
+        if dr.all(defect <= 32 * epsilon * scale):  # false for NaN, too
+            return
+        worst = dr.max(defect)[0]
+        raise InputError(
+            f"ImplicitMidpoint: residual {worst:.3g} after {self.iterations} Newton "
+            f"iterations at dt = {dt!r} s; take a smaller dt or more iterations"
+        )
+
+
+def state_jacobian(dynamics: AbstractDynamics, state: Any, control: Any) -> list[Any]:
+    """Compute df/dx by forward-mode differentiation.
+
+    Args:
+        dynamics: vehicle model.
+        state: (3, n); control: (n,). Both are treated as constants.
+
+    Returns:
+        Three columns, each (3, n): column j is df/dx_j, detached.
+    """
+    columns = []
+    for row in range(3):
+        with dr.resume_grad():
+            probe = type(state)(dr.detach(state))
+            dr.enable_grad(probe[row])
+            slope = dynamics.derivative(probe, dr.detach(control))
+            dr.set_grad(probe[row], 1)
+            columns.append(dr.detach(dr.forward_to(slope)))
+    return columns
+
+
+def solve_columns(columns: list[Any], right: Any) -> Any:
+    """Solve a batch of 3x3 systems given by columns, by Cramer's rule.
+
+    Args:
+        columns: three (3, n) columns of a matrix that is not near singular.
+        right: (3, n).
+
+    Returns:
+        (3, n); differentiable in all arguments.
+    """
+    first, second, third = columns
+    normal = dr.cross(second, third)
+    determinant = dr.dot(first, normal)
+    return (
+        type(right)(
+            dr.dot(right, normal),
+            dr.dot(first, dr.cross(right, third)),
+            dr.dot(first, dr.cross(second, right)),
+        )
+        / determinant
+    )
