@@ -1,0 +1,101 @@
+"""The command line: arguments, exit codes and messages, no logic.
+
+Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+import tyro
+
+import mi_nerfattack
+from mi_nerfattack.commands import COMMANDS
+from mi_nerfattack.errors import NerfAttackError
+
+PROG = "mi-nerfattack"
+EXIT_INPUT = 2
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+
+_DESCRIPTION = (
+    "Find, measure and repair failures of image-based driving policies.\n\n"
+    "--debug, anywhere, shows the traceback of an error; --version prints the version."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one sub-command and return the exit code.
+
+    Args:
+        argv: the arguments without the program's name; None takes the process's.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    arguments = [item for item in arguments if item != "--debug"]
+    try:
+        with _terminate_as_interrupt():
+            code = _run(arguments)
+            sys.stdout.flush()
+            return code
+    except NerfAttackError as err:
+        return _fail(f"error: {err}", EXIT_INPUT, debug)
+    except KeyboardInterrupt:
+        return _fail("interrupted", EXIT_INTERRUPTED, debug)
+    except BrokenPipeError:
+        # the interpreter flushes once more at its end; let that go nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments == ["--version"]:
+        print(f"{PROG} {mi_nerfattack.__version__}")
+        return 0
+    try:
+        command = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog=PROG,
+            description=_DESCRIPTION,
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except SystemExit as stop:  # help printed, or wrong usage reported
+        return stop.code if isinstance(stop.code, int) else EXIT_INPUT
+    return command.run()
+
+
+def _fail(message: str, code: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    print(f"{PROG}: {message}", file=sys.stderr)
+    return code
+
+
+@contextmanager
+def _terminate_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt, in the main thread alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())
