@@ -1,0 +1,1 @@
+"""What a run leaves behind: metrics, tables, EXR frames, plots and a page."""

@@ -1,0 +1,327 @@
+"""Cross-track metrics of closed-loop drives and the document `metrics.json`.
+
+The error is measured from the lane centre, positive to the left of the direction of
+travel. A step departs when its distance exceeds half a lane width less half a car
+width: the car then touches the lane's edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pydantic
+import scipy.stats
+
+from mi_nerfattack.errors import InputError
+
+SCHEMA = 1
+ENVIRONMENTS = ("surrogate", "deployment")
+CASES = ("unperturbed", "random", "gradient")
+BOOTSTRAP_RESAMPLES = 9999
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One closed-loop drive of T >= 1 steps; its arrays are read-only float64 copies.
+
+    Args:
+        environment: "surrogate" or "deployment".
+        route: name of the reference route.
+        case: "unperturbed", "random" or "gradient".
+        run: index among the drives of one route, environment and case, from 0.
+        seed: seed of this drive.
+        states: (T+1, 3), x and y in metres and heading in radians, initial state
+            included.
+        controls: (T,), the control that led from state t to state t+1.
+        cross_track_m: (T,), signed cross-track error of `states[1:]`, metres.
+        time_s: (T,), time of `states[1:]`, seconds, increasing.
+
+    Raises:
+        InputError: for an unknown name, a wrong shape or a value that is not finite.
+    """
+
+    environment: str
+    route: str
+    case: str
+    run: int
+    seed: int
+    states: np.ndarray
+    controls: np.ndarray
+    cross_track_m: np.ndarray
+    time_s: np.ndarray
+
+    def __post_init__(self) -> None:
+        _check_choice("environment", self.environment, ENVIRONMENTS)
+        _check_choice("case", self.case, CASES)
+        if not isinstance(self.route, str) or not self.route:
+            raise InputError(f"Drive.route: {self.route!r}; a non-empty name is needed")
+        for name in ("run", "seed"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise InputError(f"Drive.{name}: {value!r}; an integer is needed")
+            if value < 0:
+                raise InputError(f"Drive.{name}: {value}; must not be negative")
+            object.__setattr__(self, name, int(value))
+        steps = np.shape(self.controls)[0] if np.ndim(self.controls) else 0
+        if steps < 1:
+            raise InputError("Drive.controls: no step; a drive has at least one")
+        self._freeze("states", (steps + 1, 3))
+        for name in ("controls", "cross_track_m", "time_s"):
+            self._freeze(name, (steps,))
+        if np.any(np.diff(self.time_s) <= 0):
+            raise InputError("Drive.time_s: not increasing; give seconds step by step")
+
+    def _freeze(self, name: str, shape: tuple[int, ...]) -> None:
+        array = np.array(getattr(self, name), dtype=np.float64)
+        if array.shape != shape:
+            raise InputError(f"Drive.{name}: shape {array.shape}; must be {shape}")
+        if not np.all(np.isfinite(array)):
+            step = np.argwhere(~np.isfinite(array))[0][0]
+            raise InputError(
+                f"Drive.{name}: value at index {step} is not finite; the drive diverged"
+            )
+        array.flags.writeable = False
+        object.__setattr__(self, name, array)
+
+    @property
+    def distance_m(self) -> np.ndarray:
+        """Return the distance from the lane centre at each step, (T,), metres."""
+        return np.abs(self.cross_track_m)
+
+    def departed(self, limit: float) -> np.ndarray:
+        """Return a boolean per step, (T,): whether the distance exceeds the limit."""
+        return self.distance_m > limit
+
+
+def departure_limit(lane_width_m: float, car_width_m: float) -> float:
+    """Return the distance from the lane centre beyond which a step departs.
+
+    Half a lane width less half a car width, metres.
+
+    Raises:
+        InputError: unless 0 < car_width_m < lane_width_m, both finite.
+    """
+    if not 0 < car_width_m < lane_width_m < float("inf"):
+        raise InputError(
+            f"car_width_m, lane_width_m: {car_width_m!r}, {lane_width_m!r}; both must "
+            "be positive metres and the car narrower than the lane"
+        )
+    return (lane_width_m - car_width_m) / 2
+
+
+def summarise(
+    drives: Iterable[Drive], limits: Mapping[str, float], seed: int = 0
+) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+    """Summarise drives by route, environment and case.
+
+    The figures of one case of n runs, |e| being the distance from the lane centre:
+
+    - `n`: number of runs;
+    - `cross_track_mean_m`: mean of |e| over all steps of all runs;
+    - `cross_track_mean_ci95_m`: 95 % percentile bootstrap interval of the mean over
+      runs of each run's mean of |e|; null for a single run, which has no spread;
+    - `cross_track_mean_worst_run_m`: largest of the runs' means;
+    - `cross_track_max_m`: largest |e| of any step;
+    - `cross_track_total`: plain sum of |e| over the steps of a run (unit: metre-steps,
+      so it grows when the time step shrinks), averaged over the runs;
+    - `departures`: number of steps beyond the limit, summed over the runs;
+    - `runs_departed`: number of runs with at least one such step;
+    - `per_run`: the figures of each run, ordered by its index.
+
+    Args:
+        drives: in any order; lengths may differ.
+        limits: departure limit of each route, metres.
+        seed: seed of the bootstrap.
+
+    Returns:
+        {route: {environment: {case: figures}}} of plain Python values.
+
+    Raises:
+        InputError: for the same run twice, or a route without a limit.
+    """
+    groups: dict[tuple[str, str, str], dict[int, Drive]] = {}
+    for drive in drives:
+        key = (drive.route, drive.environment, drive.case)
+        runs = groups.setdefault(key, {})
+        if drive.run in runs:
+            raise InputError(f"{' / '.join(key)}: run {drive.run} twice; number runs")
+        runs[drive.run] = drive
+    result: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
+    for route, environment, case in sorted(groups, key=_order):
+        runs = groups[route, environment, case]
+        ordered = [runs[index] for index in sorted(runs)]
+        figures = _case_figures(ordered, limit_of(route, limits), seed)
+        result.setdefault(route, {}).setdefault(environment, {})[case] = figures
+    return result
+
+
+def metrics_document(
+    scenario: Mapping[str, Any],
+    seed: int,
+    drives: Iterable[Drive],
+    limits: Mapping[str, float],
+    cost: Mapping[str, float],
+) -> dict[str, Any]:
+    """Build the validated content of `metrics.json`.
+
+    Args:
+        scenario: the scenario as run, in JSON types.
+        seed: the run's seed; also that of the bootstrap.
+        drives: all drives of the run, at least one.
+        limits: departure limit of each route, metres.
+        cost: `wall_s`, `peak_memory_mb` and `renders`; more keys are kept.
+
+    Returns:
+        A document for `files.write_json`.
+    """
+    routes = summarise(drives, limits, seed)
+    document = {
+        "schema": SCHEMA,
+        "scenario": dict(scenario),
+        "seed": seed,
+        "departure_limits_m": {route: limit_of(route, limits) for route in routes},
+        "routes": routes,
+        "cost": dict(cost),
+    }
+    validate(document)
+    return document
+
+
+def limit_of(route: str, limits: Mapping[str, float]) -> float:
+    """Return a route's departure limit; InputError if it has none or it is not > 0."""
+    if route not in limits:
+        known = ", ".join(sorted(limits)) or "none"
+        raise InputError(f"limits: no limit for route {route!r}; given: {known}")
+    limit = float(limits[route])
+    if not 0 < limit < float("inf"):
+        raise InputError(f"limits.{route}: {limit!r}; must be positive metres")
+    return limit
+
+
+def validate(document: Any) -> None:
+    """Check a metrics document against schema 1.
+
+    Raises:
+        InputError: naming the first key that is missing, of a wrong type, negative or
+            not finite, or a case whose `n` is not its number of runs.
+    """
+    try:
+        _Document.model_validate(document)
+    except pydantic.ValidationError as err:
+        first = err.errors()[0]
+        place = ".".join(["metrics", *map(str, first["loc"])])
+        value = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
+        raise InputError(f"{place}: {first['msg']}{value}; see schema 1") from err
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+
+
+class _Run(_Model):
+    run: pydantic.NonNegativeInt
+    seed: pydantic.NonNegativeInt
+    cross_track_mean_m: pydantic.NonNegativeFloat
+    cross_track_max_m: pydantic.NonNegativeFloat
+    cross_track_total: pydantic.NonNegativeFloat
+    departures: pydantic.NonNegativeInt
+
+
+class _Case(_Model):
+    n: pydantic.PositiveInt
+    cross_track_mean_m: pydantic.NonNegativeFloat
+    cross_track_max_m: pydantic.NonNegativeFloat
+    cross_track_total: pydantic.NonNegativeFloat
+    departures: pydantic.NonNegativeInt
+    per_run: list[_Run]
+
+    @pydantic.model_validator(mode="after")
+    def _count_runs(self) -> _Case:
+        if self.n != len(self.per_run):
+            raise ValueError(f"n is {self.n} but per_run has {len(self.per_run)} runs")
+        return self
+
+
+class _Cost(_Model):
+    wall_s: pydantic.NonNegativeFloat
+    peak_memory_mb: pydantic.NonNegativeFloat
+    renders: pydantic.NonNegativeInt
+
+
+class _Cases(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+    unperturbed: _Case | None = None
+    random: _Case | None = None
+    gradient: _Case | None = None
+
+
+class _Environments(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+    surrogate: _Cases | None = None
+    deployment: _Cases | None = None
+
+
+class _Document(_Model):
+    schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
+    scenario: dict[str, Any]
+    seed: pydantic.NonNegativeInt
+    routes: dict[str, _Environments] = pydantic.Field(min_length=1)
+    cost: _Cost
+
+
+def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any]:
+    per_run = [_run_figures(drive, limit) for drive in drives]
+    means = np.array([run["cross_track_mean_m"] for run in per_run])
+    distances = np.concatenate([drive.distance_m for drive in drives])
+    return {
+        "n": len(drives),
+        "cross_track_mean_m": float(distances.mean()),
+        "cross_track_mean_ci95_m": _mean_interval(means, seed),
+        "cross_track_mean_worst_run_m": float(means.max()),
+        "cross_track_max_m": float(distances.max()),
+        "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
+        "departures": sum(run["departures"] for run in per_run),
+        "runs_departed": sum(run["departures"] > 0 for run in per_run),
+        "per_run": per_run,
+    }
+
+
+def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
+    return {
+        "run": drive.run,
+        "seed": drive.seed,
+        "steps": len(drive.distance_m),
+        "cross_track_mean_m": float(drive.distance_m.mean()),
+        "cross_track_max_m": float(drive.distance_m.max()),
+        "cross_track_total": float(drive.distance_m.sum()),
+        "departures": int(drive.departed(limit).sum()),
+    }
+
+
+def _mean_interval(means: np.ndarray, seed: int) -> list[float] | None:
+    if len(means) < 2:
+        return None
+    # Percentile: the bias-corrected interval is undefined for equal runs.
+    interval = scipy.stats.bootstrap(
+        (means,),
+        np.mean,
+        confidence_level=0.95,
+        n_resamples=BOOTSTRAP_RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return [float(interval.low), float(interval.high)]
+
+
+def _order(key: tuple[str, str, str]) -> tuple[str, int, int]:
+    return key[0], ENVIRONMENTS.index(key[1]), CASES.index(key[2])
+
+
+def _check_choice(name: str, value: Any, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise InputError(
+            f"Drive.{name}: {value!r}; must be one of {', '.join(allowed)}"
+        )

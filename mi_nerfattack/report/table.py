@@ -1,0 +1,106 @@
+"""Tables of a run: a CSV row per step, and the metrics for a terminal."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import rich.box
+import rich.table
+
+from mi_nerfattack import files
+from mi_nerfattack.report.metrics import Drive, limit_of
+
+STEP_COLUMNS = (
+    "environment",
+    "route",
+    "case",
+    "run",
+    "seed",
+    "step",
+    "time_s",
+    "x_m",
+    "y_m",
+    "heading_rad",
+    "control",
+    "cross_track_m",
+    "departed",
+)
+
+
+def write_steps(
+    path: str | Path, drives: Iterable[Drive], limits: Mapping[str, float]
+) -> None:
+    """Write a CSV file with a row per drive and step, atomically.
+
+    Row `step` t = 1..T holds the state reached at `time_s`, the control that led to
+    it and its signed cross-track error; `departed` is 1 beyond the limit, else 0.
+    Numbers are written so that they read back to the same float64.
+
+    Args:
+        path: the file.
+        drives: written in the given order.
+        limits: departure limit of each route, metres.
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(STEP_COLUMNS)
+    for drive in drives:
+        writer.writerows(_rows(drive, limit_of(drive.route, limits)))
+    files.write_text(path, buffer.getvalue())
+
+
+def _rows(drive: Drive, limit: float) -> Iterable[list[Any]]:
+    names = [drive.environment, drive.route, drive.case, drive.run, drive.seed]
+    columns = zip(
+        drive.time_s.tolist(),
+        drive.states[1:].tolist(),
+        drive.controls.tolist(),
+        drive.cross_track_m.tolist(),
+        drive.departed(limit).tolist(),
+        strict=True,
+    )
+    for step, (time, state, control, error, departed) in enumerate(columns, start=1):
+        yield [*names, step, time, *state, control, error, int(departed)]
+
+
+def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
+    """Return the metrics as a table that fits a terminal of 80 columns.
+
+    Args:
+        document: as of `metrics.metrics_document`.
+
+    Returns:
+        A row per route, environment and case; `out` counts steps beyond the limit.
+    """
+    table = rich.table.Table(
+        title="Distance from the lane centre",
+        box=rich.box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1),
+    )
+    for name in ("route", "environment", "case"):
+        table.add_column(name, overflow="fold")
+    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m steps)", "out\n(steps)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for route, environments in document["routes"].items():
+        for environment, cases in environments.items():
+            labels = [route, environment]
+            for case, figures in cases.items():
+                table.add_row(*labels, case, *_cells(figures))
+                labels = ["", ""]
+            table.add_section()
+    return table
+
+
+def _cells(figures: Mapping[str, Any]) -> list[str]:
+    return [
+        str(figures["n"]),
+        f"{figures['cross_track_mean_m']:.3f}",
+        f"{figures['cross_track_max_m']:.3f}",
+        f"{figures['cross_track_total']:.2f}",
+        str(figures["departures"]),
+    ]
