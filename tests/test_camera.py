@@ -51,9 +51,6 @@ def rays_of(camera, poses, **kwargs):
     return o.numpy().T.reshape(shape), d.numpy().T.reshape(shape)
 
 
-# --- conventions --------------------------------------------------------------------
-
-
 def test_conversions_undo_each_other():
     poses = random_poses(5)
     there_and_back = [
@@ -75,6 +72,18 @@ def test_conversions_of_known_axes():
     np.testing.assert_array_equal(mitsuba[:3, 2], [0, 0, 1])
 
 
+@pytest.mark.parametrize("eye", [(3.0, -2.0, 5.0), (0.0, 0.0, 4.0), (1.0, 0.0, 0.0)])
+def test_look_at_is_upright_and_rigid(eye):
+    matrix = cam.look_at(np.array(eye), np.zeros(3))
+    np.testing.assert_allclose(
+        matrix[:3, 2], -np.array(eye) / np.linalg.norm(eye), atol=1e-12
+    )
+    np.testing.assert_allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+    assert matrix[2, 0] == 0  # the horizon is level
+    assert matrix[2, 1] <= 0  # the image's down is not up in the world
+
+
 @pytest.mark.parametrize("pitch_deg", [0.0, 6.0, 90.0])
 def test_mount_by_hand(pitch_deg):
     mount = cam.CameraMount(height_m=1.4, forward_m=0.5, pitch_deg=pitch_deg)
@@ -94,9 +103,6 @@ def test_mount_pose_agrees_with_matrix():
     np.testing.assert_allclose(origin.numpy().T, matrix[:, :3, 3], atol=1e-5)
     for i, column in enumerate(rotation):
         np.testing.assert_allclose(column.numpy().T, matrix[:, :3, i], atol=1e-6)
-
-
-# --- rays ---------------------------------------------------------------------------
 
 
 def test_first_ray_is_top_left():
@@ -178,9 +184,6 @@ def test_wrong_number_of_poses():
         cam.generate_rays(cam.from_fov(2, 2, 90.0), origin, rotation, 3)
 
 
-# --- distortion ---------------------------------------------------------------------
-
-
 def test_distorted_rays_project_back_with_opencv():
     import cv2
 
@@ -232,9 +235,6 @@ def test_mitsuba_sensor_refuses_what_it_cannot_do():
         cam.mitsuba_sensor_dict(FOX, np.eye(4), 1)
     with pytest.raises(InputError, match="square pixels"):
         cam.mitsuba_sensor_dict(cam.Camera(4, 4, 4.0, 5.0, 2.0, 2.0), np.eye(4), 1)
-
-
-# --- colour -------------------------------------------------------------------------
 
 
 def test_srgb_known_values():

@@ -108,16 +108,14 @@ def from_fov(width: int, height: int, fov_x_deg: float) -> Camera:
     """Make a centred pinhole camera with square pixels.
 
     Args:
-        width, height: image size in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
         fov_x_deg: horizontal field of view in degrees, in (0, 180).
     """
     if not 0 < fov_x_deg < 180:
         raise InputError(f"fov_x_deg: {fov_x_deg}; must be between 0 and 180 degrees")
     focal = 0.5 * width / math.tan(math.radians(0.5 * fov_x_deg))
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
-
-
-# --- conventions: (..., 4, 4) camera-to-world matrices, NumPy ---------------------------
 
 
 def _flip_columns(matrix: np.ndarray, signs: tuple[int, int, int]) -> np.ndarray:
@@ -142,6 +140,29 @@ def opencv_to_mitsuba(matrix: np.ndarray) -> np.ndarray:
 def mitsuba_to_opencv(matrix: np.ndarray) -> np.ndarray:
     """Convert camera-to-world (..., 4, 4) from Mitsuba's to OpenCV's camera axes."""
     return _flip_columns(matrix, (-1, -1, 1))
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Place an upright camera (up is +z).
+
+    Args:
+        eye: (3,), metres.
+        target: (3,), metres, on the optical axis; straight above or below eye, the
+            top of the image points to +y.
+
+    Returns:
+        camera_to_world: (4, 4), OpenCV axes, float64.
+    """
+    forward = np.asarray(target, np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    matrix[:3, 3] = eye
+    return matrix
 
 
 def mitsuba_sensor_dict(
@@ -194,9 +215,6 @@ def mitsuba_sensor_dict(
     }
 
 
-# --- a camera on a vehicle ---------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class CameraMount:
     """Where a camera sits on a vehicle whose state is (px, py, theta).
@@ -220,8 +238,10 @@ def mount_pose(
     Args:
         state: px, py (metres), theta (radians), each a `mi.Float` with one entry per
             vehicle.
-        height_m, forward_m, pitch_deg: as in `CameraMount`. They reach the kernel as
-            opaque values, so that another mount needs no other kernel.
+        height_m: as in `CameraMount`; it and the next two reach the kernel as opaque
+            values, so that another mount needs no other kernel.
+        forward_m: as in `CameraMount`.
+        pitch_deg: as in `CameraMount`.
 
     Returns:
         origin (`mi.Point3f`) and the columns (right, down, forward) of the rotation
@@ -265,9 +285,6 @@ def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:
     matrix[:, 2, 3] = mount.height_m
     matrix[:, 3, 3] = 1
     return matrix
-
-
-# --- rays --------------------------------------------------------------------------------
 
 
 def pose_arrays(camera_to_world: np.ndarray) -> tuple[Any, tuple[Any, Any, Any]]:

@@ -1,0 +1,1 @@
+"""From photographs, scenes and meshes to posed images."""
