@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render import camera as cam
-from mi_nerfattack.render import colour
+from mi_nerfattack import colour
 from mi_nerfattack.render.distortion import distort, undistort
 
 FOX = cam.Camera(
