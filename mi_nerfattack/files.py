@@ -141,19 +141,8 @@ def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str,
 
     size = _check_file(path, MAX_TENSOR_BYTES)
     with _reported(path), open(path, "rb") as file:
-        start = file.read(8)
-    if start[:2] == b"PK":
-        raise InputError(f"{path}: is a zip archive (a pickle?); {_TENSOR_REMEDY}")
-    if start[:1] == b"\x80" and start[1:2] in (b"\2", b"\3", b"\4", b"\5"):
-        raise InputError(f"{path}: is a pickle; {_TENSOR_REMEDY}")
-    if size < 8:
-        raise InputError(f"{path}: {size} bytes, truncated; {_TENSOR_REMEDY}")
-    length = int.from_bytes(start, "little")
-    if length > size - 8:
-        raise InputError(
-            f"{path}: header of {length} bytes in a file of {size} bytes, truncated "
-            f"or of another format; {_TENSOR_REMEDY}"
-        )
+        start = file.read(9)
+    _check_tensor_header(path, start, size)
     try:
         with safetensors.safe_open(str(path), framework="numpy") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
@@ -274,6 +263,25 @@ def _check_file(path: str | Path, limit: int) -> int:
     if status.st_size > limit:
         raise InputError(f"{path}: {status.st_size} bytes; at most {limit} are read")
     return status.st_size
+
+
+def _check_tensor_header(path: str | Path, start: bytes, size: int) -> None:
+    """Check the first nine bytes: the header's length and its opening brace."""
+    length = int.from_bytes(start[:8], "little")
+    if start[8:] != b"{":
+        if start.startswith(b"PK"):
+            raise InputError(f"{path}: is a zip archive (a pickle?); {_TENSOR_REMEDY}")
+        if start[:1] == b"\x80" and start[1:2] in (b"\2", b"\3", b"\4", b"\5"):
+            raise InputError(f"{path}: is a pickle; {_TENSOR_REMEDY}")
+        raise InputError(
+            f"{path}: {size} bytes without a safetensors header, truncated or of "
+            f"another format; {_TENSOR_REMEDY}"
+        )
+    if length > size - 8:
+        raise InputError(
+            f"{path}: header of {length} bytes in a file of {size} bytes, truncated "
+            "or damaged; write or copy it again"
+        )
 
 
 def _read_bytes(path: str | Path, limit: int) -> bytes:
