@@ -1,0 +1,1 @@
+"""A fire hydrant built by a script."""

@@ -1,0 +1,1 @@
+"""A T-intersection built by a script."""
