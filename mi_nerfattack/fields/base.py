@@ -1,0 +1,87 @@
+"""The interface of a radiance field: bounds, occupancy and point evaluation."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.fields.occupancy import Occupancy
+
+
+class AbstractField(ABC):
+    """Radiance field in its own frame: density and linear radiance at a point.
+
+    A field owns its parameters as Dr.Jit arrays of the variant that was active
+    when it was made. Geometry (density) and appearance are separate parameters,
+    so that an attack can change the second without touching the first.
+
+    Attributes:
+        lower: (3,) lower corner of the bounding box, metres in the field's frame.
+        upper: (3,) upper corner of the bounding box, metres in the field's frame.
+        step_m: length of a marching step near the camera, metres in the field's
+            frame.
+        cone: growth of the step with distance, 1/1; a step at distance t is about
+            ``max(step_m, cone * t)``. Zero keeps the step constant.
+        occupancy: grid that tells where density may be above its threshold.
+    """
+
+    kind: str
+    lower: np.ndarray
+    upper: np.ndarray
+    step_m: float
+    cone: float
+    occupancy: Occupancy
+
+    @abstractmethod
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate density and radiance.
+
+        Args:
+            point: (3, n), metres in the field's frame.
+            direction: (3, n), unit vectors of travel in the field's frame.
+            active: (n,) mask; masked lanes give zeros.
+
+        Returns:
+            density (n,), 1/metre of the field's frame, and radiance (3, n), linear
+            Rec. 709.
+        """
+
+    @abstractmethod
+    def parameters(self) -> dict[str, Any]:
+        """Return the differentiable parameters by name (Dr.Jit arrays)."""
+
+    @abstractmethod
+    def set_parameter(self, name: str, value: Any) -> None:
+        """Replace a parameter; shape and type must be those of the present one."""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return what a field file stores, as NumPy arrays."""
+
+    @abstractmethod
+    def metadata(self) -> dict[str, str]:
+        """Return what a field file's header stores, as strings."""
+
+    def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Evaluate density alone, (n,), 1/metre of the field's frame."""
+        up = mi.Vector3f(0, 0, 1)
+        return self.eval(point, up, active)[0]
+
+    def background(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Return the radiance of what lies behind the field, (3, n), linear.
+
+        Black unless the field carries a background model.
+        """
+        return dr.zeros(mi.Color3f, dr.width(direction))
+
+    def unit(self, point: mi.Point3f) -> mi.Point3f:
+        """Map a point of the field's frame to [0, 1]^3 of its bounding box."""
+        lower = mi.Point3f(*[float(v) for v in self.lower])
+        inverse = mi.Vector3f(*[1.0 / float(v) for v in self.upper - self.lower])
+        return mi.Point3f((point - lower) * inverse)

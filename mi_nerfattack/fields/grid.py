@@ -1,0 +1,229 @@
+"""Decoder-free multi-resolution grid field: the object whose texture is attacked."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.hashgrid import HashGridEncoding
+
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.colour import srgb_to_linear
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Levels of a multi-resolution grid.
+
+    Attributes:
+        levels: number of levels.
+        base_resolution: vertices along an edge of the coarsest level.
+        max_resolution: vertices along an edge of the finest level.
+    """
+
+    levels: int = 16
+    base_resolution: int = 16
+    max_resolution: int = 64
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.levels <= 32:
+            raise ValueError(f"levels: {self.levels}; allowed are 1 to 32")
+        if not 2 <= self.base_resolution <= self.max_resolution <= 512:
+            raise ValueError(
+                f"resolutions: {self.base_resolution} to {self.max_resolution}; "
+                "allowed is 2 <= base <= max <= 512"
+            )
+
+    @property
+    def growth(self) -> float:
+        """Factor between the resolutions of neighbouring levels."""
+        if self.levels == 1:
+            return 1.0
+        ratio = self.max_resolution / self.base_resolution
+        return float(ratio ** (1 / (self.levels - 1)))
+
+
+class GridField(AbstractField):
+    """Multi-resolution grid without decoder and without view dependence.
+
+    Every vertex holds one density value and three colours. The values of all
+    levels are interpolated trilinearly and added up:
+    ``density = density_scale * exp(sum_l d_l)`` and
+    ``L = srgb_to_linear(sigmoid(sum_l c_l))``. Sixteen levels from 16 to 64 hold
+    4.4 million values (appendix A.4.1, B.1).
+
+    Not differentiable with respect to ``density_scale``, the bounding box and the
+    occupancy.
+
+    Args:
+        layout: levels and resolutions.
+        lower: (3,) of the bounding box, metres.
+        upper: (3,) of the bounding box, metres.
+        density: (n_vertices,) raw density values; zeros when left out.
+        texture: (n_vertices, 3) raw colour values; zeros (mid grey) when left out.
+        occupancy: where density may be; everywhere when left out.
+        density_scale: 1/metre.
+        step_m: marching step, metres; half a voxel of the finest level by default.
+        info: free metadata that is kept in the file (provenance, units).
+
+    Source: appendix A.4.1 and B.1; Mueller et al. 2022 for the levels.
+    """
+
+    kind = "grid_field"
+
+    def __init__(
+        self,
+        layout: GridLayout,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        density: np.ndarray | None = None,
+        texture: np.ndarray | None = None,
+        occupancy: Occupancy | None = None,
+        density_scale: float = 1.0,
+        step_m: float | None = None,
+        info: dict[str, str] | None = None,
+    ) -> None:
+        self.layout = layout
+        self.lower = np.asarray(lower, np.float64)
+        self.upper = np.asarray(upper, np.float64)
+        check_box(self.lower, self.upper)
+        self.density_scale = float(density_scale)
+        voxel = float((self.upper - self.lower).max()) / layout.max_resolution
+        self.step_m = 0.5 * voxel if step_m is None else float(step_m)
+        self.cone = 0.0
+        self.info = dict(info or {})
+        self.occupancy = occupancy or Occupancy.full()
+        self.encoding = HashGridEncoding(
+            mi.Float,
+            3,
+            n_levels=layout.levels,
+            n_features_per_level=4,
+            hashmap_size=layout.max_resolution**3 * 4,
+            base_resolution=layout.base_resolution,
+            per_level_scale=layout.growth,
+            align_corners=True,
+            init_scale=0.0,
+        )
+        self.n_vertices = self.encoding.n_params // 4
+        self._density = flat_parameter(density, (self.n_vertices,), "density")
+        self._texture = flat_parameter(texture, (self.n_vertices, 3), "texture")
+        self._pack()
+
+    @property
+    def texture(self) -> mi.TensorXf:
+        """Raw colour values, (n_vertices, 3); the parameter that is attacked."""
+        return mi.TensorXf(self._texture, (self.n_vertices, 3))
+
+    @property
+    def packed(self) -> mi.Float:
+        """Density and colours side by side, (4 n_vertices,): what kernels read."""
+        return self.encoding.data
+
+    @packed.setter
+    def packed(self, value: mi.Float) -> None:
+        self.encoding.data = value
+
+    def texture_gradient(self, packed_gradient: mi.Float) -> mi.TensorXf:
+        """Pick the colours' part, (n_vertices, 3), out of a gradient of `packed`."""
+        i = dr.arange(mi.UInt32, 3 * self.n_vertices)
+        vertex = i // 3
+        grad = dr.gather(mi.Float, packed_gradient, 4 * vertex + 1 + (i - 3 * vertex))
+        return mi.TensorXf(grad, (self.n_vertices, 3))
+
+    def _pack(self) -> None:
+        i = dr.arange(mi.UInt32, 4 * self.n_vertices)
+        vertex, channel = i >> 2, i & 3
+        is_density = channel == 0
+        colour = dr.select(is_density, 0, 3 * vertex + channel - 1)
+        self.encoding.data = dr.select(
+            is_density,
+            dr.gather(mi.Float, self._density, vertex, is_density),
+            dr.gather(mi.Float, self._texture, colour, ~is_density),
+        )
+        dr.eval(self.encoding.data)
+
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate density and radiance; see :meth:`AbstractField.eval`."""
+        # The encoding reads one vertex past the last cell at exactly 1.
+        unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
+        features = self.encoding(unit, active)
+        d, r, g, b = [
+            sum((features[4 * level + c] for level in range(1, self.layout.levels)),
+                start=features[c])
+            for c in range(4)
+        ]
+        density = self.density_scale * dr.exp(dr.minimum(d, 15.0))
+        colour = mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in (r, g, b)])
+        return density & active, srgb_to_linear(colour) & active
+
+    def parameters(self) -> dict[str, Any]:
+        """Return ``texture`` (n_vertices, 3) and ``density`` (n_vertices,)."""
+        return {"texture": self.texture, "density": self._density}
+
+    def set_parameter(self, name: str, value: Any) -> None:
+        """Replace ``texture`` or ``density``."""
+        if name == "texture":
+            self._texture = flat_parameter(value, (self.n_vertices, 3), name)
+        elif name == "density":
+            self._density = flat_parameter(value, (self.n_vertices,), name)
+        else:
+            raise KeyError(f"{name}: a grid field has 'texture' and 'density'")
+        self._pack()
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return density, texture (half precision) and occupancy bits."""
+        return {
+            "density": self._density.numpy().astype(np.float16),
+            "texture": self.texture.numpy().astype(np.float16),
+            "occupancy": np.packbits(self.occupancy.cells.ravel()),
+        }
+
+    def metadata(self) -> dict[str, str]:
+        """Return layout, bounds, units and provenance."""
+        return {
+            **self.info,
+            **{k: str(v) for k, v in asdict(self.layout).items()},
+            **box_metadata(self),
+            "density_scale": repr(self.density_scale),
+        }
+
+
+def box_metadata(field: AbstractField) -> dict[str, str]:
+    """Return the header entries that every kind of field file shares."""
+    return {
+        "kind": field.kind,
+        "lower": " ".join(repr(float(v)) for v in field.lower),
+        "upper": " ".join(repr(float(v)) for v in field.upper),
+        "occupancy_shape": " ".join(str(n) for n in field.occupancy.shape),
+        "step_m": repr(field.step_m),
+        "cone": repr(field.cone),
+        "length_unit": "metre",
+        "colour_space": "radiance = srgb_to_linear(sigmoid(raw)), linear Rec. 709",
+    }
+
+
+def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
+    """Turn an array of a given shape (or its flat form) into a flat Dr.Jit array."""
+    if value is None:
+        value = np.zeros(shape, np.float32)
+    found = tuple(value.shape)
+    if found not in (shape, (int(np.prod(shape)),)):
+        raise ValueError(f"{name}: shape {found}; expected {shape}")
+    if isinstance(value, np.ndarray):
+        flat = mi.Float(np.ascontiguousarray(value, np.float32).ravel())
+    else:
+        flat = mi.Float(value.array if dr.is_tensor_v(value) else value)
+    return flat
+
+
+def check_box(lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raise ValueError unless two (3,) corners are finite and in order."""
+    good = lower.shape == upper.shape == (3,) and np.isfinite(lower).all()
+    if not (good and np.isfinite(upper).all() and (upper > lower).all()):
+        raise ValueError(f"bounding box: {lower} to {upper}; expected lower < upper")

@@ -1,0 +1,117 @@
+"""Field files: one safetensors file a field, everything else in its header."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack import files
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.grid import GridField, GridLayout
+from mi_nerfattack.fields.ngp import NGPField, NGPLayout
+from mi_nerfattack.fields.occupancy import Occupancy
+
+FORMAT = "mi_nerfattack field 1"
+
+
+def save_field(path: str | Path, field: AbstractField) -> None:
+    """Write a field file atomically.
+
+    Raises:
+        InputError: the path cannot be written.
+    """
+    metadata = {"format": FORMAT, **field.metadata()}
+    files.write_safetensors(path, field.tensors(), metadata)
+
+
+def load_field(path: str | Path) -> AbstractField:
+    """Read a field file of any kind.
+
+    Raises:
+        InputError: the file is missing, truncated, of another format, lacks a
+            tensor or header entry, or holds a wrong shape or a value that is not
+            finite; the message names file and entry.
+    """
+    tensors, metadata = files.read_safetensors(path)
+    if metadata.get("format") != FORMAT:
+        raise InputError(
+            f"{path}: header entry 'format' is {metadata.get('format')!r}; expected "
+            f"{FORMAT!r}; make field files with 'mi-nerfattack fit' or 'asset'"
+        )
+    for name, value in tensors.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise InputError(
+                f"{path}: tensor '{name}' holds NaN or infinity; fit the field again"
+            )
+    kinds = {"grid_field": _grid, "ngp_field": _ngp}
+    kind = metadata.get("kind", "")
+    if kind not in kinds:
+        raise InputError(
+            f"{path}: header entry 'kind' is {kind!r}; allowed: {', '.join(kinds)}"
+        )
+    try:
+        return kinds[kind](tensors, metadata)
+    except KeyError as err:
+        raise InputError(f"{path}: entry {err} is missing from the file") from err
+    except ValueError as err:
+        raise InputError(f"{path}: {err}") from err
+
+
+def load_grid(path: str | Path) -> GridField:
+    """Read a field file that must be a grid field, as objects are."""
+    field = load_field(path)
+    if not isinstance(field, GridField):
+        raise InputError(f"{path}: is a {field.kind}; a grid_field is needed here")
+    return field
+
+
+def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridField:
+    names = ("levels", "base_resolution", "max_resolution")
+    layout = GridLayout(**{name: int(meta[name]) for name in names})
+    return GridField(
+        layout,
+        _vector(meta, "lower"),
+        _vector(meta, "upper"),
+        density=tensors["density"],
+        texture=tensors["texture"],
+        occupancy=_occupancy(tensors["occupancy"], meta),
+        density_scale=float(meta["density_scale"]),
+        step_m=float(meta["step_m"]),
+        info=_info(meta),
+    )
+
+
+def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField:
+    names = NGPLayout.__dataclass_fields__
+    layout = NGPLayout(**{name: int(meta[name]) for name in names})
+    return NGPField(
+        layout,
+        _vector(meta, "lower"),
+        _vector(meta, "upper"),
+        tensors=dict(tensors),
+        occupancy=_occupancy(tensors["occupancy"], meta),
+        step_m=float(meta["step_m"]),
+        cone=float(meta["cone"]),
+        info=_info(meta),
+    )
+
+
+def _vector(meta: Mapping[str, str], name: str) -> np.ndarray:
+    return np.array([float(v) for v in meta[name].split()])
+
+
+def _occupancy(bits: np.ndarray, meta: Mapping[str, str]) -> Occupancy:
+    shape = tuple(int(v) for v in meta["occupancy_shape"].split())
+    count = int(np.prod(shape))
+    if len(shape) != 3 or bits.dtype != np.uint8 or bits.size != (count + 7) // 8:
+        raise ValueError(
+            f"occupancy: {bits.size} bytes for a grid of {shape}; the file is damaged"
+        )
+    return Occupancy(np.unpackbits(bits, count=count).reshape(shape).astype(bool))
+
+
+def _info(meta: Mapping[str, str]) -> dict[str, str]:
+    return {k: v for k, v in meta.items() if k.startswith(("provenance", "fit."))}

@@ -1,0 +1,279 @@
+"""Neural graphics primitive: hash grid, density network and colour network."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import drjit as dr
+import drjit.nn as nn
+import mitsuba as mi
+import numpy as np
+from drjit.hashgrid import HashGridEncoding
+
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.grid import box_metadata, check_box, flat_parameter
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.colour import srgb_to_linear
+
+GEOMETRY_FEATURES = 16
+SH_ORDER = 3
+
+
+@dataclass(frozen=True)
+class NGPLayout:
+    """Architecture of an NGP.
+
+    Attributes:
+        levels: of the hash grid.
+        features: values a vertex and level.
+        log2_table: binary logarithm of the vertices a level.
+        base_resolution: vertices along an edge of the coarsest level.
+        max_resolution: vertices along an edge of the finest level.
+        width: of the hidden layers of both networks.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_table: int = 19
+    base_resolution: int = 16
+    max_resolution: int = 2048
+    width: int = 64
+
+    def __post_init__(self) -> None:
+        limits = {
+            "levels": (1, 32),
+            "features": (2, 8),
+            "log2_table": (8, 24),
+            "base_resolution": (2, 1024),
+            "max_resolution": (self.base_resolution, 65536),
+            "width": (8, 256),
+        }
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(
+                    f"{name}: {getattr(self, name)}; allowed are {low} to {high}"
+                )
+
+    @property
+    def growth(self) -> float:
+        """Factor between the resolutions of neighbouring levels."""
+        if self.levels == 1:
+            return 1.0
+        ratio = self.max_resolution / self.base_resolution
+        return float(ratio ** (1 / (self.levels - 1)))
+
+
+class NGPField(AbstractField):
+    """Instant-NGP radiance field with view-dependent colour.
+
+    ``h = density_net(hash(x))``, ``density = density_scale * exp(h_0)`` and
+    ``L = srgb_to_linear(sigmoid(colour_net(h, SH_3(w))))``. Behind the field lies
+    a latitude-longitude image of raw colours (the sky), bilinearly interpolated.
+
+    Networks use Dr.Jit's cooperative vectors: float32 on LLVM, float16 on CUDA.
+
+    Args:
+        layout: the architecture.
+        lower: (3,) of the bounding box, metres.
+        upper: (3,) of the bounding box, metres.
+        tensors: ``table``, ``density_net.I``, ``colour_net.I``, ``sky`` as written
+            by :meth:`tensors`; initialised from `seed` when left out.
+        occupancy: where density may be; everywhere when left out.
+        step_m: marching step near the camera, metres.
+        cone: growth of the step with distance.
+        sky_shape: (height, width) of the background image when initialised.
+        seed: of the initialisation.
+        info: free metadata that is kept in the file.
+
+    Source: Mueller et al. 2022, section 4 and 5.4.
+    """
+
+    kind = "ngp_field"
+
+    def __init__(
+        self,
+        layout: NGPLayout,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        tensors: dict[str, np.ndarray] | None = None,
+        occupancy: Occupancy | None = None,
+        step_m: float = 0.05,
+        cone: float = 1 / 128,
+        sky_shape: tuple[int, int] = (32, 64),
+        seed: int = 0,
+        info: dict[str, str] | None = None,
+    ) -> None:
+        self.layout = layout
+        self.lower = np.asarray(lower, np.float64)
+        self.upper = np.asarray(upper, np.float64)
+        check_box(self.lower, self.upper)
+        self.density_scale = 1.0 / float((self.upper - self.lower).max())
+        self.step_m = float(step_m)
+        self.cone = float(cone)
+        self.info = dict(info or {})
+        self.occupancy = occupancy or Occupancy.full()
+        rng = dr.rng(seed=seed)
+        self.encoding = HashGridEncoding(
+            mi.Float,
+            3,
+            n_levels=layout.levels,
+            n_features_per_level=layout.features,
+            hashmap_size=2**layout.log2_table,
+            base_resolution=layout.base_resolution,
+            per_level_scale=layout.growth,
+            align_corners=True,
+            rng=rng,
+        )
+        self._modules = _networks(layout, rng)
+        self.sky_shape = sky_shape
+        self.sky = dr.zeros(mi.Float, sky_shape[0] * sky_shape[1] * 3)
+        if tensors is not None:
+            self._load(tensors)
+        self.density_net, self.colour_net = [
+            nn.pack(module, layout="training") for module in self._modules
+        ]
+        dr.make_opaque(self.sky, self.encoding.data)
+
+    def _load(self, tensors: dict[str, np.ndarray]) -> None:
+        self.encoding.data = flat_parameter(
+            tensors["table"], (self.encoding.n_params,), "table"
+        )
+        for prefix, module in zip(NETWORK_NAMES, self._modules, strict=True):
+            for index, key in enumerate(module):
+                value = np.asarray(tensors[f"{prefix}.{index}"], np.float32)
+                if value.shape != tuple(module[key].shape):
+                    raise ValueError(
+                        f"{prefix}.{index}: shape {value.shape}; expected "
+                        f"{tuple(module[key].shape)}"
+                    )
+                module[key] = type(module[key])(value)
+        sky = np.asarray(tensors["sky"], np.float32)
+        if sky.ndim != 3 or sky.shape[2] != 3:
+            raise ValueError(f"sky: shape {sky.shape}; expected (height, width, 3)")
+        self.sky_shape = (sky.shape[0], sky.shape[1])
+        self.sky = mi.Float(sky.ravel())
+
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate density and radiance; see :meth:`AbstractField.eval`."""
+        geometry = self._geometry(point, active)
+        harmonics = dr.sh_eval(mi.Vector3f(direction), SH_ORDER)
+        vector = self._coop(geometry, harmonics)
+        raw = [mi.Float(x) for x in self.colour_net(vector)]
+        density = self.density_scale * dr.exp(dr.minimum(geometry[0], 15.0))
+        return density & active, _activate(raw) & active
+
+    def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Evaluate density alone, (n,), 1/metre."""
+        raw = self._geometry(point, active)[0]
+        return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
+
+    def _geometry(self, point: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
+        unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
+        features = self.encoding(unit, active)
+        return [mi.Float(x) for x in self.density_net(self._coop(features))]
+
+    def _coop(self, *values: Any) -> nn.CoopVec:
+        kind = dr.leaf_t(self._weight_type)
+        return nn.CoopVec(*[kind(x) for part in values for x in part])
+
+    def background(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Interpolate the sky image bilinearly, (3, n), linear."""
+        height, width = self.sky_shape
+        u = dr.atan2(direction.y, direction.x) * (0.5 / dr.pi) * width
+        v = dr.safe_acos(direction.z) / dr.pi * height - 0.5
+        u0, v0 = dr.floor(u), dr.floor(v)
+        colour = mi.Color3f(0)
+        for du in (0, 1):
+            for dv in (0, 1):
+                weight = (u - u0 if du else 1 - u + u0) * (v - v0 if dv else 1 - v + v0)
+                column = mi.Int32(u0) + du
+                column = dr.select(column < 0, column + width, column)
+                column = dr.select(column >= width, column - width, column)
+                row = dr.clip(mi.Int32(v0) + dv, 0, height - 1)
+                index = mi.UInt32(row * width + column)
+                colour += weight * dr.gather(mi.Color3f, self.sky, index)
+        return _activate([colour.x, colour.y, colour.z])
+
+    def parameters(self) -> dict[str, Any]:
+        """Return ``table``, ``density_weights``, ``colour_weights`` and ``sky``."""
+        return {
+            "table": self.encoding.data,
+            "density_weights": self.density_net["weights"],
+            "colour_weights": self.colour_net["weights"],
+            "sky": self.sky,
+        }
+
+    def set_parameter(self, name: str, value: Any) -> None:
+        """Replace one of :meth:`parameters`, keeping its derivative graph."""
+        if name not in self.parameters():
+            raise KeyError(f"{name}: an NGP has {', '.join(self.parameters())}")
+        old = self.parameters()[name]
+        if dr.width(value) != dr.width(old):
+            raise ValueError(
+                f"{name}: {dr.width(value)} values; expected {dr.width(old)}"
+            )
+        if name == "table":
+            self.encoding.data = value
+        elif name == "sky":
+            self.sky = value
+        else:
+            net = self.density_net if name[0] == "d" else self.colour_net
+            net["weights"] = value
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return table (half precision), network matrices, sky, occupancy bits."""
+        result = {
+            "table": self.encoding.data.numpy().astype(np.float16),
+            "sky": self.sky.numpy().copy().reshape(*self.sky_shape, 3),
+            "occupancy": np.packbits(self.occupancy.cells.ravel()),
+        }
+        packed = (self.density_net, self.colour_net)
+        for prefix, net in zip(NETWORK_NAMES, packed, strict=True):
+            linear = [layer for layer in net.layers if isinstance(layer, nn.Linear)]
+            for index, layer in enumerate(linear):
+                matrix = self._weight_type(nn.unpack(layer.weights))
+                result[f"{prefix}.{index}"] = matrix.numpy().astype(np.float32)
+        return result
+
+    def metadata(self) -> dict[str, str]:
+        """Return architecture, bounds, units and provenance."""
+        return {
+            **self.info,
+            **{k: str(v) for k, v in asdict(self.layout).items()},
+            **box_metadata(self),
+        }
+
+    @property
+    def _weight_type(self) -> type:
+        return _weight_type()
+
+
+NETWORK_NAMES = ("density_net", "colour_net")
+
+
+def _weight_type() -> type:
+    on_cuda = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
+    return mi.TensorXf16 if on_cuda else mi.TensorXf
+
+
+def _networks(layout: NGPLayout, rng: Any) -> tuple[nn.Module, nn.Module]:
+    density = nn.Sequential(
+        nn.Linear(-1, layout.width, bias=False),
+        nn.ReLU(),
+        nn.Linear(-1, GEOMETRY_FEATURES, bias=False),
+    ).alloc(_weight_type(), layout.levels * layout.features, rng=rng)
+    colour = nn.Sequential(
+        nn.Linear(-1, layout.width, bias=False),
+        nn.ReLU(),
+        nn.Linear(-1, layout.width, bias=False),
+        nn.ReLU(),
+        nn.Linear(-1, 3, bias=False),
+    ).alloc(_weight_type(), GEOMETRY_FEATURES + (SH_ORDER + 1) ** 2, rng=rng)
+    return density, colour
+
+
+def _activate(raw: list[mi.Float]) -> mi.Color3f:
+    return srgb_to_linear(mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in raw]))

@@ -1,0 +1,142 @@
+"""Occupancy of a field as a grid of distances, for skipping empty space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+if TYPE_CHECKING:
+    from mi_nerfattack.fields.base import AbstractField
+
+MAX_DISTANCE = 255
+
+
+class Occupancy:
+    """Boolean grid over a unit box, stored as Chebyshev distances to occupied cells.
+
+    A cell that holds ``n > 0`` is empty, and so are all cells closer than ``n`` to
+    it: a ray may leave the whole block of ``2 n - 1`` cells in one jump. Cells that
+    hold 0 are occupied. Costs one byte a cell.
+
+    Args:
+        cells: boolean (rx, ry, rz), True where the field may have density.
+    """
+
+    def __init__(self, cells: np.ndarray) -> None:
+        self.cells = np.ascontiguousarray(cells, dtype=bool)
+        if self.cells.ndim != 3 or min(self.cells.shape) < 1:
+            raise ValueError(f"occupancy: shape {cells.shape}; expected (rx, ry, rz)")
+        self.shape: tuple[int, int, int] = tuple(int(n) for n in self.cells.shape)  # type: ignore[assignment]
+        if self.cells.all():
+            distance = np.zeros(self.shape, np.uint8)
+        elif not self.cells.any():
+            distance = np.full(self.shape, MAX_DISTANCE, np.uint8)
+        else:
+            distance = ndimage.distance_transform_cdt(~self.cells, metric="chessboard")
+            distance = np.minimum(distance, MAX_DISTANCE).astype(np.uint8)
+        byte = dr.uint8_array_t(mi.Float)
+        self.distance = byte(distance.ravel())
+        dr.make_opaque(self.distance)
+
+    @staticmethod
+    def full(resolution: int = 1) -> Occupancy:
+        """Return a grid in which every cell is occupied."""
+        return Occupancy(np.ones((resolution,) * 3, bool))
+
+    @property
+    def fraction(self) -> float:
+        """Share of the cells that are occupied, 0 to 1."""
+        return float(self.cells.mean())
+
+    def query(
+        self, unit: mi.Point3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Point3f]:
+        """Look up the distance grid.
+
+        Args:
+            unit: (3, n), positions in [0, 1]^3; outside is clamped to the border.
+            active: (n,) mask.
+
+        Returns:
+            distance (n,) in cells, 0 where occupied, and the cell's index (3, n).
+        """
+        rx, ry, rz = self.shape
+        cell = mi.Point3f(
+            dr.clip(dr.floor(unit.x * rx), 0, rx - 1),
+            dr.clip(dr.floor(unit.y * ry), 0, ry - 1),
+            dr.clip(dr.floor(unit.z * rz), 0, rz - 1),
+        )
+        index = (mi.UInt32(cell.x) * ry + mi.UInt32(cell.y)) * rz + mi.UInt32(cell.z)
+        value = dr.gather(type(self.distance), self.distance, index, active)
+        return mi.Float(mi.UInt32(value)), cell
+
+    def exit(
+        self,
+        unit: mi.Point3f,
+        direction: mi.Vector3f,
+        cell: mi.Point3f,
+        distance: mi.Float,
+    ) -> mi.Float:
+        """Return how far a ray goes before it leaves the empty block, (n,).
+
+        Args:
+            unit: (3, n), position in the unit box.
+            direction: (3, n), of any length; the result is in units of it.
+            cell: (3, n), from :meth:`query`.
+            distance: (n,), from :meth:`query`, at least 1.
+        """
+        result = mi.Float(dr.inf)
+        for axis in range(3):
+            forward = direction[axis] > 0
+            edge = cell[axis] + dr.select(forward, distance, 1 - distance)
+            step = edge / self.shape[axis] - unit[axis]
+            moving = direction[axis] != 0
+            t = step / dr.select(moving, direction[axis], 1)
+            result = dr.minimum(result, dr.select(moving, t, dr.inf))
+        return dr.maximum(result, 0)
+
+
+def build(
+    field: AbstractField,
+    resolution: int,
+    threshold: float,
+    seed: int = 0,
+    samples: int = 8,
+    dilate: int = 1,
+    chunk: int = 1 << 20,
+) -> Occupancy:
+    """Build the occupancy of a field from its density.
+
+    Each cell is sampled at its centre and at jittered positions; it is occupied
+    when the largest density there reaches the threshold, or when a neighbour is.
+
+    Args:
+        field: the field; its present occupancy is not looked at.
+        resolution: cells along the longest edge of the bounding box.
+        threshold: density, 1/metre of the field's frame.
+        seed: of the jitter.
+        samples: positions a cell.
+        dilate: neighbours that are taken along, in cells.
+        chunk: evaluations a launch.
+    """
+    extent = np.asarray(field.upper - field.lower, float)
+    shape = np.maximum(1, np.round(resolution * extent / extent.max())).astype(int)
+    count = int(np.prod(shape))
+    peak = np.zeros(count, np.float32)
+    rng = np.random.default_rng(seed)
+    for start in range(0, count, chunk):
+        index = np.arange(start, min(start + chunk, count))
+        cell = np.stack(np.unravel_index(index, shape))
+        for k in range(samples):
+            offset = 0.5 if k == 0 else rng.random(cell.shape)
+            local = field.lower[:, None] + (cell + offset) / shape[:, None] * extent[:, None]
+            density = field.density(mi.Point3f(local.astype(np.float32)), mi.Bool(True))
+            peak[index] = np.maximum(peak[index], density.numpy())
+    cells = (peak >= threshold).reshape(shape)
+    if dilate and cells.any():
+        cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)), iterations=dilate)
+    return Occupancy(cells)
