@@ -207,7 +207,7 @@ def _map_panels(count: int, low: np.ndarray, high: np.ndarray) -> tuple[Figure, 
     """Place panels above each other where the map is wide, else beside each other."""
     width_in = WIDTH_PX / DPI
     aspect = float((high[1] - low[1]) / (high[0] - low[0]))
-    rows = count if aspect < 0.75 else 1
+    rows = count if aspect < 0.6 else 1
     columns = count // rows
     panel_in = (width_in - 0.7 * columns) / columns * aspect
     height_in = min(rows * (max(panel_in, 1.0) + 0.65) + 0.6, 14.0)
@@ -271,7 +271,7 @@ def _draw_band(axis: Axes, drives: Sequence[Drive]) -> None:
 
 
 def _legend_below(figure: Figure, handles: list[Any]) -> None:
-    columns = min(len(handles), 4)
+    columns = 3 if len(handles) in (3, 5, 6) else 4
     figure.legend(
         handles=handles, loc="outside lower center", ncols=columns, frameon=False
     )

@@ -74,7 +74,7 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
         document: as of `metrics.metrics_document`.
 
     Returns:
-        A row per route, environment and case; `out` counts steps beyond the limit.
+        A row per route, environment and case; `steps out` are beyond the limit.
     """
     table = rich.table.Table(
         title="Distance from the lane centre",
@@ -82,9 +82,10 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
         pad_edge=False,
         padding=(0, 1),
     )
-    for name in ("route", "environment", "case"):
-        table.add_column(name, overflow="fold")
-    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m steps)", "out\n(steps)"):
+    table.add_column("route", overflow="fold", max_width=14)
+    for name in ("environment", "case"):
+        table.add_column(name, no_wrap=True)
+    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m)", "steps\nout"):
         table.add_column(name, justify="right", no_wrap=True)
     for route, environments in document["routes"].items():
         for environment, cases in environments.items():
