@@ -108,26 +108,27 @@ def _find_in_package() -> Path | None:
 
 
 def _find_in_system() -> Path | None:
-    multiarch = sysconfig.get_config_var("MULTIARCH") or "lib"
-    folders = [
-        *(
-            Path(top) / sub
-            for top in ("/usr/lib", "/usr/local/lib")
-            for sub in ("", multiarch)
-        ),
-        Path("/usr/lib64"),
-        *Path("/usr/lib").glob("llvm-*/lib"),
-        Path("/opt/homebrew/opt/llvm/lib"),
-        Path("/usr/local/opt/llvm/lib"),
-    ]
     found = [
         (_major(path), path)
-        for folder in folders
+        for folder in _system_folders()
         for path in folder.glob("libLLVM*")
         if _LIBRARY.match(path.name) and path.is_file()
     ]
     usable = [item for item in found if item[0] >= MINIMUM_SYSTEM]
     return max(usable)[1] if usable else None
+
+
+def _system_folders() -> list[Path]:
+    multiarch = sysconfig.get_config_var("MULTIARCH") or "lib"
+    return [
+        Path("/usr/lib"),
+        Path("/usr/lib") / multiarch,
+        Path("/usr/lib64"),
+        Path("/usr/local/lib"),
+        *Path("/usr/lib").glob("llvm-*/lib"),
+        Path("/opt/homebrew/opt/llvm/lib"),
+        Path("/usr/local/opt/llvm/lib"),
+    ]
 
 
 def _major(path: Path) -> int:

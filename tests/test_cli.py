@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+
+import pytest
+
+import mi_nerfattack
+from mi_nerfattack import cli, doctor, llvm
+from mi_nerfattack.commands import COMMANDS
+from mi_nerfattack.errors import InputError
+
+COMMAND = [sys.executable, "-m", "mi_nerfattack.cli"]
+HEAVY = {"torch", "matplotlib", "trimesh", "skimage", "scipy", "cv2", "OpenEXR"}
+
+
+@dataclass(frozen=True)
+class Try:
+    """Do what the test says."""
+
+    what: str = "succeed"
+    """What to do."""
+
+    def run(self) -> int:
+        """Do it."""
+        if self.what == "refuse":
+            raise InputError("fields/x.safetensors: truncated; copy it again")
+        if self.what == "interrupt":
+            raise KeyboardInterrupt
+        if self.what == "pipe":
+            raise BrokenPipeError
+        if self.what == "bug":
+            raise ZeroDivisionError("ours")
+        if self.what == "terminate":
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10)
+        return 0 if self.what == "succeed" else 1
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command line with the command 'try' added."""
+    monkeypatch.setitem(COMMANDS, "try", Try)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        code = cli.main(arguments)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def start(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        **options,
+    )
+
+
+def test_success_and_negative_answer(run):
+    assert run("try")[0] == 0
+    assert run("try", "--what", "fail")[0] == 1
+
+
+def test_bad_input_is_one_line_and_code_2(run):
+    code, out, err = run("try", "--what", "refuse")
+    assert (code, out) == (2, "")
+    message = "fields/x.safetensors: truncated; copy it again"
+    assert err == f"mi-nerfattack: error: {message}\n"
+
+
+@pytest.mark.parametrize("place", [0, 3])
+def test_debug_shows_the_traceback(run, place):
+    arguments = ["try", "--what", "refuse"]
+    arguments.insert(place, "--debug")
+    code, _, err = run(*arguments)
+    assert code == 2
+    assert "Traceback" in err
+    assert err.splitlines()[-1].startswith("mi-nerfattack: error: ")
+
+
+def test_interruption_is_code_130(run):
+    assert run("try", "--what", "interrupt") == (
+        130,
+        "",
+        "mi-nerfattack: interrupted\n",
+    )
+
+
+def test_sigterm_is_an_interruption_and_the_handler_is_put_back(run):
+    before = signal.getsignal(signal.SIGTERM)
+    code, _, err = run("try", "--what", "terminate")
+    assert (code, err) == (130, "mi-nerfattack: interrupted\n")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(run):
+    with pytest.raises(ZeroDivisionError):
+        run("try", "--what", "bug")
+
+
+def test_other_threads_may_call(run):
+    codes: list[int] = []
+    thread = threading.Thread(target=lambda: codes.append(cli.main(["try"])))
+    thread.start()
+    thread.join()
+    assert codes == [0]
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["nonsense"], ["doctor", "--nonsense"], ["--nonsense"]]
+)
+def test_wrong_usage_is_code_2(run, arguments):
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert err
+    assert "Traceback" not in err
+
+
+def test_version(run):
+    assert run("--version") == (0, f"mi-nerfattack {mi_nerfattack.__version__}\n", "")
+
+
+@pytest.mark.parametrize("arguments", [[], *([name] for name in COMMANDS)])
+def test_help_is_complete_and_loads_nothing_heavy(arguments):
+    code = (
+        "import sys, time\n"
+        "begin = time.perf_counter()\n"
+        "from mi_nerfattack.cli import main\n"
+        f"code = main({[*arguments, '--help']!r})\n"
+        "print(time.perf_counter() - begin, file=sys.stderr)\n"
+        "print(*sys.modules, file=sys.stderr)\n"
+        "sys.exit(code)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "usage: mi-nerfattack" in done.stdout
+    if not arguments:
+        assert all(name in done.stdout for name in COMMANDS)
+    seconds, loaded = done.stderr.splitlines()[-2:]
+    assert float(seconds) < 5  # about 0.4 on an idle machine
+    assert not HEAVY & set(loaded.split())
+
+
+def test_closed_pipe_is_quiet():
+    process = subprocess.Popen(
+        [*COMMAND, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(60) == cli.EXIT_BROKEN_PIPE
+    assert err == b""
+
+
+def test_ctrl_c_in_a_real_process():
+    code = (
+        "import sys, time\n"
+        "from dataclasses import dataclass\n"
+        "from mi_nerfattack import cli, commands\n"
+        "@dataclass(frozen=True)\n"
+        "class Wait:\n"
+        "    'Wait.'\n"
+        "    def run(self):\n"
+        "        print('ready', flush=True)\n"
+        "        time.sleep(60)\n"
+        "commands.COMMANDS['wait'] = Wait\n"
+        "sys.exit(cli.main(['wait']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "mi-nerfattack: interrupted\n")
+
+
+def test_doctor_as_json_and_as_table():
+    done = start("doctor", "--json")
+    report = json.loads(done.stdout)
+    found = {item["name"]: item for item in report["findings"]}
+    assert done.returncode == (0 if report["can_run"] else 1)
+    assert {"python", "LLVM", "variants", "GPU", "cores", "memory", "disk"} <= set(
+        found
+    )
+    assert "llvm_ad_rgb" in found["variants"]["value"]
+    assert found["default variant"]["state"] == "ok"
+    for item in found.values():
+        assert item["state"] == "ok" or item["remedy"], item
+    table = start("doctor")
+    assert table.returncode == done.returncode
+    assert re.search(r"LLVM +\d+\.\d+", table.stdout)
+
+
+def test_doctor_without_llvm_tells_what_to_do():
+    environment = os.environ | {llvm.VARIABLE: "/nowhere/libLLVM.so"}
+    done = start("doctor", "--json", env=environment)
+    assert done.returncode == 1
+    found = {item["name"]: item for item in json.loads(done.stdout)["findings"]}
+    assert found["LLVM"]["state"] == "missing"
+    assert llvm.PACKAGE in found["LLVM"]["remedy"]
+    assert found["default variant"]["state"] == "missing"
+
+
+def test_doctor_reports_what_is_missing():
+    needed = doctor.Requirement("no-such-distribution>=2")
+    finding = doctor._package(needed, "missing", "install it")
+    assert finding == doctor.Finding(
+        "no-such-distribution", "not installed", "missing", "install it"
+    )
+    assert not doctor.can_run([finding])
+    old = doctor.Requirement("mitsuba>=99")
+    assert ", needed >=99" in doctor._package(old, "absent", "update").value
+    assert doctor.can_run([doctor._package(old, "absent", "update")])
+
+
+def test_doctor_compares_bundled_files(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    # SHA-256 of "abc" as printed in FIPS 180-2, appendix B.1
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert doctor._matches(tmp_path, "a", {"sha256": known})
+    (tmp_path / "a").write_bytes(b"abd")
+    assert not doctor._matches(tmp_path, "a", {"sha256": known})
+    assert not doctor._matches(tmp_path, "b", {"sha256": known})
