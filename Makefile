@@ -1,8 +1,7 @@
 # Two commands need nothing else: `make demo` and `make test`.
 PYTHON ?= python3
 VENV := .venv
-PIP := $(VENV)/bin/python -m pip
-STAMP := $(VENV)/.installed
+PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 # The build that the results were measured with; it needs no GPU.
 TORCH := torch==2.13.0
 
@@ -15,25 +14,36 @@ help:
 	@echo "make lint   check format, lint and types"
 	@echo "make clean  remove the virtual environment and what was built"
 
-demo: $(STAMP)
+demo: $(VENV)/.installed
 	$(VENV)/bin/mi-nerfattack demo
 
-test: $(STAMP)
+test: $(VENV)/.installed-test
 	$(VENV)/bin/python -m pytest
 
-lint: $(STAMP)
+lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
-$(STAMP): pyproject.toml | check-python
-	@echo "== creating the virtual environment in $(VENV)"
+# A stamp says that the step is done, and is younger than what it was done from.
+$(VENV)/.installed: pyproject.toml | check-python
+	@echo "== making a virtual environment in $(VENV)"
 	$(PYTHON) -m venv $(VENV)
-	@echo "== installing $(TORCH), then this package with its dependencies"
-	$(PIP) install --quiet --disable-pip-version-check "$(TORCH)"
-	$(PIP) install --quiet --disable-pip-version-check -e ".[dev]"
+	@echo "== installing PyTorch, then this package and what it needs (minutes)"
+	$(PIP) install --quiet "$(TORCH)"
+	$(PIP) install --quiet -e .
 	@touch $@
 	@echo "== installed; the next run skips this"
+
+$(VENV)/.installed-test: $(VENV)/.installed
+	@echo "== installing what the tests need"
+	$(PIP) install --quiet -e ".[test]"
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed-test
+	@echo "== installing the linters"
+	$(PIP) install --quiet -e ".[dev]"
+	@touch $@
 
 check-python:
 	@command -v $(PYTHON) >/dev/null 2>&1 || { \
