@@ -99,7 +99,7 @@ class ImplicitMidpoint(AbstractIntegrator):
     """
 
     explicit: ClassVar[bool] = False
-    iterations: int = 4
+    iterations: int = 6
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -114,11 +114,11 @@ class ImplicitMidpoint(AbstractIntegrator):
             InputError: Newton's method has not converged to rounding error.
         """
         x_prev, control = dr.detach(x), dr.detach(u)
-        x_next = x_prev + dt * dynamics.derivative(x_prev, control)
+        x_next = type(x_prev)(x_prev)  # an Euler step overshoots in stiff models
         for _ in range(self.iterations):
             defect = self.residual(dynamics, x_prev, x_next, control, dt)
             columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
-            x_next -= solve_columns(columns, defect)
+            x_next = x_next - solve_columns(columns, defect)
         self._check(dynamics, x_prev, x_next, control, dt)
         if not dr.grad_enabled(x, u):
             return x_next
@@ -154,6 +154,7 @@ class ImplicitMidpoint(AbstractIntegrator):
         scale = 1 + dr.max(dr.abs(x_prev)) + dr.max(dr.abs(x))
         epsilon = dr.epsilon(dr.value_t(type(x)))
         defect = dr.max(dr.abs(self.residual(dynamics, x_prev, x, u, dt)))
+        dr.eval(x, defect, scale)  # one launch for the step and its check
         if dr.all(defect <= 32 * epsilon * scale):  # false for NaN, too
             return
         worst = dr.max(defect)[0]
@@ -168,19 +169,23 @@ def state_jacobian(dynamics: AbstractDynamics, state: Any, control: Any) -> list
 
     Args:
         dynamics: vehicle model.
-        state: (3, n); control: (n,). Both are treated as constants.
+        state: (3, n), treated as a constant.
+        control: (n,), treated as a constant.
 
     Returns:
         Three columns, each (3, n): column j is df/dx_j, detached.
     """
     columns = []
+    # A model need not depend on every row: Dubins ignores the position. Nor may the
+    # input's gradient be cleared, for a result can be an input, as in `dx/dt = v`.
+    flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
     for row in range(3):
         with dr.resume_grad():
-            probe = type(state)(dr.detach(state))
-            dr.enable_grad(probe[row])
-            slope = dynamics.derivative(probe, dr.detach(control))
-            dr.set_grad(probe[row], 1)
-            columns.append(dr.detach(dr.forward_to(slope)))
+            rows = [type(state[0])(dr.detach(state[i])) for i in range(3)]
+            dr.enable_grad(rows[row])
+            slope = dynamics.derivative(type(state)(*rows), dr.detach(control))
+            dr.set_grad(rows[row], 1)
+            columns.append(dr.detach(dr.forward_to(slope, flags=flags)))
     return columns
 
 

@@ -1,0 +1,140 @@
+"""Interface of a driving policy to the closed loop, and the bridge to torch."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import drjit as dr
+import torch
+
+from mi_nerfattack.errors import InputError
+
+
+class AbstractPolicy(ABC):
+    """Map from images to controls with a vector-Jacobian product.
+
+    Images and controls are Dr.Jit arrays, so that the closed loop needs to know no
+    other library. A call starts by waiting for the images.
+    """
+
+    @abstractmethod
+    def control(self, image: Any, goal: Any) -> Any:
+        """Evaluate the policy.
+
+        Args:
+            image: tensor (n, height, width, 3), sRGB in [0, 1]; taken as a constant.
+            goal: an integer, or one for each image.
+
+        Returns:
+            Row (n,), evaluated and detached, in the unit of the vehicle's control.
+        """
+
+    @abstractmethod
+    def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
+        """Multiply a cotangent by the derivative of `control`.
+
+        Args:
+            image: as for `control`.
+            goal: as for `control`.
+            cotangent: row (n,), derivative of the objective by the control.
+
+        Returns:
+            The control (n,), and the derivative of the objective by the image, a
+            tensor of the image's shape; both evaluated and detached.
+        """
+
+
+class TorchPolicy(AbstractPolicy):
+    """Policy given by a torch module; memory is shared, not copied, both ways.
+
+    Args:
+        module: maps an image (n, 3, height, width), sRGB in [0, 1], and a goal (n,)
+            int64 to a control (n,), changing neither in place. It is switched to
+            evaluation mode, its parameters are frozen, and it is moved to the
+            device of the images.
+        goals: number of goals; `module.goals` unless given.
+    """
+
+    def __init__(self, module: torch.nn.Module, goals: int | None = None) -> None:
+        """Take over `module`."""
+        self.module = module.eval().requires_grad_(False)
+        count = getattr(module, "goals", None) if goals is None else goals
+        if not isinstance(count, int) or count < 1:
+            raise InputError(f"TorchPolicy.goals: {count!r}; an integer of at least 1")
+        self.goals = count
+
+    def control(self, image: Any, goal: Any) -> Any:
+        """Evaluate the module without recording a graph."""
+        with torch.no_grad():
+            return to_row(self._evaluate(to_torch(image), goal), image)
+
+    def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
+        """Evaluate the module and its reverse derivative, one graph at a time."""
+        leaf = to_torch(image).detach().requires_grad_(True)
+        with torch.enable_grad():
+            control = self._evaluate(leaf, goal)
+        weight = to_torch(cotangent).to(control)
+        if weight.shape != control.shape:
+            raise InputError(
+                f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
+            )
+        (gradient,) = torch.autograd.grad(control, leaf, weight)
+        return to_row(control, image), to_tensor(gradient, image)
+
+    def _evaluate(self, image: torch.Tensor, goal: Any) -> torch.Tensor:
+        """Apply the module to (n, height, width, 3), in the module's precision."""
+        if image.ndim != 4 or image.shape[3] != 3:
+            raise InputError(
+                f"image: shape {tuple(image.shape)}; (n, height, width, 3) is needed"
+            )
+        self.module.to(image.device)
+        parameter = next(self.module.parameters(), image)
+        planes = image.permute(0, 3, 1, 2).to(parameter.dtype)
+        control = self.module(planes, self._goals(goal, image))
+        if control.shape != image.shape[:1]:
+            raise InputError(
+                f"policy: controls {tuple(control.shape)} for {len(image)} images; "
+                "the module must return one number for each image"
+            )
+        return control
+
+    def _goals(self, goal: Any, image: torch.Tensor) -> torch.Tensor:
+        """Expand and check goals, (n,) int64 on the image's device."""
+        if dr.is_array_v(goal):
+            goal = to_torch(goal)
+        values = torch.as_tensor(goal).to(image.device, torch.int64)
+        if values.shape not in (torch.Size([]), image.shape[:1]):
+            raise InputError(
+                f"goal: shape {tuple(values.shape)} for {len(image)} images"
+            )
+        if ((values < 0) | (values >= self.goals)).any():
+            raise InputError(f"goal: {goal}; at least 0 and below {self.goals}")
+        return values.expand(len(image))
+
+
+def to_torch(array: Any) -> torch.Tensor:
+    """View a Dr.Jit array or tensor, detached, as torch's; waits until it is there."""
+    values = dr.detach(array)
+    dr.eval(values)
+    dr.sync_thread()
+    return values.torch()
+
+
+def to_tensor(value: torch.Tensor, like: Any) -> Any:
+    """Make a Dr.Jit tensor of the type of `like`; evaluated, never a literal."""
+    return type(like)(_settled(value, like))
+
+
+def to_row(value: torch.Tensor, like: Any) -> Any:
+    """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
+    return dr.array_t(like)(_settled(value, like))
+
+
+def _settled(value: torch.Tensor, like: Any) -> torch.Tensor:
+    """Bring a result into the scalar type of `like` and wait for its device."""
+    scalar = torch.float64 if dr.type_v(like) == dr.VarType.Float64 else torch.float32
+    value = value.detach().to(scalar).contiguous()
+    if value.is_cuda:  # Dr.Jit has a stream of its own
+        torch.cuda.current_stream(value.device).synchronize()
+    return value

@@ -1,0 +1,155 @@
+"""Driving frames with goals and expert controls, memory-mapped from shards.
+
+A shard is a folder of three NumPy files: `frames.npy`, uint8 (n, height, width, 3),
+sRGB; `goals.npy`, int64 (n,); `controls.npy`, float32 (n,), rad/s. Frames stay on
+the disk and are read row by row.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack import files
+from mi_nerfattack.errors import InputError
+
+COLUMNS = {"frames": np.uint8, "goals": np.int64, "controls": np.float32}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameDataset:
+    """Rows of several shards under one index.
+
+    Args:
+        frames: one array (n_k, height, width, 3) uint8 sRGB for each shard, in
+            memory or memory-mapped.
+        goals: (sum n_k,) int64.
+        controls: (sum n_k,) float32, rad/s.
+    """
+
+    frames: tuple[np.ndarray, ...]
+    goals: np.ndarray
+    controls: np.ndarray
+
+    def __post_init__(self) -> None:
+        shapes = {array.shape[1:] for array in self.frames}
+        count = sum(len(array) for array in self.frames)
+        if len(shapes) != 1 or any(array.dtype != np.uint8 for array in self.frames):
+            raise InputError(f"frames: uint8 of one shape are needed, not {shapes}")
+        if count == 0 or {self.goals.shape, self.controls.shape} != {(count,)}:
+            raise InputError(
+                f"dataset: {count} frames, goals {self.goals.shape}, controls "
+                f"{self.controls.shape}; at least one row, and as many of each"
+            )
+        if not np.isfinite(self.controls).all():
+            row = int(np.argmin(np.isfinite(self.controls)))
+            raise InputError(
+                f"controls: row {row} is {self.controls[row]}; finite only"
+            )
+
+    @classmethod
+    def from_folders(cls, folders: Sequence[str | Path]) -> FrameDataset:
+        """Map shards written by `write_shard`, in the order given.
+
+        Raises:
+            InputError: no folder; a missing or damaged file; lengths that differ.
+        """
+        if not folders:
+            raise InputError("dataset: no folders; give at least one shard")
+        shards = [
+            [
+                _map_column(Path(folder) / f"{name}.npy", COLUMNS[name])
+                for name in COLUMNS
+            ]
+            for folder in folders
+        ]
+        for folder, shard in zip(folders, shards, strict=True):
+            if len({len(column) for column in shard}) != 1:
+                raise InputError(
+                    f"{folder}: {[len(column) for column in shard]} rows of "
+                    f"{list(COLUMNS)}; write the shard again"
+                )
+        frames, goals, controls = zip(*shards, strict=True)
+        return cls(tuple(frames), np.concatenate(goals), np.concatenate(controls))
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.goals)
+
+    def read_frames(self, rows: np.ndarray) -> np.ndarray:
+        """Copy frames (k, height, width, 3) uint8 of the given row numbers (k,)."""
+        starts = np.cumsum([0, *(len(array) for array in self.frames)])
+        result = np.empty((len(rows), *self.frames[0].shape[1:]), np.uint8)
+        shard = np.searchsorted(starts, rows, side="right") - 1
+        for number in np.unique(shard):
+            chosen = shard == number
+            result[chosen] = self.frames[number][rows[chosen] - starts[number]]
+        return result
+
+    def split(
+        self, fraction: float, seed: int, block: int = 64
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Divide the rows into training and held-out rows by whole blocks.
+
+        Neighbouring frames of one drive look alike; whole blocks of consecutive rows
+        keep them on the same side.
+
+        Args:
+            fraction: held out, in (0, 1).
+            seed: of the choice of blocks.
+            block: consecutive rows that stay together.
+
+        Returns:
+            Training and held-out row numbers, ascending; neither is empty.
+        """
+        if not 0 < fraction < 1:
+            raise InputError(f"held_out: {fraction!r}; between 0 and 1")
+        block = max(1, min(block, len(self) // 4))
+        number = np.arange(len(self)) // block
+        count = int(number[-1]) + 1
+        if count < 2:
+            raise InputError(f"dataset: {len(self)} rows cannot be split; at least 2")
+        held = min(max(1, round(fraction * count)), count - 1)
+        chosen = np.random.default_rng(seed).permutation(count)[:held]
+        mask = np.isin(number, chosen)
+        return np.flatnonzero(~mask), np.flatnonzero(mask)
+
+
+def write_shard(
+    folder: str | Path, frames: np.ndarray, goals: np.ndarray, controls: np.ndarray
+) -> None:
+    """Write one shard; each of its files appears whole or not at all.
+
+    Args:
+        folder: made if missing.
+        frames: (n, height, width, 3) uint8, sRGB.
+        goals: (n,) integers.
+        controls: (n,) rad/s.
+    """
+    goals = np.asarray(goals, np.int64)
+    controls = np.asarray(controls, np.float32)
+    FrameDataset((np.asarray(frames),), goals, controls)  # checks all three
+    folder = files.make_folder(folder)
+    for name, array in zip(COLUMNS, (frames, goals, controls), strict=True):
+        buffer = io.BytesIO()
+        np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+        files.write_bytes(folder / f"{name}.npy", buffer.getvalue())
+
+
+def _map_column(path: Path, dtype: type) -> np.ndarray:
+    """Memory-map one .npy file and check its type and shape."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); write it again") from error
+    image = len(array.shape) == 4 and array.shape[3] == 3
+    if array.dtype != dtype or not (image if dtype is np.uint8 else array.ndim == 1):
+        raise InputError(
+            f"{path}: {array.dtype} {array.shape}; {np.dtype(dtype)} of shape "
+            f"{'(n, height, width, 3)' if dtype is np.uint8 else '(n,)'} is needed"
+        )
+    return array
