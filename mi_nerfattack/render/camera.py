@@ -295,8 +295,10 @@ def pose_arrays(camera_to_world: np.ndarray) -> tuple[Any, tuple[Any, Any, Any]]
         `generate_rays` takes them.
     """
     matrix = np.asarray(camera_to_world, np.float64).reshape(-1, 4, 4)
-    top = np.ascontiguousarray(matrix[:, :3].transpose(2, 1, 0), np.float32)
+    # not from NumPy memory, whose alignment would select one of several kernels
+    top = matrix[:, :3].transpose(2, 1, 0).tolist()
     columns = [mi.Vector3f(*(mi.Float(row) for row in column)) for column in top]
+    dr.make_opaque(columns)
     return mi.Point3f(columns[3]), (columns[0], columns[1], columns[2])
 
 
