@@ -237,8 +237,8 @@ class _DevicePath:
 
     def __init__(self, route: Route, like: Any) -> None:
         """Upload `route` as arrays of the type of the row `like`."""
-        self.real = dr.detached_t(type(like))
-        self.integer = dr.uint32_array_t(self.real)
+        self.real: Any = dr.detached_t(type(like))
+        self.integer: Any = dr.uint32_array_t(self.real)
         self.x = self.real(route.points[:, 0])
         self.y = self.real(route.points[:, 1])
         self.count = dr.opaque(self.integer, len(route.points) - 1)
