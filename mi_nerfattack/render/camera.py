@@ -176,7 +176,7 @@ def mitsuba_sensor_dict(
     Args:
         camera: square pixels, no distortion (the stock sensor has neither).
         camera_to_world: (4, 4), OpenCV axes, metres.
-        spp: samples per pixel of the `independent` sampler.
+        spp: samples per pixel of the `multijitter` sampler.
         film: more or other properties of the `hdrfilm`, whose defaults here are
             32-bit RGB and a box filter.
 
@@ -202,7 +202,7 @@ def mitsuba_sensor_dict(
         "near_clip": 1e-2,
         "far_clip": 1e4,
         "to_world": mi.ScalarTransform4f(opencv_to_mitsuba(camera_to_world)),
-        "sampler": {"type": "independent", "sample_count": spp},
+        "sampler": {"type": "multijitter", "sample_count": spp},
         "film": {
             "type": "hdrfilm",
             "width": camera.width,

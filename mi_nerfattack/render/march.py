@@ -109,7 +109,9 @@ class PosedField:
         """Map a world ray; ``o + t d`` keeps its meaning with t in world metres."""
         offset = mi.Vector3f(origin - self._origin)
         o = [dr.dot(column, offset) * self._inverse_scale for column in self._columns]
-        d = [dr.dot(column, direction) * self._inverse_scale for column in self._columns]
+        d = [
+            dr.dot(column, direction) * self._inverse_scale for column in self._columns
+        ]
         return mi.Point3f(*o), mi.Vector3f(*d)
 
     def to_world_gradient(
@@ -220,7 +222,6 @@ def _seek(
     return index, t, dr.maximum(width, 0), found
 
 
-@dr.syntax
 def march(
     posed: PosedField,
     origin: mi.Point3f,
@@ -244,31 +245,10 @@ def march(
 
     Source: appendix A.1 to A.3, with the signs of Mildenhall et al. 2020, eq. 3.
     """
-    o, d = posed.to_local(origin, direction)
-    near, far = posed.interval(o, d, t_max)
-    heading = dr.normalize(d)
-    active = mi.Bool(active) & (near < far)
-
-    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
-    transmittance = mi.Float(1)  # T, from the origin to the interval
-    radiance = mi.Color3f(0)  # premultiplied radiance so far
-    moment = mi.Float(0)  # integral of t sigma T so far
-    while active:
-        index, t, width, active = _seek(
-            posed, o, d, index, near, far, jitter, active
-        )
-        density, colour = posed.eval(o + t * d, heading, active)
-        passed = dr.select(active, dr.exp(-density * width), 1)
-        weight = transmittance * (1 - passed)
-        radiance += weight * colour
-        moment += weight * t
-        transmittance *= passed
-        index += 1
-        active &= (transmittance > stop) & (index < MAX_INTERVALS)
-    return March(radiance, 1 - transmittance, moment)
+    with dr.suspend_grad():
+        return _march(posed, origin, direction, t_max, jitter, active, stop)
 
 
-@dr.syntax
 def march_derivative(
     mode: dr.ADMode,
     posed: PosedField,
@@ -305,6 +285,66 @@ def march_derivative(
         the tangent of the march (forward mode; zeros otherwise), and the objective's
         derivative by origin and direction (3, n) (backward mode).
     """
+    with dr.suspend_grad():
+        return _march_derivative(
+            mode,
+            posed,
+            origin,
+            direction,
+            t_max,
+            jitter,
+            active,
+            primal,
+            cotangent,
+            stop,
+        )
+
+
+@dr.syntax
+def _march(
+    posed: PosedField,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    t_max: mi.Float,
+    jitter: mi.Float,
+    active: mi.Bool,
+    stop: float,
+) -> March:
+    o, d = posed.to_local(origin, direction)
+    near, far = posed.interval(o, d, t_max)
+    heading = dr.normalize(d)
+    active = mi.Bool(active) & (near < far)
+
+    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
+    transmittance = mi.Float(1)  # T, from the origin to the interval
+    radiance = mi.Color3f(0)  # premultiplied radiance so far
+    moment = mi.Float(0)  # integral of t sigma T so far
+    while active:
+        index, t, width, active = _seek(posed, o, d, index, near, far, jitter, active)
+        density, colour = posed.eval(o + t * d, heading, active)
+        passed = dr.select(active, dr.exp(-density * width), 1)
+        weight = transmittance * (1 - passed)
+        radiance += weight * colour
+        moment += weight * t
+        transmittance *= passed
+        index += 1
+        active &= (transmittance > stop) & (index < MAX_INTERVALS)
+    return March(radiance, 1 - transmittance, moment)
+
+
+@dr.syntax
+def _march_derivative(
+    mode: dr.ADMode,
+    posed: PosedField,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    t_max: mi.Float,
+    jitter: mi.Float,
+    active: mi.Bool,
+    primal: March,
+    cotangent: March,
+    stop: float,
+) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     backward = mode == dr.ADMode.Backward
     o, d = posed.to_local(origin, direction)
     near, far = posed.interval(o, d, t_max)
@@ -320,9 +360,7 @@ def march_derivative(
     d_heading = mi.Vector3f(0)
     out_radiance, out_opacity, out_moment = mi.Color3f(0), mi.Float(0), mi.Float(0)
     while active:
-        index, t, width, active = _seek(
-            posed, o, d, index, near, far, jitter, active
-        )
+        index, t, width, active = _seek(posed, o, d, index, near, far, jitter, active)
         point = mi.Point3f(o + t * d)
         towards = mi.Vector3f(heading)
         with dr.resume_grad():
