@@ -33,7 +33,7 @@ def linear_to_srgb(value: ArrayT) -> ArrayT:
     is_dark = value <= _LINEAR_KNEE
     # the unused branch must stay away from 0, where its derivative is infinite
     bright = dr.select(is_dark, _LINEAR_KNEE, value)
-    curve = dr.select(is_dark, 12.92 * value, 1.055 * dr.power(bright, 1 / 2.4) - 0.055)
+    curve = dr.select(is_dark, value * 12.92, 1.055 * dr.power(bright, 1 / 2.4) - 0.055)
     return dr.select(value < 0, 0, dr.select(value > 1, 1, curve))
 
 

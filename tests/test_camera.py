@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mi_nerfattack import colour
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render import camera as cam
-from mi_nerfattack import colour
 from mi_nerfattack.render.distortion import distort, undistort
 
 FOX = cam.Camera(
@@ -28,11 +28,7 @@ FOX = cam.Camera(
 )
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    dr.sync_thread()
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def random_poses(n: int, seed: int = 0) -> np.ndarray:

@@ -99,7 +99,7 @@ def render_asset(
     size_px: int,
     seed: int = 0,
     lighting: Lighting | None = None,
-    spp: int = 32,
+    spp: int = 25,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[PosedImages, np.ndarray]:
     """Render a mesh from all sides without background.

@@ -318,8 +318,8 @@ def _mitsuba_shape(part: MeshPart) -> Any:
         parameters["vertex_texcoords"] = mi.Float(uv.ravel())
     parameters.update()
     if part.vertex_colour is not None:
-        colour = np.float32(part.vertex_colour * part.colour)
-        mesh.add_attribute("vertex_color", 3, mi.Float(colour.ravel()))
+        colour = part.vertex_colour * np.array(part.colour)
+        mesh.add_attribute("vertex_color", 3, colour.ravel().tolist())
     return mesh
 
 
@@ -343,7 +343,7 @@ def _tinted(texture: np.ndarray, colour: tuple[float, float, float]) -> np.ndarr
     if colour == (1.0, 1.0, 1.0):
         return np.ascontiguousarray(texture)
     linear = srgb_to_linear_numpy(texture.astype(np.float32) / 255)
-    product = linear_to_srgb_numpy(linear * np.float32(colour))
+    product = linear_to_srgb_numpy(linear * np.array(colour, np.float32))
     return np.round(255 * product).astype(np.uint8)
 
 

@@ -8,6 +8,7 @@ view into the next.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,7 @@ class ViewRenderer:
 
         Args:
             camera_to_world: (4, 4), OpenCV axes, metres.
-            spp: samples per pixel.
+            spp: samples per pixel, at least 1; rounded up to a grid (32 to 35).
             seed: of the samples, in [0, 2^32).
         """
         to_world = mi.Transform4f(opencv_to_mitsuba(camera_to_world))
@@ -90,8 +91,8 @@ class ViewRenderer:
             self.scene,
             sensor=self._sensor,
             integrator=self._integrator,
-            spp=spp,
-            seed=seed,
+            spp=_grid_samples(spp),
+            seed=mi.UInt32(seed),
         ).numpy()
         return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
 
@@ -101,6 +102,14 @@ class ViewRenderer:
         o, d = generate_rays(self.camera, origin, rotation, 1)
         t = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
         return t.numpy().reshape(self.camera.height, self.camera.width)
+
+
+def _grid_samples(spp: int) -> int:
+    """Round up as the `multijitter` sampler does, which warns where it has to."""
+    if spp < 1:
+        raise InputError(f"spp: {spp}; must be at least 1")
+    rows = math.isqrt(spp)
+    return rows * -(-spp // rows)
 
 
 def iterate_views(
@@ -176,7 +185,9 @@ def drive_poses(
     rng = np.random.default_rng(seed)
     along = rng.uniform(0, 1, n)
     cut = _LATERAL_MAX / _LATERAL_SD
-    lateral = truncnorm.rvs(-cut, cut, scale=_LATERAL_SD, size=n, random_state=rng)
+    lateral = _LATERAL_SD * np.asarray(
+        truncnorm.rvs(-cut, cut, size=n, random_state=rng)
+    )
     any_heading = rng.uniform(size=n) < _ANY_HEADING_SHARE
     heading = np.where(
         any_heading,
