@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.distortion import distort, jacobian, undistort
@@ -142,7 +143,7 @@ def mitsuba_to_opencv(matrix: np.ndarray) -> np.ndarray:
     return _flip_columns(matrix, (-1, -1, 1))
 
 
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+def look_at(eye: ArrayLike, target: ArrayLike) -> np.ndarray:
     """Place an upright camera (up is +z).
 
     Args:
@@ -153,6 +154,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     Returns:
         camera_to_world: (4, 4), OpenCV axes, float64.
     """
+    eye = np.asarray(eye, np.float64)
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
