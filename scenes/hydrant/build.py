@@ -29,10 +29,9 @@ def _cylinder(radius: float, low: float, high: float, colour, sides: int = 32):
 
 
 def _painted(part: trimesh.Trimesh, colour) -> trimesh.Trimesh:
-    """Give every face vertices of its own and one colour."""
-    part.unmerge_vertices()
+    """Give every face one colour."""
     part.visual = trimesh.visual.ColorVisuals(
-        part, vertex_colors=np.tile(np.uint8(colour), (len(part.vertices), 1))
+        part, face_colors=np.tile(np.uint8(colour), (len(part.faces), 1))
     )
     return part
 
@@ -97,6 +96,10 @@ def world_mesh() -> trimesh.Trimesh:
 def build(path: Path) -> None:
     """Write the hydrant as binary glTF."""
     mesh = world_mesh()
+    # Colours change at edges, therefore every face gets vertices of its own.
+    colours = np.repeat(mesh.visual.face_colors, 3, axis=0)
+    mesh.unmerge_vertices()
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
     mesh.apply_transform(_Z_UP_TO_Y_UP)
     path.write_bytes(trimesh.Scene({"hydrant": mesh}).export(file_type="glb"))
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from .city import BUILDINGS, build_city
 from .facades import paint_atlas
+from .furniture import furnish
 from .ground import grass, pavement, roads
 from .layout import routes
 from .paint import grass_image, pavement_image, road_images, write_png
@@ -37,12 +38,13 @@ _SCENE = """<!-- T-intersection: metres, z up, linear image needs no exposure. -
 
     <integrator type="path">
         <integer name="max_depth" value="4"/>
+        <integer name="rr_depth" value="2"/>
     </integrator>
 
     <sensor type="perspective" id="overview">
         <float name="fov" value="60"/>
         <transform name="to_world">
-            <lookat origin="-38, -48, 34" target="0, -8, 0" up="0, 0, 1"/>
+            <lookat origin="-30, -48, 34" target="4, -6, 0" up="0, 0, 1"/>
         </transform>
         <sampler type="independent">
             <integer name="sample_count" value="$spp"/>
@@ -57,8 +59,8 @@ _SCENE = """<!-- T-intersection: metres, z up, linear image needs no exposure. -
     <emitter type="sunsky" id="sky">
         <vector name="sun_direction" value="-0.44, -0.50, 0.75"/>
         <float name="turbidity" value="4"/>
-        <float name="sun_scale" value="2.2"/>
-        <float name="sky_scale" value="3.8"/>
+        <float name="sun_scale" value="2.5"/>
+        <float name="sky_scale" value="3.0"/>
     </emitter>
 
 {shapes}</scene>
@@ -72,7 +74,7 @@ def build(folder: Path, seed: int) -> list[Path]:
     meshes = roads() | {
         "pavement": pavement(),
         "grass": grass(),
-        "city": build_city(seed),
+        "city": build_city(seed, furnish),
     }
     images = road_images(seed) | {
         "pavement": pavement_image(seed),
@@ -86,7 +88,7 @@ def build(folder: Path, seed: int) -> list[Path]:
         files.append(folder / "textures" / f"{name}.png")
         write_png(files[-1], images[name])
     shapes = "".join(
-        _SHAPE.format(name=name, wrap="repeat" if name == "pavement" else "clamp")
+        _SHAPE.format(name=name, wrap="repeat" if name in ("pavement", "grass") else "clamp")
         for name in meshes
     )
     texts = {

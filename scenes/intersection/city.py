@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,6 +119,21 @@ class City:
         uv = swatch_uv(colour, self._n, unit)
         self.mesh.add(vertices + np.asarray(centre), uv, faces)
 
+    def disc(self, centre, radius: float, depth: float, face: float, colour) -> None:
+        """Append an upright octagonal plate that looks along the angle face."""
+        angle = 2 * np.pi * (np.arange(8) + 0.5) / 8
+        y, z = radius * np.cos(angle), radius * np.sin(angle)
+        front = np.stack([np.full(8, depth / 2), y, z], axis=1)
+        back = front * [-1, 1, 1]
+        uv = swatch_uv(colour, self._n, 0.5 + 0.4 * np.stack([y, z], 1) / radius)
+        place = np.asarray(centre)
+        self.mesh.polygon(rotate_z(front, face) + place, uv)
+        self.mesh.polygon(rotate_z(back[::-1], face) + place, uv[::-1])
+        for i in range(8):
+            j = (i + 1) % 8
+            rim = np.array([back[i], back[j], front[j], front[i]])
+            self.mesh.quad(rotate_z(rim, face) + place, uv[[i, j, j, i]])
+
     def building(self, index: int) -> None:
         """Append a building of the list with its roof."""
         item = BUILDINGS[index]
@@ -182,10 +198,13 @@ class City:
         self.box(head, (0.75, 0.32, 0.2), "lamp", angle)
 
 
-def build_city(seed: int) -> MeshBuilder:
-    """Return everything above ground as one mesh."""
-    from .furniture import furnish
+def build_city(seed: int, furnish: Callable[[City], None]) -> MeshBuilder:
+    """Return everything above ground as one mesh.
 
+    Args:
+        seed: of the trees' shapes.
+        furnish: appends what is not a building.
+    """
     city = City(seed)
     for index in range(len(BUILDINGS)):
         city.building(index)

@@ -42,8 +42,7 @@ def _sign(city: City, x: float, y: float, face: float, colour: str, kind: str) -
             (0.1, 1.5, 0.2), "white", face,
         )  # fmt: skip
     else:
-        city.box(place + [0, 0, 1.85], (0.1, 0.5, 0.9), colour, face)
-        city.box(place + [0, 0, 2.05], (0.102, 0.9, 0.5), colour, face)
+        city.disc(place + [0, 0, 2.3], 0.48, 0.1, face, colour)
 
 
 def _car(city: City, x: float, y: float, angle: float, colour: str) -> None:

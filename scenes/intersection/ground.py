@@ -15,7 +15,8 @@ from .layout import (
 from .mesh import MeshBuilder
 from .paint import SIDE_ROAD_TOP
 
-EXTENT = 85.0
+EXTENT = 400.0
+_LAWN_IMAGE = 80.0
 _REPEAT = 16.0
 _TURN_STEPS = 12
 
@@ -102,7 +103,7 @@ def grass() -> MeshBuilder:
             [[-inner, -EXTENT], [inner, -EXTENT], [inner, -end], [-inner, -end]]
         ),
     ]
-    side = 2 * EXTENT
+    side = 2 * _LAWN_IMAGE
     for region in regions:
         corners = np.column_stack([region, np.full(len(region), KERB_HEIGHT)])
         uv = np.column_stack([0.5 + region[:, 0] / side, 0.5 - region[:, 1] / side])
