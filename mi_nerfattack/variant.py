@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import logging
 import os
 
@@ -98,7 +97,4 @@ def _on_change(old: str | None, new: str) -> None:
 
 
 def _register() -> None:
-    if importlib.util.find_spec(_PLUGINS) is None:
-        _log.warning("plugins not registered: %s is not installed", _PLUGINS)
-        return
     importlib.import_module(_PLUGINS).register()
