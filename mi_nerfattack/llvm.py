@@ -22,10 +22,9 @@ PACKAGE = "karellen-llvm-core"
 MINIMUM = 17
 MINIMUM_SYSTEM = 19
 
-_REMEDY = (
+_INSTALL = (
     f"install one with 'pip install {PACKAGE}' (Linux x86-64) or from the system's "
-    f"packages (libllvm{MINIMUM_SYSTEM} or newer), or set {VARIABLE} to its file, "
-    "and import mi_nerfattack before drjit and mitsuba"
+    f"packages (libllvm{MINIMUM_SYSTEM} or newer), or set {VARIABLE} to its file"
 )
 _LIBRARY = re.compile(r"libLLVM(?:[-.\d]*)(?:\.so[.\d]*|\.dylib)$")
 _RUNTIME = ("libunwind", "libc++abi", "libc++")
@@ -87,14 +86,26 @@ def check_version() -> tuple[int, int, int]:
     chosen = os.environ.get(VARIABLE)
     if found is None:
         where = "no LLVM library found" if chosen is None else f"cannot load {chosen}"
-        raise SetupError(f"{VARIABLE}: {where}; {_REMEDY}")
+        raise SetupError(f"{VARIABLE}: {where}; {_remedy()}")
     if found[0] < MINIMUM:
         name = ".".join(map(str, found))
         raise SetupError(
             f"{VARIABLE}: LLVM {name} is loaded, {MINIMUM} or newer is needed; "
-            f"{_REMEDY}"
+            f"{_remedy()}"
         )
     return found
+
+
+def _remedy() -> str:
+    library = locate()
+    if library.origin in ("package", "system"):
+        return (
+            "import mi_nerfattack before drjit and mitsuba, or start Python with "
+            f"{VARIABLE}={library.path}"
+        )
+    if _find_in_package() is not None:
+        return f"unset {VARIABLE} to use the library of {PACKAGE}"
+    return _INSTALL
 
 
 def _find_in_package() -> Path | None:

@@ -95,8 +95,17 @@ def test_old_version_is_refused(monkeypatch, found):
 
 
 def test_missing_library_is_refused(monkeypatch, without_variable):
+    monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
+    monkeypatch.setattr(llvm, "_system_folders", lambda: [])
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (-1, -1, -1))
     with pytest.raises(SetupError, match="no LLVM library found; install one"):
+        llvm.check_version()
+
+
+@needs_package
+def test_late_import_is_told_what_to_do(monkeypatch, without_variable):
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 7))
+    with pytest.raises(SetupError, match="import mi_nerfattack before drjit"):
         llvm.check_version()
 
 
