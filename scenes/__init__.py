@@ -1,1 +1,26 @@
-"""Bundled scenes."""
+"""Bundled scenes, fields, policy and routes: data and the scripts that made them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mi_nerfattack.errors import InputError
+
+from .listing import ROOT, data_files
+
+
+def bundled(name: str) -> Path:
+    """Return the path of a bundled file or folder.
+
+    Args:
+        name: relative to this package with forward slashes, for instance
+            ``"intersection/scene.xml"``.
+
+    Raises:
+        InputError: nothing of this name is bundled; the message lists what is.
+    """
+    path = (ROOT / name).resolve()
+    if path.is_relative_to(ROOT) and path.exists():
+        return path
+    known = ", ".join(data_files(ROOT))
+    raise InputError(f"{name}: not a bundled file or folder; there are {known}")

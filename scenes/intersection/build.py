@@ -88,7 +88,9 @@ def build(folder: Path, seed: int) -> list[Path]:
         files.append(folder / "textures" / f"{name}.png")
         write_png(files[-1], images[name])
     shapes = "".join(
-        _SHAPE.format(name=name, wrap="repeat" if name in ("pavement", "grass") else "clamp")
+        _SHAPE.format(
+            name=name, wrap="repeat" if name in ("pavement", "grass") else "clamp"
+        )
         for name in meshes
     )
     texts = {

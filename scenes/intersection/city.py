@@ -35,7 +35,10 @@ _PALE, _GREY, _DARK = (0.88, 0.86, 0.80), (0.60, 0.60, 0.60), (0.34, 0.33, 0.34)
 BUILDINGS = [
     Building((-47, -35, 10, 19), 8.0, _look((0.70, 0.36, 0.30), _PALE, 3, 6), "gravel"),
     Building(
-        (-32, -21, 9.5, 19), 9.5, _look((0.90, 0.84, 0.66), _GREY, 3, 5, "green"), "tile"
+        (-32, -21, 9.5, 19),
+        9.5,
+        _look((0.90, 0.84, 0.66), _GREY, 3, 5, "green"),
+        "tile",
     ),
     Building(
         (-18, -6, 11, 20), 6.2, _look((0.55, 0.69, 0.80), _PALE, 2, 5), "slate", True
@@ -50,13 +53,23 @@ BUILDINGS = [
         (12.5, 22, 11, 20), 6.5, _look((0.92, 0.77, 0.38), _PALE, 2, 4), "tile", True
     ),
     Building(
-        (25, 36, 9.5, 19), 9.0, _look((0.52, 0.66, 0.50), _DARK, 3, 7, "", True), "slate"
+        (25, 36, 9.5, 19),
+        9.0,
+        _look((0.52, 0.66, 0.50), _DARK, 3, 7, "", True),
+        "slate",
     ),
     Building(
-        (38.5, 47, 10, 19), 7.0, _look((0.66, 0.56, 0.70), _PALE, 2, 4, "blue"), "gravel"
+        (38.5, 47, 10, 19),
+        7.0,
+        _look((0.66, 0.56, 0.70), _PALE, 2, 4, "blue"),
+        "gravel",
     ),
     Building(
-        (-45, -33, -21, -10.5), 6.8, _look((0.86, 0.68, 0.64), _GREY, 2, 5), "tile", True
+        (-45, -33, -21, -10.5),
+        6.8,
+        _look((0.86, 0.68, 0.64), _GREY, 2, 5),
+        "tile",
+        True,
     ),
     Building(
         (-26, -12, -22, -11.5),
@@ -77,19 +90,27 @@ BUILDINGS = [
         (28, 41, -20, -10.5), 6.0, _look((0.82, 0.80, 0.58), _DARK, 2, 6), "slate", True
     ),
     Building(
-        (10.5, 20, -43, -27), 9.0, _look((0.42, 0.60, 0.60), _PALE, 3, 5, "", True), "tile"
+        (10.5, 20, -43, -27),
+        9.0,
+        _look((0.42, 0.60, 0.60), _PALE, 3, 5, "", True),
+        "tile",
     ),
     Building(
         (50, 57, -11, 9), 8.5, _look((0.84, 0.60, 0.30), _DARK, 3, 8, "cyan"), "gravel"
     ),
     Building(
-        (-58, -51, -10, 9), 7.5, _look((0.68, 0.74, 0.80), _DARK, 3, 8, "", True), "slate"
+        (-58, -51, -10, 9),
+        7.5,
+        _look((0.68, 0.74, 0.80), _DARK, 3, 8, "", True),
+        "slate",
     ),
     Building(
-        (-10, 9.5, -57, -50.5), 8.0, _look((0.78, 0.44, 0.46), _PALE, 3, 8, "purple"),
+        (-10, 9.5, -57, -50.5),
+        8.0,
+        _look((0.78, 0.44, 0.46), _PALE, 3, 8, "purple"),
         "gravel",
     ),
-]  # fmt: skip
+]
 
 
 class City:
@@ -155,7 +176,9 @@ class City:
             self.mesh.quad(top, uv)
             rise = np.array([0.0, 0.0, 1.6])
             inner = np.array([x0 + 2.5, y0 + 3.0, high[2]])
-            shed = box_faces(inner, np.array([inner[0] + 3, inner[1] + 3, inner[2]]) + rise)
+            shed = box_faces(
+                inner, np.array([inner[0] + 3, inner[1] + 3, inner[2]]) + rise
+            )
             for corners in shed.values():
                 self.mesh.quad(corners, swatch_uv("concrete", self._n, _UNIT))
 

@@ -96,12 +96,12 @@ def grass() -> MeshBuilder:
     regions = [
         np.array(west),
         (np.array(west) * [-1, 1])[::-1],
-        np.array([[-EXTENT, inner], [EXTENT, inner], [EXTENT, EXTENT], [-EXTENT, EXTENT]]),
+        np.array(
+            [[-EXTENT, inner], [EXTENT, inner], [EXTENT, EXTENT], [-EXTENT, EXTENT]]
+        ),
         np.array([[end, -inner], [EXTENT, -inner], [EXTENT, inner], [end, inner]]),
         np.array([[-EXTENT, -inner], [-end, -inner], [-end, inner], [-EXTENT, inner]]),
-        np.array(
-            [[-inner, -EXTENT], [inner, -EXTENT], [inner, -end], [-inner, -end]]
-        ),
+        np.array([[-inner, -EXTENT], [inner, -EXTENT], [inner, -end], [-inner, -end]]),
     ]
     side = 2 * _LAWN_IMAGE
     for region in regions:

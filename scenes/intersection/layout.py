@@ -19,7 +19,8 @@ def road_depth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the signed distance to the nearest kerb, positive on the road.
 
     Args:
-        x, y: world coordinates, metres, of one shape.
+        x: world coordinates, metres, of any shape.
+        y: likewise, of the same shape.
     """
     x = np.abs(x)
     centre = LANE_WIDTH + KERB_RADIUS
@@ -45,9 +46,7 @@ def corner_kerb(side: int, steps: int = 12) -> np.ndarray:
         [-centre + KERB_RADIUS * np.cos(angle), -centre + KERB_RADIUS * np.sin(angle)],
         axis=1,
     )
-    line = np.concatenate(
-        [[[-ROAD_END, -LANE_WIDTH]], arc, [[-LANE_WIDTH, -ROAD_END]]]
-    )
+    line = np.concatenate([[[-ROAD_END, -LANE_WIDTH]], arc, [[-LANE_WIDTH, -ROAD_END]]])
     return line * np.array([-side, 1.0])
 
 
@@ -55,7 +54,9 @@ def _turn(start, corner, end, radius: float) -> np.ndarray:
     """Sample two straights joined by an arc at equal steps of arc length.
 
     Args:
-        start, corner, end: (2,) points; the straights meet at the corner at 90 degrees.
+        start: (2,), metres.
+        corner: (2,), where the straights would meet at 90 degrees.
+        end: (2,), metres.
         radius: of the arc, metres.
     """
     start, corner, end = (np.asarray(p, dtype=np.float64) for p in (start, corner, end))
@@ -65,7 +66,10 @@ def _turn(start, corner, end, radius: float) -> np.ndarray:
     arc = 0.5 * np.pi * radius
     last = np.linalg.norm(end - corner) - radius
     centre = corner - radius * before + radius * after
-    s = ROUTE_SPACING * np.arange(int((first + arc + last) / ROUTE_SPACING) + 1)[:, None]
+    s = (
+        ROUTE_SPACING
+        * np.arange(int((first + arc + last) / ROUTE_SPACING) + 1)[:, None]
+    )
     angle = np.clip((s - first) / radius, 0.0, 0.5 * np.pi)
     curve = centre + radius * (np.sin(angle) * before - np.cos(angle) * after)
     lead = np.minimum(s - first, 0.0) * before

@@ -92,12 +92,15 @@ def road_colour(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     return colour * (1 - paint) + WHITE * paint
 
 
-def pixel_grid(x0: float, x1: float, y0: float, y1: float, scale: float) -> tuple:
+def pixel_grid(
+    x0: float, x1: float, y0: float, y1: float, scale: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (h, w) of the pixel centres; row 0 lies at y1."""
     width, height = round((x1 - x0) * scale), round((y1 - y0) * scale)
     x = x0 + (np.arange(width) + 0.5) / scale
     y = y1 - (np.arange(height) + 0.5) / scale
-    return np.meshgrid(x, y)
+    across, up = np.meshgrid(x, y)
+    return across, up
 
 
 def road_images(seed: int) -> dict[str, np.ndarray]:

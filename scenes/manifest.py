@@ -1,0 +1,125 @@
+"""Checksums and origin of the bundled data files.
+
+``python -m mi_nerfattack.scenes.manifest check`` compares the files with
+``manifest.json``; ``... record FILE... --command '...' [--seed N] [--note '...']``
+adds or updates entries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.errors import InputError, NerfAttackError
+from mi_nerfattack.files import read_json, write_json
+
+from .listing import MANIFEST, ROOT, data_files
+
+LIMIT_BYTES = 40_000_000
+_KEYS = {"command", "seed", "sha256", "bytes", "machine", "note"}
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file as hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def load(root: Path = ROOT) -> dict[str, dict[str, Any]]:
+    """Return the entries of the manifest by file name; none if there is no manifest.
+
+    Raises:
+        InputError: the manifest lacks ``files`` or an entry lacks a key.
+    """
+    path = root / MANIFEST
+    if not path.exists():
+        return {}
+    entries = read_json(path).get("files")
+    if not isinstance(entries, dict):
+        raise InputError(f"{path}: 'files' is missing; record the files anew")
+    for name, entry in entries.items():
+        if set(entry) != _KEYS:
+            raise InputError(
+                f"{path}: entry {name!r} has the keys {sorted(entry)}; "
+                f"it needs {sorted(_KEYS)}"
+            )
+    return entries
+
+
+def problems(root: Path = ROOT) -> list[str]:
+    """Return one line for each file that is missing, changed or not listed."""
+    entries = load(root)
+    present = set(data_files(root))
+    lines = [f"{name}: missing" for name in sorted(set(entries) - present)]
+    lines += [f"{name}: not listed" for name in sorted(present - set(entries))]
+    for name in sorted(present & set(entries)):
+        size, expected = (root / name).stat().st_size, entries[name]["bytes"]
+        if size != expected:
+            lines.append(f"{name}: {size} bytes; the manifest says {expected}")
+        elif digest(root / name) != entries[name]["sha256"]:
+            lines.append(f"{name}: SHA-256 differs from the manifest's")
+    total = sum((root / name).stat().st_size for name in present)
+    if total >= LIMIT_BYTES:
+        lines.append(f"all files: {total} bytes; the limit is {LIMIT_BYTES}")
+    return lines
+
+
+def record(
+    paths: list[Path], command: str, seed: int | None, note: str, root: Path = ROOT
+) -> None:
+    """Add or update the entries of files below root.
+
+    Args:
+        paths: the files.
+        command: that wrote them, as typed in the repository's root.
+        seed: of the command; None if it draws no random numbers.
+        note: what the files are and their licence.
+        root: folder of the manifest.
+
+    Raises:
+        InputError: a path does not exist or lies outside root.
+    """
+    entries = load(root)
+    for path in paths:
+        path = path.resolve()
+        if not path.is_file() or not path.is_relative_to(root.resolve()):
+            raise InputError(f"{path}: not a file below {root}; name a bundled file")
+        entries[path.relative_to(root.resolve()).as_posix()] = {
+            "command": command,
+            "seed": seed,
+            "sha256": digest(path),
+            "bytes": path.stat().st_size,
+            "machine": f"{platform.system()} {platform.machine()}",
+            "note": note,
+        }
+    write_json(root / MANIFEST, {"files": dict(sorted(entries.items()))})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    actions = parser.add_subparsers(dest="action", required=True)
+    actions.add_parser("check")
+    recorder = actions.add_parser("record")
+    recorder.add_argument("files", type=Path, nargs="+")
+    recorder.add_argument("--command", required=True)
+    recorder.add_argument("--seed", type=int)
+    recorder.add_argument("--note", default="")
+    given = parser.parse_args(arguments)
+    try:
+        if given.action == "record":
+            record(given.files, given.command, given.seed, given.note)
+            return 0
+        lines = problems()
+    except NerfAttackError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print("\n".join(lines) if lines else f"{len(load())} files match the manifest")
+    return 1 if lines else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

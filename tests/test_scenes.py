@@ -1,0 +1,176 @@
+"""Bundled data: checksums, reproducible builds, geometry of routes and hydrant."""
+
+from __future__ import annotations
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenes import bundled, manifest
+from mi_nerfattack.scenes.hydrant import build as hydrant
+from mi_nerfattack.scenes.intersection import build as intersection
+from mi_nerfattack.scenes.intersection import layout
+
+
+def route(name: str) -> np.ndarray:
+    data = json.loads(bundled("intersection/routes.json").read_text())
+    return np.array(data[name]["points_m"])
+
+
+def test_manifest_matches() -> None:
+    assert manifest.problems() == []
+
+
+def test_manifest_reports_each_kind_of_difference(tmp_path) -> None:
+    for name in ("same", "changed", "longer", "missing"):
+        (tmp_path / f"{name}.bin").write_bytes(b"abc")
+    manifest.record(sorted(tmp_path.iterdir()), "make", 1, "", root=tmp_path)
+    (tmp_path / "changed.bin").write_bytes(b"abd")
+    (tmp_path / "longer.bin").write_bytes(b"abcd")
+    (tmp_path / "missing.bin").unlink()
+    (tmp_path / "extra.bin").write_bytes(b"")
+    assert manifest.problems(tmp_path) == [
+        "missing.bin: missing",
+        "extra.bin: not listed",
+        "changed.bin: SHA-256 differs from the manifest's",
+        "longer.bin: 4 bytes; the manifest says 3",
+    ]
+
+
+def test_recording_a_file_elsewhere_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="not a file below"):
+        manifest.record([tmp_path / "no"], "make", None, "")
+
+
+@pytest.mark.parametrize("name", ["nothing.xml", "../pyproject.toml"])
+def test_unknown_name_lists_what_exists(name: str) -> None:
+    with pytest.raises(InputError, match=r"intersection/scene\.xml"):
+        bundled(name)
+
+
+def test_intersection_builds_to_identical_bytes(tmp_path) -> None:
+    first = intersection.build(tmp_path / "a", seed=3)
+    second = intersection.build(tmp_path / "b", seed=3)
+    other = intersection.build(tmp_path / "c", seed=4)
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
+    assert [p.read_bytes() for p in first] != [p.read_bytes() for p in other]
+
+
+def test_hydrant_builds_to_identical_bytes(tmp_path) -> None:
+    hydrant.build(tmp_path / "a.glb")
+    hydrant.build(tmp_path / "b.glb")
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["straight", "right", "left"])
+def test_route_is_evenly_spaced_and_smooth(name: str) -> None:
+    points = route(name)
+    step = np.diff(points, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    # A chord of an arc of radius r >= 6.75 is shorter than 0.5 by at most 0.5^3/24/r^2.
+    assert np.all((length > 0.5 - 0.5**3 / 24 / 6.75**2 - 2e-6) & (length < 0.5 + 2e-6))
+    assert length.sum() >= 42
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    # Between chords an arc of radius r turns by at most 0.5/r.
+    assert np.abs(np.diff(heading)).max() <= 0.5 / 6.75 + 1e-5
+
+
+def test_routes_lie_on_the_lane_centres() -> None:
+    x, y = route("straight").T
+    np.testing.assert_allclose(y, -1.75, atol=1e-6)
+    assert (x[0], x[-1]) == (-25, 35)
+
+    x, y = route("right").T
+    assert (x[0], y[0]) == (-22, -1.75)
+    assert abs(y[-1] + 30) < 0.5
+    east, south = x <= -8.5, y <= -8.5
+    np.testing.assert_allclose(y[east], -1.75, atol=1e-6)
+    np.testing.assert_allclose(x[south], -1.75, atol=1e-6)
+    arc = ~east & ~south
+    radius = np.hypot(x[arc] + 8.5, y[arc] + 8.5)
+    np.testing.assert_allclose(radius, 6.75, atol=2e-6)
+
+    x, y = route("left").T
+    assert (x[0], y[0]) == (1.75, -24)
+    assert abs(x[-1] + 30) < 0.5
+    north, west = y <= -7.25, x <= -7.25
+    np.testing.assert_allclose(x[north], 1.75, atol=1e-6)
+    np.testing.assert_allclose(y[west], 1.75, atol=1e-6)
+    arc = ~north & ~west
+    np.testing.assert_allclose(np.hypot(x[arc] + 7.25, y[arc] + 7.25), 9.0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "expected"),
+    [
+        (0.0, 0.0, 3.5),
+        (-20.0, -1.75, 1.75),
+        (20.0, 3.0, 0.5),
+        (1.75, -30.0, 1.75),
+        (-8.5, -3.5, 0.0),
+        (3.5, -8.5, 0.0),
+        (8.5 - 5 / 2**0.5, -8.5 + 5 / 2**0.5, 0.0),
+        (-30.0, 5.0, -1.5),
+        (6.0, -20.0, -2.5),
+    ],
+)
+def test_distance_to_the_kerb(x: float, y: float, expected: float) -> None:
+    depth = layout.road_depth(np.array([x]), np.array([y]))
+    np.testing.assert_allclose(depth, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["straight", "right", "left"])
+def test_a_car_on_the_route_stays_off_the_kerbs(name: str) -> None:
+    x, y = route(name).T
+    assert layout.road_depth(x, y).min() >= 1.75 - 1e-5
+
+
+def test_scene_loads_and_is_exposed(variant: str) -> None:
+    scene = mi.load_file(str(bundled("intersection/scene.xml")), width=48, height=32)
+    image = np.array(mi.render(scene, spp=16, seed=0))[..., :3]
+    assert image.shape == (32, 48, 3)
+    assert np.all(np.isfinite(image))
+    assert 0.05 < image.mean() < 0.5
+    assert np.mean(image.max(axis=-1) > 1) < 0.02
+    assert np.mean(image.max(axis=-1) < 0.01) < 0.02
+
+
+def test_markings_are_where_the_lanes_are(variant: str) -> None:
+    """Look straight down: paint is brighter than the asphalt beside it."""
+    scene = mi.load_file(str(bundled("intersection/scene.xml")))
+
+    def colour(x: float, y: float) -> float:
+        ray = mi.Ray3f(mi.Point3f(x, y, 3.0), mi.Vector3f(0, 0, -1))
+        si = scene.ray_intersect(ray)
+        np.testing.assert_allclose(np.array(si.p.z), 0.0, atol=1e-5)
+        return float(np.mean(np.array(si.bsdf(ray).eval_diffuse_reflectance(si))))
+
+    for paint, asphalt in (
+        ((-30.0, 3.15), (-30.0, 2.6)),  # north edge line
+        ((11.5, 0.0), (14.5, 0.0)),  # centre dash and gap
+        ((0.0, -17.0), (0.0, -20.0)),  # the same on the side road
+        ((1.5, -14.1), (-1.5, -14.1)),  # stop line of the northbound lane
+        ((0.5, -11.5), (0.0, -11.5)),  # crosswalk
+    ):
+        assert colour(*paint) > 2.5 * colour(*asphalt)
+
+
+def test_hydrant_is_metric_closed_and_upright() -> None:
+    world = hydrant.world_mesh()
+    np.testing.assert_allclose(world.bounds[:, 2], [0.0, 0.75], atol=1e-9)
+    for part in hydrant.world_parts():
+        assert part.is_watertight and part.volume > 0
+    loaded = trimesh.load(bundled("hydrant/hydrant.glb"), force="mesh")
+    x, y, z = np.asarray(loaded.vertices).T
+    back = np.stack([x, -z, y], axis=1)  # glTF's y up to z up
+    np.testing.assert_allclose(
+        [back.min(axis=0), back.max(axis=0)], world.bounds, atol=1e-6
+    )
+    # Upright: the flange at the foot is wider than the nut at the top.
+    foot, top = back[back[:, 2] < 0.03], back[back[:, 2] > 0.74]
+    assert np.hypot(*foot.T[:2]).max() > 3 * np.hypot(*top.T[:2]).max()
+    assert bundled("hydrant/hydrant.glb").stat().st_size < 300_000
