@@ -13,7 +13,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenes import bundled, manifest
 from mi_nerfattack.scenes.hydrant import build as hydrant
 from mi_nerfattack.scenes.intersection import build as intersection
-from mi_nerfattack.scenes.intersection import layout
+from mi_nerfattack.scenes.intersection import layout, paint
 
 
 def route(name: str) -> np.ndarray:
@@ -55,9 +55,14 @@ def test_unknown_name_lists_what_exists(name: str) -> None:
 def test_intersection_builds_to_identical_bytes(tmp_path) -> None:
     first = intersection.build(tmp_path / "a", seed=3)
     second = intersection.build(tmp_path / "b", seed=3)
-    other = intersection.build(tmp_path / "c", seed=4)
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
-    assert [p.read_bytes() for p in first] != [p.read_bytes() for p in other]
+
+
+def test_seed_changes_the_road() -> None:
+    x, y = paint.pixel_grid(-5, 5, -3, 3, 2)
+    one, two = paint.road_colour(x, y, 3), paint.road_colour(x, y, 4)
+    assert np.abs(one - two).max() > 0.01
+    np.testing.assert_array_equal(one, paint.road_colour(x, y, 3))
 
 
 def test_hydrant_builds_to_identical_bytes(tmp_path) -> None:
@@ -162,7 +167,7 @@ def test_markings_are_where_the_lanes_are(variant: str) -> None:
 def test_hydrant_is_metric_closed_and_upright() -> None:
     world = hydrant.world_mesh()
     np.testing.assert_allclose(world.bounds[:, 2], [0.0, 0.75], atol=1e-9)
-    for part in hydrant.world_parts():
+    for part, _ in hydrant.parts():
         assert part.is_watertight and part.volume > 0
     loaded = trimesh.load(bundled("hydrant/hydrant.glb"), force="mesh")
     x, y, z = np.asarray(loaded.vertices).T

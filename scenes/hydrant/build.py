@@ -21,53 +21,45 @@ _Z_UP_TO_Y_UP = np.array(
 )
 
 
-def _cylinder(radius: float, low: float, high: float, colour, sides: int = 32):
+Part = tuple[trimesh.Trimesh, tuple[int, int, int, int]]
+
+
+def _cylinder(radius: float, low: float, high: float, colour, sides: int = 32) -> Part:
     """Return an upright cylinder between two heights, metres."""
-    part = trimesh.creation.cylinder(radius, high - low, sections=sides)
-    part.apply_translation([0, 0, 0.5 * (low + high)])
-    return _painted(part, colour)
+    mesh = trimesh.creation.cylinder(radius, high - low, sections=sides)
+    mesh.apply_translation([0, 0, 0.5 * (low + high)])
+    return mesh, colour
 
 
-def _painted(part: trimesh.Trimesh, colour) -> trimesh.Trimesh:
-    """Give every face one colour."""
-    part.visual = trimesh.visual.ColorVisuals(
-        part, face_colors=np.tile(np.uint8(colour), (len(part.faces), 1))
-    )
-    return part
-
-
-def _nozzle(angle: float, height: float, radius: float, reach: float) -> list:
+def _nozzle(angle: float, height: float, radius: float, reach: float) -> list[Part]:
     """Return a side outlet with flange, cap and nut along a horizontal direction."""
     rings = [
-        (radius, 0.06, reach - 0.035, _RED, 24),
-        (1.25 * radius, reach - 0.035, reach - 0.015, _RED, 24),
-        (1.12 * radius, reach - 0.018, reach + 0.02, _YELLOW, 24),
-        (0.4 * radius, reach + 0.015, reach + 0.045, _YELLOW, 5),
+        _cylinder(radius, 0.06, reach - 0.035, _RED, 24),
+        _cylinder(1.25 * radius, reach - 0.035, reach - 0.015, _RED, 24),
+        _cylinder(1.12 * radius, reach - 0.018, reach + 0.02, _YELLOW, 24),
+        _cylinder(0.4 * radius, reach + 0.015, reach + 0.045, _YELLOW, 5),
     ]
     turn = trimesh.transformations.rotation_matrix(0.5 * np.pi, [0, 1, 0])
     spin = trimesh.transformations.rotation_matrix(angle, [0, 0, 1])
-    parts = []
-    for r, low, high, colour, sides in rings:
-        part = _cylinder(r, low, high, colour, sides)
-        part.apply_transform(turn)
-        part.apply_transform(spin)
-        part.apply_translation([0, 0, height])
-        parts.append(part)
-    return parts
+    for mesh, _ in rings:
+        mesh.apply_transform(turn)
+        mesh.apply_transform(spin)
+        mesh.apply_translation([0, 0, height])
+    return rings
 
 
-def _bonnet(low: float, radius: float, rise: float) -> trimesh.Trimesh:
+def _bonnet(low: float, radius: float, rise: float) -> Part:
     """Return the closed dome on top of the barrel."""
     angle = np.linspace(0.0, 0.5 * np.pi, 9)
     profile = np.stack([radius * np.cos(angle), low + rise * np.sin(angle)], axis=1)
     profile[-1, 0] = 0.0
     profile = np.concatenate([[[0.0, low]], profile])
-    return _painted(trimesh.creation.revolve(profile, sections=32), _WHITE)
+    return trimesh.creation.revolve(profile, sections=32), _WHITE
 
 
-def world_parts() -> list[trimesh.Trimesh]:
-    """Return the closed parts, metres, z up, the foot's centre at the origin."""
-    parts = [
+def parts() -> list[Part]:
+    """Return closed meshes with their colours, metres, z up, foot at the origin."""
+    result = [
         _cylinder(0.165, 0.0, 0.035, _GREY),
         _cylinder(0.12, 0.03, 0.075, _RED),
         _cylinder(0.105, 0.07, 0.50, _RED),
@@ -78,30 +70,42 @@ def world_parts() -> list[trimesh.Trimesh]:
         _cylinder(0.035, 0.68, HEIGHT, _YELLOW, 5),
     ]
     for k in range(8):
-        bolt = _cylinder(0.014, 0.03, 0.055, _YELLOW, 6)
+        bolt, colour = _cylinder(0.014, 0.03, 0.055, _YELLOW, 6)
         angle = 2 * np.pi * (k + 0.5) / 8
         bolt.apply_translation([0.143 * np.cos(angle), 0.143 * np.sin(angle), 0])
-        parts.append(bolt)
-    parts += _nozzle(0.0, 0.40, 0.068, 0.175)
-    parts += _nozzle(0.5 * np.pi, 0.41, 0.05, 0.165)
-    parts += _nozzle(-0.5 * np.pi, 0.41, 0.05, 0.165)
-    return parts
+        result.append((bolt, colour))
+    result += _nozzle(0.0, 0.40, 0.068, 0.175)
+    result += _nozzle(0.5 * np.pi, 0.41, 0.05, 0.165)
+    result += _nozzle(-0.5 * np.pi, 0.41, 0.05, 0.165)
+    return result
 
 
 def world_mesh() -> trimesh.Trimesh:
-    """Return all parts as one mesh, metres, z up."""
-    return trimesh.util.concatenate(world_parts())
+    """Return all parts as one mesh with colours per vertex, metres, z up.
+
+    Every face has vertices of its own, therefore it is shaded flat.
+    """
+    corners = [np.asarray(mesh.triangles).reshape(-1, 3) for mesh, _ in parts()]
+    colours = [
+        np.tile(np.uint8(colour), (len(corner), 1))
+        for corner, (_, colour) in zip(corners, parts(), strict=True)
+    ]
+    vertices = np.concatenate(corners)
+    return trimesh.Trimesh(
+        vertices=vertices,
+        faces=np.arange(len(vertices)).reshape(-1, 3),
+        vertex_colors=np.concatenate(colours),
+        process=False,
+    )
 
 
 def build(path: Path) -> None:
     """Write the hydrant as binary glTF."""
     mesh = world_mesh()
-    # Colours change at edges, therefore every face gets vertices of its own.
-    colours = np.repeat(mesh.visual.face_colors, 3, axis=0)
-    mesh.unmerge_vertices()
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
     mesh.apply_transform(_Z_UP_TO_Y_UP)
-    path.write_bytes(trimesh.Scene({"hydrant": mesh}).export(file_type="glb"))
+    data = trimesh.Scene({"hydrant": mesh}).export(file_type="glb")
+    assert isinstance(data, bytes)
+    path.write_bytes(data)
 
 
 def main() -> None:
