@@ -87,7 +87,7 @@ def world_mesh() -> trimesh.Trimesh:
     """
     corners = [np.asarray(mesh.triangles).reshape(-1, 3) for mesh, _ in parts()]
     colours = [
-        np.tile(np.uint8(colour), (len(corner), 1))
+        np.tile(np.array(colour, np.uint8), (len(corner), 1))
         for corner, (_, colour) in zip(corners, parts(), strict=True)
     ]
     vertices = np.concatenate(corners)
