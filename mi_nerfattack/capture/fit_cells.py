@@ -1,0 +1,126 @@
+"""Occupancy while fitting: what depth maps allow, and what the field has learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from mi_nerfattack.capture.frames import PosedImages
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render.camera import generate_rays, pose_arrays
+
+_UPSAMPLING = 4
+_SMOOTH_RATIO = 1.5  # neighbours with depths closer than this lie on one surface
+_CHUNK = 1 << 20
+
+
+def grid_shape(
+    lower: np.ndarray, upper: np.ndarray, resolution: int
+) -> tuple[int, int, int]:
+    """Return the cells along each axis, `resolution` along the longest."""
+    extent = np.asarray(upper, float) - lower
+    x, y, z = np.maximum(1, np.round(resolution * extent / extent.max())).astype(int)
+    return int(x), int(y), int(z)
+
+
+def depth_points(
+    images: PosedImages, depth: np.ndarray, indices: Iterable[int], reach_m: float = 0.0
+) -> Iterable[np.ndarray]:
+    """Yield points (n, 3), metres, on the surfaces that depth maps show.
+
+    Between neighbouring pixels on one surface points are interpolated, linear in
+    inverse depth, since pixels at a grazing angle lie far apart.
+
+    Args:
+        images: the posed images.
+        depth: (n, height, width), metres along the ray.
+        indices: of the images to use.
+        reach_m: also yield the points this far before and behind the surface.
+    """
+    for index in indices:
+        origin, rotation = pose_arrays(images.camera_to_world[index])
+        direction = generate_rays(images.camera, origin, rotation, 1)[1].numpy()
+        size = (images.camera.height, images.camera.width)
+        ray = direction.reshape(3, *size).astype(np.float64)
+        inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0.0)
+        eye = images.camera_to_world[index, :3, 3]
+        for unit, t in (*_between(ray, inverse, 1), *_between(ray, inverse, 2)):
+            for offset in {0.0, -reach_m, reach_m}:
+                yield eye + ((t + offset) * unit).T
+
+
+def _between(
+    ray: np.ndarray, inverse: np.ndarray, axis: int
+) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+    """Yield directions (3, n) and depths (n,) between neighbours along an axis."""
+    first = [slice(None)] * 3
+    second = [slice(None)] * 3
+    first[axis], second[axis] = slice(None, -1), slice(1, None)
+    a, b = inverse[tuple(first[1:])], inverse[tuple(second[1:])]
+    both = (a > 0) & (b > 0)
+    joined = both & (np.maximum(a, b) < _SMOOTH_RATIO * np.minimum(a, b))
+    ray_a, ray_b = ray[tuple(first)], ray[tuple(second)]
+    for k in range(_UPSAMPLING):
+        share = k / _UPSAMPLING
+        used = joined if k else a > 0
+        mixed = (1 - share) * ray_a[:, used] + share * ray_b[:, used]
+        t = 1 / ((1 - share) * a[used] + share * b[used])
+        yield mixed / np.linalg.norm(mixed, axis=0), t
+
+
+def cells_near_surfaces(
+    points: Iterable[np.ndarray],
+    lower: np.ndarray,
+    upper: np.ndarray,
+    shape: tuple[int, int, int],
+) -> np.ndarray:
+    """Mark the cells of a grid over a box that hold a point; boolean `shape`."""
+    cells = np.zeros(shape, bool)
+    for block in points:
+        cell = np.floor((block - lower) / (upper - lower) * shape).astype(np.int64)
+        inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+        cells[tuple(cell[inside].T)] = True
+    return cells
+
+
+def learned(
+    field: AbstractField,
+    allowed: np.ndarray,
+    threshold: float,
+    rng: np.random.Generator,
+    samples: int = 4,
+) -> Occupancy:
+    """Keep the allowed cells whose density, or a neighbour's, reaches a threshold.
+
+    As `fields.occupancy.build`, but evaluates allowed cells only.
+
+    Args:
+        field: the field as fitted so far.
+        allowed: boolean grid over the field's box.
+        threshold: density, 1/metre.
+        rng: of the positions in the cells.
+        samples: positions a cell.
+    """
+    shape = np.array(allowed.shape)[:, None]
+    lower = np.asarray(field.lower)[:, None]
+    extent = np.asarray(field.upper)[:, None] - lower
+    candidates = np.stack(np.nonzero(allowed))
+    peak = np.zeros(candidates.shape[1], np.float32)
+    for start in range(0, len(peak), _CHUNK):
+        part = slice(start, min(start + _CHUNK, len(peak)))
+        for _ in range(samples):
+            cell = candidates[:, part] + rng.random((3, part.stop - start))
+            position = mi.Point3f(np.float32(lower + cell / shape * extent))
+            dr.make_opaque(position)
+            density = field.density(position, mi.Bool(True)).numpy()
+            peak[part] = np.maximum(peak[part], density)
+    cells = np.zeros(allowed.shape, bool)
+    cells[tuple(candidates)] = peak >= threshold
+    if cells.any():
+        cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)))
+    return Occupancy(cells & allowed)

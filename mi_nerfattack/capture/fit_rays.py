@@ -1,0 +1,143 @@
+"""Training rays: pixels of posed images on the device, and random batches of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.capture.frames import PosedImages
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera import Camera, pixel_rays, pose_arrays
+
+_CHUNK = 1 << 22
+
+
+@dataclass
+class RayBatch:
+    """Rays and what the images show along them.
+
+    Attributes:
+        origin: (3, n), metres in the world.
+        direction: (3, n), unit vectors.
+        colour: (3, n), sRGB in [0, 1], not premultiplied.
+        alpha: (n,), in [0, 1]; 1 where the images have none.
+        depth: (n,), metres along the ray, infinite where nothing is hit; None where
+            the images come without depth.
+    """
+
+    origin: Any
+    direction: Any
+    colour: Any
+    alpha: Any
+    depth: Any
+
+
+class RayBank:
+    """Pixels of chosen images, from which random batches of rays are drawn.
+
+    Images and poses lie on the device; a batch is one small kernel, the same for
+    every batch.
+
+    Args:
+        images: posed images.
+        indices: images to draw from, e.g. all that are not held out.
+        depth: (n, height, width), metres along the ray, of all images; or None.
+        box: lower and upper corner, metres: only pixels whose rays meet the box are
+            drawn. None draws from all.
+
+    Raises:
+        InputError: depth has another shape than the images, more pixels than
+            32 bits can number, or no pixel sees the box.
+    """
+
+    def __init__(
+        self,
+        images: PosedImages,
+        indices: np.ndarray,
+        depth: np.ndarray | None = None,
+        box: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        if depth is not None and depth.shape != images.images.shape[:3]:
+            raise InputError(
+                f"depth: shape {depth.shape}; must be {images.images.shape[:3]}, "
+                "as the images"
+            )
+        self.camera: Camera = images.camera
+        self.channels = images.images.shape[3]
+        self.has_alpha = self.channels == 4
+        chosen = images.images[indices]
+        if chosen.size >= 1 << 32:
+            raise InputError(
+                f"images: {chosen.size} values; at most {(1 << 32) - 1} can be fitted "
+                "to, reduce the images (long_edge_px) or their number"
+            )
+        # device arrays of their own: Dr.Jit may alias NumPy's memory
+        self._pixels = dr.uint8_array_t(mi.Float)(chosen.ravel().copy())
+        self._depth = None
+        if depth is not None:
+            self._depth = mi.Float(depth[indices].astype(np.float32).ravel().copy())
+        self._origin, self._rotation = pose_arrays(images.camera_to_world[indices])
+        self.count = len(indices) * self.camera.width * self.camera.height
+        dr.make_opaque(self._pixels, self._depth, self._origin)
+        self._chosen = None if box is None else self._seeing(*box)
+
+    def draw(self, count: int, random: Any) -> RayBatch:
+        """Draw a batch, pixels with replacement.
+
+        Args:
+            count: number of rays.
+            random: `mi.PCG32` of that many streams; it is advanced.
+        """
+        if self._chosen is None:
+            index = random.next_uint32_bounded(self.count)
+        else:
+            slot = random.next_uint32_bounded(dr.width(self._chosen))
+            index = dr.gather(mi.UInt32, self._chosen, slot)
+        return self.batch(index)
+
+    def batch(self, index: Any) -> RayBatch:
+        """Return the rays of given pixels, `mi.UInt32` (n,), image by image, by row."""
+        origin, direction = self._rays(index)
+        byte = type(self._pixels)
+        base = index * self.channels
+        values = [
+            mi.Float(mi.UInt32(dr.gather(byte, self._pixels, base + i))) / 255
+            for i in range(self.channels)
+        ]
+        alpha = values[3] if self.has_alpha else mi.Float(1)
+        depth = None
+        if self._depth is not None:
+            depth = dr.gather(mi.Float, self._depth, index)
+        return RayBatch(origin, direction, mi.Color3f(*values[:3]), alpha, depth)
+
+    def _rays(self, index: Any) -> tuple[Any, Any]:
+        per_image = self.camera.width * self.camera.height
+        image = index // per_image
+        pixel = index - image * per_image
+        row = pixel // self.camera.width
+        position = mi.Point2f(pixel - row * self.camera.width, row) + 0.5
+        columns = [dr.gather(mi.Vector3f, c, image) for c in self._rotation]
+        origin = dr.gather(mi.Point3f, self._origin, image)
+        return pixel_rays(
+            self.camera, origin, (columns[0], columns[1], columns[2]), position
+        )
+
+    def _seeing(self, lower: np.ndarray, upper: np.ndarray) -> Any:
+        box = mi.BoundingBox3f(lower.tolist(), upper.tolist())
+        found = []
+        for start in range(0, self.count, _CHUNK):
+            size = min(_CHUNK, self.count - start)
+            index = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
+            hit, _, far = box.ray_intersect(mi.Ray3f(*self._rays(index)))
+            found.append(dr.compress(hit & (far > 0)) + start)
+        chosen = dr.concat(found)
+        if dr.width(chosen) == 0:
+            raise InputError(
+                f"bounds: {lower.tolist()} to {upper.tolist()}; no image sees this "
+                "box, give bounds around what the cameras look at"
+            )
+        return chosen

@@ -1,0 +1,61 @@
+"""``mi-nerfattack capture``: posed renders of a Mitsuba scene along its routes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Render posed images and depth of a scene, from where a drive may look at it."""
+
+    scene: tyro.conf.Positional[Path]
+    """Mitsuba scene (.xml)."""
+    routes: Path
+    """Routes file (.json); all its routes are used."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for transforms.json, images and depth."""
+    views: int = 256
+    """Number of views."""
+    width: int = 320
+    """Of a view, pixels."""
+    height: int = 160
+    """Of a view, pixels."""
+    fov_deg: float = 90.0
+    """Horizontal field of view."""
+    spp: int = 16
+    """Samples per pixel."""
+    seed: int = 0
+    """Of poses and samples."""
+
+    def run(self) -> int:
+        """Render and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.capture.views import capture_scene
+        from mi_nerfattack.commands.fit_report import Bars
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.render.camera import from_fov
+
+        variant.ensure()
+        for name in ("views", "width", "height", "spp"):
+            if getattr(self, name) < 1:
+                raise InputError(f"--{name}: {getattr(self, name)}; at least 1")
+        camera = from_fov(self.width, self.height, self.fov_deg)
+        with Bars() as bars:
+            path = capture_scene(
+                self.scene,
+                self.routes,
+                self.output,
+                self.views,
+                camera,
+                self.spp,
+                self.seed,
+                bars.views,
+            )
+        print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
+        print(f"  mi-nerfattack fit {path.parent} -o FIELD.safetensors")
+        return 0

@@ -1,0 +1,85 @@
+"""``mi-nerfattack fit``: fit a field to a folder of posed images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit a neural field to posed images, and score it on every 8th image.
+
+    Without --bounds the field's box is that of all points in the folder's depth file
+    or, without such a file, a cube around the point nearest to all optical axes, four
+    times as wide as the farthest camera is away from it.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Folder with transforms.json and images, or the JSON file."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Field file to write (.safetensors); FILE.png beside it shows the worst views."""
+    long_edge: int | None = None
+    """Reduce the images to this longer edge, pixels."""
+    steps: int = 3000
+    """Steps of the optimiser."""
+    budget_minutes: float | None = None
+    """End the fit after this time."""
+    batch_rays: int = 4096
+    """Rays a step."""
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """Box of the field: x0 y0 z0 x1 y1 z1, metres."""
+    step_m: float | None = None
+    """Marching step near the camera; a thousandth of the longest edge by default."""
+    log2_table: int = 17
+    """Binary logarithm of the hash table's entries on each level."""
+    max_resolution: int = 2048
+    """Resolution of the finest level."""
+    occupancy: int = 256
+    """Cells of the occupancy along the longest edge."""
+    seed: int = 0
+    """Of all random numbers."""
+    skip_missing: bool = False
+    """Leave out frames whose image file is missing."""
+    json: bool = False
+    """End with one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """Fit, score and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.capture.fit import FitOptions, fit_ngp
+        from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
+        from mi_nerfattack.capture.frames import read_transforms
+        from mi_nerfattack.commands.fit_report import Bars, check_output, finish
+        from mi_nerfattack.fields.ngp import NGPLayout
+
+        check_output(self.output)
+        variant.ensure()
+        images = read_transforms(self.folder, self.long_edge, self.skip_missing)
+        depth = read_depth(self.folder, images)
+        lower, upper = find_bounds(images, depth, self.bounds)
+        options = FitOptions(
+            self.steps,
+            self.budget_minutes,
+            self.batch_rays,
+            self.seed,
+            occupancy_resolution=self.occupancy,
+        )
+        layout = NGPLayout(12, 2, self.log2_table, 16, self.max_resolution, 32)
+        with Bars() as bars:
+            result = fit_ngp(
+                images,
+                lower,
+                upper,
+                layout,
+                options,
+                depth,
+                step_m=self.step_m,
+                progress=bars.fit,
+            )
+        provenance = {"source": self.folder.name, "seed": str(self.seed)}
+        finish(result, images, self.output, provenance, self.json)
+        return 0
