@@ -68,6 +68,10 @@ class AbstractField(ABC):
     def metadata(self) -> dict[str, str]:
         """Return what a field file's header stores, as strings."""
 
+    @abstractmethod
+    def density_bound(self) -> float:
+        """Return an upper bound of the density, 1/metre, for delta tracking."""
+
     def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Evaluate density alone, (n,), 1/metre of the field's frame."""
         up = mi.Vector3f(0, 0, 1)

@@ -162,6 +162,30 @@ class GridField(AbstractField):
         colour = mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in (r, g, b)])
         return density & active, srgb_to_linear(colour) & active
 
+    def density_bound(self) -> float:
+        """Bound the density by the vertices around each block of a 64^3 partition.
+
+        Interpolation never exceeds its vertices, so the sum over levels of the
+        largest vertex near a block bounds the field there.
+        """
+        raw = self._density.numpy()
+        blocks = 64
+        edges = np.arange(blocks + 1) / blocks
+        total = np.zeros((blocks,) * 3)
+        for level in range(self.layout.levels):
+            scale = self.encoding._level_scale(level)
+            n = self.encoding._resolution(scale)
+            start = self.encoding.level_offset(level)
+            values = raw[start : start + n**3].reshape(n, n, n)
+            low = np.floor(edges[:-1] * scale).astype(int)
+            high = np.minimum(np.floor(edges[1:] * scale).astype(int) + 1, n - 1)
+            for axis in range(3):
+                width = int((high - low).max()) + 1
+                picks = [np.minimum(low + k, high) for k in range(width)]
+                values = np.max([values.take(p, axis) for p in picks], axis=0)
+            total += values
+        return self.density_scale * float(np.exp(min(total.max(), 15.0)))
+
     def parameters(self) -> dict[str, Any]:
         """Return ``texture`` (n_vertices, 3) and ``density`` (n_vertices,)."""
         return {"texture": self.texture, "density": self._density}

@@ -170,6 +170,18 @@ class NGPField(AbstractField):
         raw = self._geometry(point, active)[0]
         return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
 
+    def density_bound(self) -> float:
+        """Estimate a bound: twice the largest density at a million random points.
+
+        A network has no tight bound; where the estimate is too small, delta
+        tracking darkens the densest parts.
+        """
+        rng = dr.rng(seed=0)
+        point = mi.Point3f(*[rng.random(mi.Float, 1 << 20) for _ in range(3)])
+        extent = mi.Vector3f(*map(float, self.upper - self.lower))
+        world = mi.Point3f(*map(float, self.lower)) + point * extent
+        return 2 * float(dr.max(self.density(world, mi.Bool(True)))[0])
+
     def _geometry(self, point: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
         features = self.encoding(unit, active)

@@ -1,0 +1,1 @@
+"""Attacks on a closed loop: gradient, baselines, objectives."""

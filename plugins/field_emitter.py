@@ -1,0 +1,158 @@
+"""The emitter `field_emitter`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.plugins import field_volume as shared
+from mi_nerfattack.render.composite import depth_composite
+from mi_nerfattack.render.march import STOP, march
+
+
+class FieldEmitter(mi.Emitter):
+    r"""Fields behind the surface of a closed shape (``field_emitter``).
+
+    Radiance that leaves the surface along a ray is the ``depth`` composite (A.4 to
+    A.6) of the nested fields along that ray, over the background of the first field
+    that has one. Seen from outside, the march starts on the surface; seen from
+    inside, it starts at the ray's origin and ends on the surface. So stock
+    integrators (``path``, ``direct``) show the fields, and light other surfaces with
+    them: directions are sampled on the shape, as the stock ``area`` emitter does.
+
+    ===========  ========  =======  =======  ========================================
+    name         type      unit     default  meaning
+    ===========  ========  =======  =======  ========================================
+    (nested)     volume                      ``grid_field``, ``ngp_field``; 1 or more
+    stop         float              1e-3     transmittance at which a ray ends
+    ===========  ========  =======  =======  ========================================
+
+    .. code-block:: xml
+
+        <shape type="cube">
+            <bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
+            <emitter type="field_emitter">
+                <volume type="grid_field" id="object">
+                    <string name="filename" value="hydrant.safetensors"/>
+                </volume>
+            </emitter>
+        </shape>
+
+    .. code-block:: python
+
+        {"type": "field_emitter", "object": {"type": "grid_field", "filename": "f"}}
+
+    Limits: the shape should enclose the fields, whose own boxes end the march, and
+    carry a black BSDF: it is opaque, so what lies behind it is not seen (use
+    ``field_integrator`` for that). RGB and monochromatic variants.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        shared.refuse_spectral("field_emitter")
+        self.stop = read_stop(props)
+        self.volumes = read_volumes(props, "field_emitter")
+        self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the fields under their ids."""
+        for volume in self.volumes:
+            callback.put(volume.id(), volume, mi.ParamFlags.Differentiable)
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
+        """Evaluate the radiance that leaves towards ``si.wi``, (channels, n)."""
+        direction = -si.to_world(si.wi)
+        inside = dr.dot(direction, si.n) > 0
+        origin = dr.select(inside, si.p - si.t * direction, si.p)
+        t_max = dr.select(inside, si.t, dr.inf)
+        total = depth_composite(
+            [
+                march(
+                    v.posed, origin, direction, t_max, mi.Float(0.5), active, self.stop
+                )
+                for v in self.volumes
+            ]
+        )
+        behind = background(self.volumes, direction)
+        radiance = total.radiance + (1 - total.opacity) * behind
+        return shared.to_spectrum(radiance) & active
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, Any]:
+        """Sample a point of the shape seen from ``it``."""
+        ds = self.get_shape().sample_direction(it, sample, active)
+        active = mi.Bool(active) & (ds.pdf > 0)
+        ds.emitter = mi.EmitterPtr(self)
+        value = self.eval(self._towards(ds, it), active)
+        return ds, dr.select(active, value / dr.select(active, ds.pdf, 1), 0)
+
+    def pdf_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Float:
+        """Return the density of :meth:`sample_direction`, 1/steradian."""
+        return dr.select(active, self.get_shape().pdf_direction(it, ds, active), 0)
+
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> Any:
+        """Evaluate the radiance that arrives at ``it`` from ``ds``."""
+        return self.eval(self._towards(ds, it), active)
+
+    def _towards(
+        self, ds: mi.DirectionSample3f, it: mi.Interaction3f
+    ) -> mi.SurfaceInteraction3f:
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p, si.n, si.t = ds.p, ds.n, ds.dist
+        si.sh_frame = mi.Frame3f(ds.n)
+        si.wi = si.to_local(-ds.d)
+        return si
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return the union of the fields' boxes."""
+        box = mi.ScalarBoundingBox3f()
+        for volume in self.volumes:
+            box.expand(volume.bbox())
+        return box
+
+    def to_string(self) -> str:
+        """Describe the checked parameters."""
+        names = ", ".join(volume.id() for volume in self.volumes)
+        return f"FieldEmitter[fields=({names}), stop={self.stop}]"
+
+
+def read_stop(props: mi.Properties) -> float:
+    """Read `stop`, a transmittance."""
+    stop = float(props.get("stop", STOP))
+    if not 0 <= stop < 1:
+        raise InputError(f"stop: {stop}; allowed is 0 <= stop < 1")
+    return stop
+
+
+def read_volumes(props: mi.Properties, plugin: str) -> list[Any]:
+    """Collect nested `grid_field` and `ngp_field` volumes."""
+    volumes = [item for _, item in props.objects() if is_field_volume(item)]
+    if not volumes:
+        raise InputError(
+            f"{plugin}: no nested grid_field or ngp_field; give one or more"
+        )
+    return volumes
+
+
+def is_field_volume(item: Any) -> bool:
+    """Whether a nested object is one of this package's volumes."""
+    return isinstance(item, shared.AbstractFieldVolume)
+
+
+def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
+    """Return the background of the first NGP among the volumes, black without one."""
+    for volume in volumes:
+        if volume.field.kind == "ngp_field":
+            return volume.field.background(direction)
+    return mi.Color3f(0)
+
+
+mi.register_emitter("field_emitter", lambda props: FieldEmitter(props))

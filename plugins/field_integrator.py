@@ -1,0 +1,244 @@
+"""The integrator `field_integrator`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.plugins import field_volume as shared
+from mi_nerfattack.plugins.field_emitter import (
+    background,
+    is_field_volume,
+    read_stop,
+    read_volumes,
+)
+from mi_nerfattack.render.composite import depth_composite
+from mi_nerfattack.render.march import March, march, march_derivative
+
+
+class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
+    r"""Depth composite of radiance fields (``field_integrator``).
+
+    Every camera ray is marched through each nested field up to the nearest surface
+    of the scene; the fields are folded front to back by expected depth, ``I = I_f +
+    (1 - a_f) I_b`` (A.4 to A.6), over what a nested integrator sees behind, or over
+    the background of the first field that has one.
+
+    AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
+    ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``. Depths are
+    infinite where opacity is 0; take a ``box`` filter and one sample where that
+    matters.
+
+    ===========  ==========  ====  =======  =========================================
+    name         type        unit  default  meaning
+    ===========  ==========  ====  =======  =========================================
+    (nested)     volume                     ``grid_field``, ``ngp_field``; 1 or more
+    (nested)     integrator         none    renders surfaces and lights behind
+    stop         float              1e-3    transmittance at which a ray ends
+    jitter       bool               false   random instead of middle sample positions
+    ===========  ==========  ====  =======  =========================================
+
+    .. code-block:: xml
+
+        <integrator type="field_integrator">
+            <volume type="ngp_field" id="scene">
+                <string name="filename" value="field.safetensors"/>
+            </volume>
+            <volume type="grid_field" id="object">
+                <string name="filename" value="hydrant.safetensors"/>
+            </volume>
+        </integrator>
+
+    .. code-block:: python
+
+        {"type": "field_integrator", "object": {"type": "grid_field", "filename": "f"}}
+
+    Differentiable in primal, forward and backward mode with respect to the fields'
+    parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces.
+    RGB and monochromatic variants.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        shared.refuse_spectral("field_integrator")
+        self.stop = read_stop(props)
+        self.jitter = bool(props.get("jitter", False))
+        self.volumes = read_volumes(props, "field_integrator")
+        others = [o for _, o in props.objects() if not is_field_volume(o)]
+        self.behind = others[0] if others else None
+        self._has_aovs = True
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the fields under their ids."""
+        for volume in self.volumes:
+            callback.put(volume.id(), volume, mi.ParamFlags.Differentiable)
+
+    def aov_names(self) -> list[str]:
+        """Name the arbitrary output variables."""
+        if not self._has_aovs:
+            return []
+        layers = [f"{v.id()}.{c}" for v in self.volumes for c in "RGBAZ"]
+        return ["opacity", "depth", *layers]
+
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: mi.TensorXf,
+        sensor: Any = 0,
+        seed: mi.UInt32 = 0,
+        spp: int = 0,
+    ) -> None:
+        """Accumulate gradients; those of AOVs are ignored."""
+        count = _film(scene, sensor).base_channels_count()
+        with self._without_aovs():
+            super().render_backward(
+                scene, params, grad_in[..., :count], sensor, seed, spp
+            )
+
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        sensor: Any = 0,
+        seed: mi.UInt32 = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
+        """Render the image's tangent; that of AOVs is zero."""
+        with self._without_aovs():
+            tangent = super().render_forward(scene, params, sensor, seed, spp)
+        height, width, count = tangent.shape
+        full = dr.zeros(mi.TensorXf, (height, width, count + len(self.aov_names())))
+        full[:, :, 0:count] = tangent
+        return full
+
+    @contextmanager
+    def _without_aovs(self) -> Iterator[None]:
+        # Mitsuba 3.9 multiplies AOVs by the sensor's spectral weight there and fails.
+        self._has_aovs = False
+        try:
+            yield
+        finally:
+            self._has_aovs = True
+
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        δL: Any = None,
+        state_in: Any = None,
+        active: mi.Bool = True,
+        **kwargs: Any,
+    ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
+        """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``."""
+        del kwargs
+        ray = mi.Ray3f(dr.detach(ray))
+        active = mi.Bool(active)
+        jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
+        t_max = self._surface(scene, ray, active)
+        fixed = (ray.o, ray.d, t_max, jitter, active)
+        if mode == dr.ADMode.Primal:
+            layers = [march(v.posed, *fixed, self.stop) for v in self.volumes]
+            behind = self._behind(scene, sampler, ray, t_max, active)
+        else:
+            # Forward mode comes without the state of a primal pass.
+            layers, behind = state_in or (
+                [march(v.posed, *fixed, self.stop) for v in self.volumes],
+                self._behind(scene, sampler, ray, t_max, active),
+            )
+        if mode == dr.ADMode.Primal:
+            radiance = shared.to_spectrum(self._fold(layers, behind))
+            state = (layers, behind)
+            return radiance, active, self._aovs(layers), state
+        if mode == dr.ADMode.Backward:
+            self._backward(layers, behind, fixed, δL)
+            return δL, active, [], None
+        tangent = self._forward(layers, behind, fixed)
+        return tangent, active, [], None
+
+    def _backward(self, layers: Any, behind: Any, fixed: Any, δL: Any) -> None:
+        with dr.resume_grad():
+            leaves = [_copy(layer) for layer in layers]
+            dr.enable_grad(leaves)
+            radiance = shared.to_spectrum(self._fold(leaves, behind))
+            dr.backward_from(dr.sum(radiance * δL))
+            cotangents = [dr.grad(leaf) for leaf in leaves]
+        for volume, primal, cotangent in zip(
+            self.volumes, layers, cotangents, strict=True
+        ):
+            march_derivative(
+                dr.ADMode.Backward, volume.posed, *fixed, primal, cotangent, self.stop
+            )
+
+    def _forward(self, layers: Any, behind: Any, fixed: Any) -> Any:
+        tangents = [
+            march_derivative(
+                dr.ADMode.Forward, volume.posed, *fixed, primal, March(), self.stop
+            )[0]
+            for volume, primal in zip(self.volumes, layers, strict=True)
+        ]
+        with dr.resume_grad():
+            leaves = [_copy(layer) for layer in layers]
+            dr.enable_grad(leaves)
+            for leaf, tangent in zip(leaves, tangents, strict=True):
+                dr.set_grad(leaf, tangent)
+            radiance = shared.to_spectrum(self._fold(leaves, behind))
+            return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
+
+    def _fold(self, layers: list[March], behind: mi.Color3f) -> mi.Color3f:
+        total = depth_composite(layers)
+        return total.radiance + (1 - total.opacity) * behind
+
+    def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        if len(scene.shapes()) == 0:
+            return mi.Float(dr.inf)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        return dr.select(hit.is_valid(), hit.t, dr.inf)
+
+    def _behind(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        t_max: mi.Float,
+        active: mi.Bool,
+    ) -> mi.Color3f:
+        if self.behind is None:
+            return background(self.volumes, ray.d) & (t_max == dr.inf)
+        spectrum = self.behind.sample(
+            scene, sampler, mi.RayDifferential3f(ray), active=active
+        )[0]
+        return mi.Color3f(spectrum if not mi.is_monochromatic else spectrum.x)
+
+    def _aovs(self, layers: list[March]) -> list[mi.Float]:
+        if not self._has_aovs:
+            return []
+        total = depth_composite(layers)
+        result = [total.opacity, total.depth]
+        for layer in layers:
+            result += [*layer.radiance, layer.opacity, layer.depth]
+        return result
+
+    def to_string(self) -> str:
+        """Describe the checked parameters."""
+        names = ", ".join(volume.id() for volume in self.volumes)
+        return f"FieldIntegrator[fields=({names}), stop={self.stop}]"
+
+
+def _film(scene: mi.Scene, sensor: Any) -> mi.Film:
+    return (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
+
+
+def _copy(layer: March) -> March:
+    return March(
+        mi.Color3f(layer.radiance), mi.Float(layer.opacity), mi.Float(layer.moment)
+    )
+
+
+mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

@@ -1,0 +1,144 @@
+"""What the volumes `grid_field` and `ngp_field` share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import AbstractField, load_field
+from mi_nerfattack.render.march import PosedField, Pose
+
+QUANTITIES = ("density", "radiance")
+
+
+def read_field(props: mi.Properties, kind: str) -> AbstractField:
+    """Load the file named by the property `filename` and check its kind."""
+    name = mi.file_resolver().resolve(props["filename"])
+    field = load_field(str(name))
+    if field.kind != kind:
+        raise InputError(
+            f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'
+        )
+    return field
+
+
+def read_pose(props: mi.Properties) -> Pose:
+    """Read `to_world`: rotation, translation and uniform scale."""
+    transform = props.get("to_world", mi.ScalarTransform4f())
+    try:
+        return Pose.from_matrix(np.array(transform.matrix, np.float64))
+    except ValueError as err:
+        raise InputError(
+            f"to_world: {err}; fields take rotation, translation and uniform scale"
+        ) from err
+
+
+def read_quantity(props: mi.Properties) -> str:
+    """Read `quantity`: what the volume evaluates to in a medium."""
+    quantity = props.get("quantity", "density")
+    if quantity not in QUANTITIES:
+        raise InputError(f"quantity: {quantity!r}; allowed: {', '.join(QUANTITIES)}")
+    return quantity
+
+
+def refuse_spectral(plugin: str) -> None:
+    """Raise InputError in spectral variants, which have no RGB radiance."""
+    if mi.is_spectral:
+        raise InputError(
+            f"{plugin}: variant {mi.variant()} is spectral; fields hold RGB radiance, "
+            "use llvm_ad_rgb or cuda_ad_rgb"
+        )
+
+
+def to_spectrum(colour: mi.Color3f) -> Any:
+    """Turn linear RGB into the variant's spectrum (luminance where it is mono)."""
+    if mi.is_monochromatic:
+        return mi.Color1f(mi.luminance(colour))
+    return mi.Spectrum(colour)
+
+
+class AbstractFieldVolume(mi.Volume):
+    """Field of one kind as a Mitsuba volume.
+
+    Members set `kind` and `parameter_names` and register themselves.
+    """
+
+    kind = ""
+    parameter_names: tuple[str, ...] = ()
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        refuse_spectral(self.kind)
+        self.quantity = read_quantity(props)
+        self.field = read_field(props, self.kind)
+        self.posed = PosedField(self.field, read_pose(props))
+        self.values = self.field.parameters()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the parameters of the field."""
+        for name in self.parameter_names:
+            callback.put(name, self.values[name], mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Hand changed parameters to the field."""
+        for name in self.parameter_names:
+            if not keys or name in keys:
+                self.field.set_parameter(name, self.values[name])
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> Any:
+        """Evaluate the quantity as a spectrum, (channels, n)."""
+        if self.quantity == "density":
+            return mi.Spectrum(self.eval_1(it, active))
+        return to_spectrum(self._evaluate(it, active)[1])
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        """Evaluate density (n,), 1/metre, or the luminance of the radiance."""
+        density, colour = self._evaluate(it, active)
+        return density if self.quantity == "density" else mi.luminance(colour)
+
+    def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
+        """Evaluate radiance (3, n), linear RGB, seen along the field's +z."""
+        return mi.Vector3f(self._evaluate(it, active)[1])
+
+    def _evaluate(self, it: mi.Interaction3f, active: mi.Bool) -> Any:
+        point, _ = self.posed.to_local(it.p, mi.Vector3f(0, 0, 1))
+        lower = mi.Point3f(*map(float, self.field.lower))
+        upper = mi.Point3f(*map(float, self.field.upper))
+        inside = mi.Bool(active) & dr.all((point >= lower) & (point <= upper))
+        return self.posed.eval(point, mi.Vector3f(0, 0, 1), inside)
+
+    def max(self) -> float:
+        """Return an upper bound of the density, 1/metre; 1 for radiance."""
+        if self.quantity == "radiance":
+            return 1.0
+        return self.field.density_bound() / self.posed.pose.scale
+
+    def max_per_channel(self) -> list[float]:
+        """Return :meth:`max` for each channel."""
+        return [self.max()] * len(mi.Spectrum(0))
+
+    def resolution(self) -> mi.ScalarVector3i:
+        """Return vertices along the edges of the finest level."""
+        return mi.ScalarVector3i(self.field.layout.max_resolution)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return the bounding box in the world."""
+        box = mi.ScalarBoundingBox3f()
+        pose = self.posed.pose
+        for corner in range(8):
+            pick = [(corner >> axis) & 1 for axis in range(3)]
+            local = np.where(pick, self.field.upper, self.field.lower)
+            world = pose.rotation @ (local * pose.scale) + pose.translation
+            box.expand(mi.ScalarPoint3f(*map(float, world)))
+        return box
+
+    def to_string(self) -> str:
+        """Describe the checked parameters."""
+        return (
+            f"{self.kind}[{self.field.layout}, quantity={self.quantity}, "
+            f"bbox={self.bbox()}]"
+        )

@@ -1,0 +1,46 @@
+"""The volume `grid_field`."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
+
+
+class GridFieldVolume(AbstractFieldVolume):
+    r"""Decoder-free grid field (``grid_field``).
+
+    Density ``s exp(sum_l d_l(x))`` and radiance
+    ``srgb_to_linear(sigmoid(sum_l c_l(x)))`` of trilinearly interpolated vertices of
+    several levels (appendix A.4.1). In a stock ``heterogeneous`` medium it serves as
+    ``sigma_t`` (quantity ``density``) or ``albedo`` (quantity ``radiance``); inside
+    ``field_emitter`` and ``field_integrator`` both are used.
+
+    ============  =========  =======  ========  =====================================
+    name          type       unit     default   meaning
+    ============  =========  =======  ========  =====================================
+    filename      string                        field file of ``mi-nerfattack asset``
+    to_world      transform  metre    identity  rotation, translation, uniform scale
+    quantity      string              density   ``density`` or ``radiance``
+    texture       tensor                        (n, 3) raw colours; differentiable
+    ============  =========  =======  ========  =====================================
+
+    .. code-block:: xml
+
+        <volume type="grid_field" id="object">
+            <string name="filename" value="hydrant.safetensors"/>
+            <transform name="to_world"><scale value="2"/></transform>
+        </volume>
+
+    .. code-block:: python
+
+        {"type": "grid_field", "filename": "hydrant.safetensors"}
+
+    Limits: RGB and monochromatic variants; the pose is not differentiable.
+    """
+
+    kind = "grid_field"
+    parameter_names = ("texture",)
+
+
+mi.register_texture("grid_field", lambda props: GridFieldVolume(props))

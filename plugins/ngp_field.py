@@ -1,0 +1,45 @@
+"""The volume `ngp_field`."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
+
+
+class NGPFieldVolume(AbstractFieldVolume):
+    r"""Instant-NGP field (``ngp_field``).
+
+    Hash grid, density network and view-dependent colour network (Mueller et al.
+    2022) with an image of the sky behind. In a stock ``heterogeneous`` medium it
+    serves as ``sigma_t``; inside ``field_emitter`` and ``field_integrator`` density
+    and radiance are used.
+
+    ==============  =========  =======  ========  ===================================
+    name            type       unit     default   meaning
+    ==============  =========  =======  ========  ===================================
+    filename        string                        field file of ``mi-nerfattack fit``
+    to_world        transform  metre    identity  rotation, translation, unif. scale
+    quantity        string              density   ``density`` or ``radiance`` (seen
+                                                  along the field's +z)
+    table, ...      array                         parameters; differentiable
+    ==============  =========  =======  ========  ===================================
+
+    .. code-block:: xml
+
+        <volume type="ngp_field" id="scene">
+            <string name="filename" value="field.safetensors"/>
+        </volume>
+
+    .. code-block:: python
+
+        {"type": "ngp_field", "filename": "field.safetensors"}
+
+    Limits: RGB and monochromatic variants; the pose is not differentiable.
+    """
+
+    kind = "ngp_field"
+    parameter_names = ("table", "density_weights", "colour_weights", "sky")
+
+
+mi.register_texture("ngp_field", lambda props: NGPFieldVolume(props))
