@@ -112,9 +112,12 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         with self._without_aovs():
             tangent = super().render_forward(scene, params, sensor, seed, spp)
         height, width, count = tangent.shape
-        full = dr.zeros(mi.TensorXf, (height, width, count + len(self.aov_names())))
-        full[:, :, 0:count] = tangent
-        return full
+        total = count + len(self.aov_names())
+        full = dr.zeros(mi.Float, height * width * total)
+        index = dr.arange(mi.UInt32, height * width * count)
+        pixel = index // count
+        dr.scatter(full, tangent.array, pixel * total + index - pixel * count)
+        return mi.TensorXf(full, (height, width, total))
 
     @contextmanager
     def _without_aovs(self) -> Iterator[None]:
