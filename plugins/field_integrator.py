@@ -8,7 +8,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.field_emitter import (
     background,
@@ -16,6 +15,7 @@ from mi_nerfattack.plugins.field_emitter import (
     read_stop,
     read_volumes,
 )
+
 from mi_nerfattack.render.composite import depth_composite
 from mi_nerfattack.render.march import March, march, march_derivative
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, load_field
-from mi_nerfattack.render.march import PosedField, Pose
+from mi_nerfattack.render.march import Pose, PosedField
 
 QUANTITIES = ("density", "radiance")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mitsuba as mi
-
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 

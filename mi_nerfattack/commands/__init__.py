@@ -9,7 +9,13 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from mi_nerfattack.commands.asset import Asset
+from mi_nerfattack.commands.attack import Attack
+from mi_nerfattack.commands.capture import Capture
+from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
+from mi_nerfattack.commands.fit import Fit
+from mi_nerfattack.commands.train import Train
 
 
 class Command(Protocol):
@@ -20,6 +26,14 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, type[Command]] = {"doctor": Doctor}
+COMMANDS: dict[str, type[Command]] = {
+    "doctor": Doctor,
+    "demo": Demo,
+    "capture": Capture,
+    "fit": Fit,
+    "asset": Asset,
+    "train": Train,
+    "attack": Attack,
+}
 
 __all__ = ["COMMANDS", "Command"]

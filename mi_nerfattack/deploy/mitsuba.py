@@ -86,11 +86,9 @@ class PathTracedSensor(AbstractSensor):
     def observe(self, state: Any, step: int) -> Observation:
         """Render one image a vehicle; see :meth:`AbstractSensor.observe`."""
         poses = mount_matrix(np.array(state).T, self.mount)
-        sequence = np.random.SeedSequence([self.seed, step])
-        seeds = sequence.generate_state(len(poses))
         images = [
-            linear_to_srgb_numpy(self.linear(pose, int(seed)))
-            for pose, seed in zip(poses, seeds, strict=True)
+            linear_to_srgb_numpy(self.linear(pose, seed))
+            for pose, seed in zip(poses, self._seeds(step, len(poses)), strict=True)
         ]
         self.renders += len(images)
         image = mi.TensorXf(np.stack(images).astype(np.float32))
@@ -103,6 +101,38 @@ class PathTracedSensor(AbstractSensor):
         if not self.objects:
             return view.rgb
         return paste(view.rgb, view.depth, self.object_layer(camera_to_world))
+
+    def layers(self, camera_to_world: np.ndarray, step: int) -> dict[str, np.ndarray]:
+        """Render one frame with its parts.
+
+        Returns:
+            by layer name: the pasted frame as ``""`` (height, width, 4) and ``Z``,
+            the scene alone as ``scene`` and ``scene.Z``, the objects as ``object``
+            (premultiplied) and ``object.Z``; linear, metres.
+        """
+        view = self.renderer.render(camera_to_world, self.spp, self._seeds(step, 1)[0])
+        one = np.ones((*view.depth.shape, 1), np.float32)
+        scene = np.concatenate([view.rgb, one], axis=-1)
+        if not self.objects:
+            return {"": scene, "Z": view.depth}
+        layer = self.object_layer(camera_to_world)
+        opacity = layer.opacity.numpy().reshape(*view.depth.shape, 1)
+        depth = layer.depth.numpy().reshape(view.depth.shape)
+        radiance = layer.radiance.numpy().T.reshape(*view.depth.shape, 3)
+        pasted = paste(view.rgb, view.depth, layer)
+        in_front = (opacity[..., 0] >= OPAQUE) & (depth < view.depth)
+        return {
+            "": np.concatenate([pasted, one], axis=-1),
+            "Z": np.where(in_front, depth, view.depth),
+            "scene": scene,
+            "scene.Z": view.depth,
+            "object": np.concatenate([radiance, opacity], axis=-1),
+            "object.Z": depth,
+        }
+
+    def _seeds(self, step: int, count: int) -> list[int]:
+        sequence = np.random.SeedSequence([self.seed, step])
+        return [int(seed) for seed in sequence.generate_state(count)]
 
     def object_layer(self, camera_to_world: np.ndarray) -> March:
         """March all objects along the rays of one image."""

@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
+from mi_nerfattack.colour import srgb_to_linear
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.colour import srgb_to_linear
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,10 @@ class GridField(AbstractField):
         unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
         features = self.encoding(unit, active)
         d, r, g, b = [
-            sum((features[4 * level + c] for level in range(1, self.layout.levels)),
-                start=features[c])
+            sum(
+                (features[4 * level + c] for level in range(1, self.layout.levels)),
+                start=features[c],
+            )
             for c in range(4)
         ]
         density = self.density_scale * dr.exp(dr.minimum(d, 15.0))

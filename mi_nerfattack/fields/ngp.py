@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
+from mi_nerfattack.colour import srgb_to_linear
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import box_metadata, check_box, flat_parameter
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.colour import srgb_to_linear
 
 GEOMETRY_FEATURES = 16
 SH_ORDER = 3

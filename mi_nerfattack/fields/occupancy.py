@@ -52,9 +52,7 @@ class Occupancy:
         """Share of the cells that are occupied, 0 to 1."""
         return float(self.cells.mean())
 
-    def query(
-        self, unit: mi.Point3f, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Point3f]:
+    def query(self, unit: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Point3f]:
         """Look up the distance grid.
 
         Args:
@@ -133,7 +131,10 @@ def build(
         cell = np.stack(np.unravel_index(index, shape))
         for k in range(samples):
             offset = 0.5 if k == 0 else rng.random(cell.shape)
-            local = field.lower[:, None] + (cell + offset) / shape[:, None] * extent[:, None]
+            local = (
+                field.lower[:, None]
+                + (cell + offset) / shape[:, None] * extent[:, None]
+            )
             density = field.density(mi.Point3f(local.astype(np.float32)), mi.Bool(True))
             peak[index] = np.maximum(peak[index], density.numpy())
     cells = (peak >= threshold).reshape(shape)

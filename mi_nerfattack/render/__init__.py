@@ -1,0 +1,1 @@
+"""Rendering of fields: cameras, marching, compositing."""

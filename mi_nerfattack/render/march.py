@@ -173,7 +173,6 @@ class March:
     opacity: mi.Float = field(default_factory=lambda: mi.Float(0))
     moment: mi.Float = field(default_factory=lambda: mi.Float(0))
 
-    DRJIT_STRUCT = {"radiance": mi.Color3f, "opacity": mi.Float, "moment": mi.Float}
 
     @staticmethod
     def zeros(count: int) -> March:

@@ -120,9 +120,7 @@ def _residual_vjp(
     return result
 
 
-def _solve(
-    loop: ClosedLoop, before: Any, after: Any, control: Any, right: Any
-) -> Any:
+def _solve(loop: ClosedLoop, before: Any, after: Any, control: Any, right: Any) -> Any:
     """Solve ``(dG_t/dx_t)^T l = right``."""
     if loop.integrator.explicit:
         return right

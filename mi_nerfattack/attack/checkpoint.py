@@ -1,0 +1,60 @@
+"""Checkpoints of an attack: one safetensors file, replaced atomically."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+import mi_nerfattack
+from mi_nerfattack import files
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.errors import InputError
+
+FORMAT = "mi_nerfattack attack checkpoint 1"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {
+        "mi_nerfattack": mi_nerfattack.__version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "variant": str(mi.variant()),
+    }
+
+
+def save_checkpoint(path: str | Path, attack: GradientAttack, digest: str) -> None:
+    """Write the complete state of an attack.
+
+    Args:
+        path: file, replaced atomically.
+        attack: the attack.
+        digest: hash of the scenario.
+    """
+    metadata = {"format": FORMAT, "scenario": digest, **versions()}
+    files.write_safetensors(path, attack.tensors(), metadata)
+
+
+def load_checkpoint(path: str | Path, attack: GradientAttack, digest: str) -> None:
+    """Continue an attack from a file.
+
+    Raises:
+        InputError: the file is no checkpoint, belongs to another scenario or was
+            written by other versions.
+    """
+    tensors, metadata = files.read_safetensors(path)
+    expected = {"format": FORMAT, "scenario": digest, **versions()}
+    for key, value in expected.items():
+        if metadata.get(key) != value:
+            raise InputError(
+                f"{path}: {key} is {metadata.get(key)!r}, this run has {value!r}; "
+                "resume with the same scenario and versions, or start a new run folder"
+            )
+    try:
+        attack.load_tensors(tensors)
+    except KeyError as err:
+        raise InputError(
+            f"{path}: entry {err} is missing; the file is damaged"
+        ) from err

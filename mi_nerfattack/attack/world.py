@@ -1,0 +1,180 @@
+"""Build what a scenario describes: fields, sensors, loops, routes, initial poses."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.capture.views import load_scene
+from mi_nerfattack.deploy.mitsuba import PathTracedSensor
+from mi_nerfattack.fields import GridField, load_field, load_grid
+from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
+from mi_nerfattack.render.march import Pose, PosedField
+from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor
+from mi_nerfattack.scenario import Scenario, VehicleSection, resolve
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
+from mi_nerfattack.vehicle.integrators import (
+    RK4,
+    AbstractIntegrator,
+    ExplicitEuler,
+    ImplicitMidpoint,
+)
+from mi_nerfattack.vehicle.route import Route
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A scenario brought to life.
+
+    Attributes:
+        scenario: what it was built from.
+        route: the lane centre.
+        fields: grid fields of the objects, in the scenario's order.
+        surrogate: sensor in the scene's field.
+        deployment: sensor in the path-traced scene.
+        policy: a policy.AbstractPolicy.
+        initial: (runs, 3) initial states, the first one nominal.
+    """
+
+    scenario: Scenario
+    route: Route
+    fields: list[GridField]
+    surrogate: FieldSensor
+    deployment: PathTracedSensor
+    policy: Any
+    initial: np.ndarray
+
+    def loop(self, sensor: AbstractSensor) -> ClosedLoop:
+        """Close the loop through a sensor."""
+        vehicle = self.scenario.vehicle
+        return ClosedLoop(
+            sensor,
+            self.policy,
+            self.route.goal,
+            build_dynamics(vehicle),
+            build_integrator(vehicle),
+            vehicle.dt_s,
+        )
+
+    def set_textures(self, textures: list[np.ndarray]) -> None:
+        """Give each object a texture, (n_vertices, 3) raw colours."""
+        for field, texture in zip(self.fields, textures, strict=True):
+            field.set_parameter("texture", texture)
+
+
+def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
+    """Load all files of a scenario.
+
+    Args:
+        scenario: from :func:`scenario.load_scenario`.
+        base: folder that relative paths start from.
+        policy: the policy under test.
+
+    Raises:
+        InputError: a file is missing or wrong.
+    """
+    scene = PosedField(load_field(resolve(scenario.scene.field, base)))
+    fields = [load_grid(resolve(item.field, base)) for item in scenario.objects]
+    posed = [
+        PosedField(
+            field, Pose.upright(item.position_m, np.radians(item.yaw_deg), item.scale)
+        )
+        for field, item in zip(fields, scenario.objects, strict=True)
+    ]
+    camera, mount = build_camera(scenario)
+    route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
+    xml = load_scene(resolve(scenario.scene.deployment, base))
+    jitter = scenario.seed if scenario.attack.jitter else None
+    return World(
+        scenario,
+        route,
+        fields,
+        FieldSensor(scene, posed, camera, mount, jitter),
+        PathTracedSensor(
+            xml, posed, camera, mount, scenario.deployment.spp, scenario.seed
+        ),
+        policy,
+        initial_states(scenario, route, scenario.drive.runs, 0),
+    )
+
+
+def initial_states(
+    scenario: Scenario, route: Route, count: int, stream: int
+) -> np.ndarray:
+    """Draw initial states normally around the route's start.
+
+    Args:
+        scenario: gives seed and standard deviations.
+        route: its first point is the nominal pose.
+        count: number of states.
+        stream: different streams give independent states.
+
+    Returns:
+        (count, 3), metres and radians; the first is the nominal pose itself.
+
+    Source: appendix A.4.
+    """
+    rng = np.random.default_rng([scenario.seed, stream])
+    lateral = rng.normal(0, scenario.drive.lateral_sd_m, count)
+    heading = rng.normal(0, np.radians(scenario.drive.heading_sd_deg), count)
+    lateral[0] = heading[0] = 0.0
+    return route.pose_at(np.zeros(count), lateral, heading)
+
+
+def build_camera(scenario: Scenario) -> tuple[Camera, CameraMount]:
+    """Make intrinsics and mount."""
+    section = scenario.camera
+    camera = from_fov(section.width, section.height, section.fov_x_deg)
+    mount = CameraMount(section.height_m, section.forward_m, section.pitch_deg)
+    return camera, mount
+
+
+def build_dynamics(section: VehicleSection) -> AbstractDynamics:
+    """Make the vehicle model."""
+    if section.model == "dubins":
+        return Dubins(section.speed_ms, section.max_heading_rate)
+    steer = float(np.radians(section.max_steer_deg))
+    return Ackermann(section.speed_ms, section.wheelbase_m, steer)
+
+
+def build_integrator(section: VehicleSection) -> AbstractIntegrator:
+    """Make the time step."""
+    members: dict[str, AbstractIntegrator] = {
+        "euler": ExplicitEuler(),
+        "rk4": RK4(),
+        "implicit_midpoint": ImplicitMidpoint(),
+    }
+    return members[section.integrator]
+
+
+def object_footprints(world: World) -> list[np.ndarray]:
+    """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
+    outlines = []
+    for posed in world.surrogate.objects:
+        low, high = posed.field.lower, posed.field.upper
+        corners = np.array(
+            [
+                [x, y, 0.0]
+                for x, y in (
+                    (low[0], low[1]),
+                    (high[0], low[1]),
+                    (high[0], high[1]),
+                    (low[0], high[1]),
+                )
+            ]
+        )
+        world_corners = posed.pose.scale * corners @ posed.pose.rotation.T
+        outlines.append((world_corners + posed.pose.translation)[:, :2])
+    return outlines
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1e-6 if sys.platform == "darwin" else 1.024e-3)

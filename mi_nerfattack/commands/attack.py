@@ -1,0 +1,34 @@
+"""``mi-nerfattack attack``: attack a policy and measure the transfer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Attack:
+    """Optimise the textures of a scenario's objects until the policy leaves its lane.
+
+    Drives the unperturbed scene, as many random textures as the attack has
+    iterations, and the attack in the surrogate; repeats all three in the path-traced
+    deployment scene; writes everything to a run folder.
+    """
+
+    scenario: tyro.conf.Positional[Path]
+    """Scenario file (TOML)."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Run folder, new or empty."""
+    resume: bool = False
+    """Continue an interrupted attack from the checkpoint in the run folder."""
+    json: bool = False
+    """End with one line of JSON, the content of metrics.json, in place of the table."""
+
+    def run(self) -> int:
+        """Run the job and print the table."""
+        from mi_nerfattack.commands.attack_progress import run_scenario
+
+        return run_scenario(self.scenario, self.output, self.resume, self.json)

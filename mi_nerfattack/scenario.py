@@ -1,0 +1,220 @@
+"""The scenario file: one TOML file that replays one result.
+
+Paths are relative to the file, or name bundled data as ``bundled:FILE``. Every
+section but ``scene``, ``objects`` and ``policy`` may be left out; unknown keys are
+refused with their line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mi_nerfattack import files
+from mi_nerfattack.errors import InputError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+BUNDLED = "bundled:"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class SceneSection(_Section):
+    """Where the drive takes place."""
+
+    field: str  # field file of the scene: the surrogate
+    deployment: str  # Mitsuba scene XML: the deployment environment
+    routes: str  # JSON of routes
+    route: str  # name of the route that is driven
+
+
+class ObjectSection(_Section):
+    """An object whose texture is attacked."""
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    field: str  # grid field file
+    position_m: tuple[Finite, Finite, Finite]
+    yaw_deg: Finite = 0.0
+    scale: Positive = 1.0
+
+
+class PolicySection(_Section):
+    """The policy under test."""
+
+    file: str  # PilotNet, safetensors
+
+
+class CameraSection(_Section):
+    """The camera on the vehicle."""
+
+    width: Count = 200
+    height: Count = 66
+    fov_x_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    height_m: Positive = 1.4
+    forward_m: Finite = 0.5
+    pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
+
+
+class VehicleSection(_Section):
+    """The vehicle and its time step."""
+
+    model: Literal["dubins", "ackermann"] = "dubins"
+    integrator: Literal["euler", "rk4", "implicit_midpoint"] = "rk4"
+    speed_ms: Positive = 5.0
+    dt_s: Positive = 0.1
+    width_m: Positive = 1.8
+    wheelbase_m: Positive = 2.7
+    max_heading_rate: Positive = 1.5
+    max_steer_deg: Annotated[float, Field(gt=0, lt=90)] = 34.0
+
+
+class DriveSection(_Section):
+    """What is driven."""
+
+    horizon: Count = 60
+    runs: Count = 4  # drives of the unperturbed and the attacked case
+    lateral_sd_m: NonNegative = 0.1
+    heading_sd_deg: NonNegative = 0.5
+
+
+class AttackSection(_Section):
+    """How the texture is optimised."""
+
+    iterations: Count = 20
+    learning_rate: Positive = 0.3
+    poses: Count = 1  # initial poses of an iteration; the first is nominal
+    attached: bool = False
+    jitter: bool = False
+    checkpoint_every: Count = 10
+
+
+class BaselineSection(_Section):
+    """Random textures to compare with."""
+
+    textures: Count | None = None  # as many as attack iterations if left out
+    kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
+
+
+class DeploymentSection(_Section):
+    """The path-traced scene."""
+
+    spp: Count = 16
+
+
+class Scenario(_Section):
+    """A complete scenario."""
+
+    name: Annotated[str, Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    scene: SceneSection
+    objects: Annotated[tuple[ObjectSection, ...], Field(min_length=1)]
+    policy: PolicySection
+    camera: CameraSection = CameraSection()
+    vehicle: VehicleSection = VehicleSection()
+    drive: DriveSection = DriveSection()
+    attack: AttackSection = AttackSection()
+    baseline: BaselineSection = BaselineSection()
+    deployment: DeploymentSection = DeploymentSection()
+
+    def digest(self) -> str:
+        """Hash of all values, 16 hexadecimal digits; the same for equal scenarios."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def load_scenario(path: str | Path) -> tuple[Scenario, str]:
+    """Read and check a scenario file.
+
+    Returns:
+        the scenario with absolute paths, and the text of the file.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, or a key is unknown,
+            missing, of the wrong type or out of range; with file and line.
+    """
+    text = files.read_text(path)
+    data = files.read_toml(path)
+    try:
+        scenario = Scenario.model_validate_json(json.dumps(data, default=str))
+    except ValidationError as err:
+        raise InputError(_describe(path, text, err)) from err
+    names = [item.id for item in scenario.objects]
+    if len(set(names)) != len(names) or "scene" in names:
+        raise InputError(f"{path}: objects: ids {names}; must differ, and not be scene")
+    return scenario, text
+
+
+def resolve(name: str, base: str | Path) -> Path:
+    """Find a file that a scenario names.
+
+    Args:
+        name: ``bundled:FILE``, or a path relative to `base`.
+        base: folder of the scenario file.
+    """
+    if name.startswith(BUNDLED):
+        from mi_nerfattack.scenes import bundled
+
+        return bundled(name[len(BUNDLED) :])
+    path = Path(name).expanduser()
+    return path if path.is_absolute() else Path(base) / path
+
+
+def _describe(path: str | Path, text: str, err: ValidationError) -> str:
+    problems = []
+    for error in err.errors():
+        location = [part for part in error["loc"]]
+        key = ".".join(str(part) for part in location) or "(file)"
+        line = _line_of(text, location)
+        where = f"{path}:{line}" if line else f"{path}"
+        value = "" if error["type"] == "missing" else f" (is {error['input']!r})"
+        message = error["msg"][0].lower() + error["msg"][1:]
+        if error["type"] == "extra_forbidden":
+            message = f"unknown key; allowed: {', '.join(_allowed(location))}"
+            value = ""
+        problems.append(f"{where}: {key}: {message}{value}")
+    return "\n".join(problems)
+
+
+def _allowed(location: list[Any]) -> list[str]:
+    model: Any = Scenario
+    for part in location[:-1]:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = ObjectSection if part == "objects" else annotation
+    return list(model.model_fields)
+
+
+def _line_of(text: str, location: list[Any]) -> int | None:
+    """Find the line of a key in TOML text: its table, then its name; 1-based."""
+    tables = [part for part in location[:-1] if isinstance(part, str)]
+    index = next((part for part in location if isinstance(part, int)), 0)
+    name, current, seen = str(location[-1]), "", -1
+    header_line = None
+    for number, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*\[\[?\s*([^\]]+?)\s*\]\]?", line)
+        if header:
+            current = header.group(1)
+            seen = seen + 1 if "[[" in line else seen
+            if current == ".".join(tables or [name]):
+                header_line = number
+            continue
+        in_table = current == ".".join(tables)
+        if line.lstrip().startswith("#") or not in_table:
+            continue
+        if tables == ["objects"] and seen != index:
+            continue
+        if re.match(rf"\s*[\"']?{re.escape(name)}[\"']?\s*=", line):
+            return number
+    return header_line
