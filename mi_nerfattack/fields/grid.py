@@ -67,7 +67,7 @@ class GridField(AbstractField):
         texture: (n_vertices, 3) raw colour values; zeros (mid grey) when left out.
         occupancy: where density may be; everywhere when left out.
         density_scale: 1/metre.
-        step_m: marching step, metres; half a voxel of the finest level by default.
+        step_m: marching step, metres; a voxel of the finest level by default.
         info: free metadata that is kept in the file (provenance, units).
 
     Source: appendix A.4.1 and B.1; Mueller et al. 2022 for the levels.
@@ -93,7 +93,7 @@ class GridField(AbstractField):
         check_box(self.lower, self.upper)
         self.density_scale = float(density_scale)
         voxel = float((self.upper - self.lower).max()) / layout.max_resolution
-        self.step_m = 0.5 * voxel if step_m is None else float(step_m)
+        self.step_m = voxel if step_m is None else float(step_m)
         self.cone = 0.0
         self.info = dict(info or {})
         self.occupancy = occupancy or Occupancy.full()
