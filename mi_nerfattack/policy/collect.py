@@ -7,19 +7,20 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from mi_nerfattack import files
 from mi_nerfattack.attack.textures import random_texture
+from mi_nerfattack.deploy.mitsuba import PathTracedSensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.dataset import write_shard
 from mi_nerfattack.policy.placement import Ground, Roadside, Scatter
 from mi_nerfattack.render.march import PosedField
 from mi_nerfattack.rollout.loop import ClosedLoop, simulate, to_state
-from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
+from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor, Observation
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.expert import LaneFollower
 from mi_nerfattack.vehicle.integrators import RK4
@@ -31,16 +32,6 @@ OnFrames = Callable[[int, int], None]
 
 _DONE = "shard.json"
 _LARGEST_ERROR_M = 2.0
-
-
-class ObjectSensor(Protocol):
-    """Sensor whose objects can be exchanged, as both of ours can."""
-
-    objects: list[PosedField]
-
-    def observe(self, state: Any, step: int) -> Observation:
-        """See `AbstractSensor.observe`."""
-        ...  # pragma: no cover
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +47,7 @@ class World:
     """
 
     name: str
-    sensor: ObjectSensor
+    sensor: FieldSensor | PathTracedSensor
     objects: tuple[GridField, ...]
     ground: Ground
 
@@ -216,7 +207,7 @@ def to_uint8(image: Any) -> np.ndarray:
 class _Tape(AbstractSensor):
     """Sensor that keeps the images it passes on, and counts steps over all drives."""
 
-    def __init__(self, sensor: ObjectSensor) -> None:
+    def __init__(self, sensor: FieldSensor | PathTracedSensor) -> None:
         self.sensor = sensor
         self.frames: list[np.ndarray] = []
         self.seed = 0

@@ -191,8 +191,8 @@ def _train(
         state = f"epoch {at.epoch}/{settings.epochs}  loss {at.loss:.4f}"
         progress(f"training {number}", done, total, state)
 
-    # twice as fast on a CPU; the values do not depend on it
-    module.to(memory_format=torch.channels_last)
+    # a quarter faster on a CPU; the values do not depend on it
+    module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     checkpoint = folder / f"checkpoint_{number}.safetensors"
     data = FrameDataset.from_folders(shards)
     return fit_policy(module, data, settings, checkpoint, progress=step)
