@@ -95,6 +95,8 @@ class GridField(AbstractField):
         voxel = float((self.upper - self.lower).max()) / layout.max_resolution
         self.step_m = voxel if step_m is None else float(step_m)
         self.cone = 0.0
+        check_positive("step_m", self.step_m)
+        check_positive("density_scale", self.density_scale)
         self.info = dict(info or {})
         self.occupancy = occupancy or Occupancy.full()
         self.encoding = HashGridEncoding(
@@ -253,3 +255,9 @@ def check_box(lower: np.ndarray, upper: np.ndarray) -> None:
     good = lower.shape == upper.shape == (3,) and np.isfinite(lower).all()
     if not (good and np.isfinite(upper).all() and (upper > lower).all()):
         raise ValueError(f"bounding box: {lower} to {upper}; expected lower < upper")
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise ValueError unless a number is finite and above zero."""
+    if not 0 < value < np.inf:
+        raise ValueError(f"{name}: {value}; must be positive and finite")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
+
+T = TypeVar("T", int, float)
 
 FORMAT = "mi_nerfattack field 1"
 
@@ -70,7 +73,7 @@ def load_grid(path: str | Path) -> GridField:
 
 def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridField:
     names = ("levels", "base_resolution", "max_resolution")
-    layout = GridLayout(**{name: int(meta[name]) for name in names})
+    layout = GridLayout(**{name: _number(meta, name, int) for name in names})
     return GridField(
         layout,
         _vector(meta, "lower"),
@@ -78,35 +81,46 @@ def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridFie
         density=tensors["density"],
         texture=tensors["texture"],
         occupancy=_occupancy(tensors["occupancy"], meta),
-        density_scale=float(meta["density_scale"]),
-        step_m=float(meta["step_m"]),
+        density_scale=_number(meta, "density_scale", float),
+        step_m=_number(meta, "step_m", float),
         info=_info(meta),
     )
 
 
 def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField:
     names = NGPLayout.__dataclass_fields__
-    layout = NGPLayout(**{name: int(meta[name]) for name in names})
+    layout = NGPLayout(**{name: _number(meta, name, int) for name in names})
     return NGPField(
         layout,
         _vector(meta, "lower"),
         _vector(meta, "upper"),
         tensors=dict(tensors),
         occupancy=_occupancy(tensors["occupancy"], meta),
-        step_m=float(meta["step_m"]),
-        cone=float(meta["cone"]),
+        step_m=_number(meta, "step_m", float),
+        cone=_number(meta, "cone", float),
         info=_info(meta),
     )
 
 
 def _vector(meta: Mapping[str, str], name: str) -> np.ndarray:
-    return np.array([float(v) for v in meta[name].split()])
+    return np.array([_number({name: v}, name, float) for v in meta[name].split()])
+
+
+def _number(meta: Mapping[str, str], name: str, kind: type[T]) -> T:
+    try:
+        return kind(meta[name])
+    except ValueError as err:
+        raise ValueError(
+            f"header entry '{name}' holds {meta[name]!r}; expected {kind.__name__}"
+        ) from err
 
 
 def _occupancy(bits: np.ndarray, meta: Mapping[str, str]) -> Occupancy:
-    shape = tuple(int(v) for v in meta["occupancy_shape"].split())
+    name = "occupancy_shape"
+    shape = tuple(_number({name: v}, name, int) for v in meta[name].split())
     count = int(np.prod(shape))
-    if len(shape) != 3 or bits.dtype != np.uint8 or bits.size != (count + 7) // 8:
+    good = len(shape) == 3 and min(shape) > 0 and bits.dtype == np.uint8
+    if not good or bits.size != (count + 7) // 8:
         raise ValueError(
             f"occupancy: {bits.size} bytes for a grid of {shape}; the file is damaged"
         )

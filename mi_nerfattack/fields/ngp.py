@@ -13,7 +13,12 @@ from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.colour import srgb_to_linear
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.grid import box_metadata, check_box, flat_parameter
+from mi_nerfattack.fields.grid import (
+    box_metadata,
+    check_box,
+    check_positive,
+    flat_parameter,
+)
 from mi_nerfattack.fields.occupancy import Occupancy
 
 GEOMETRY_FEATURES = 16
@@ -111,6 +116,9 @@ class NGPField(AbstractField):
         self.density_scale = 1.0 / float((self.upper - self.lower).max())
         self.step_m = float(step_m)
         self.cone = float(cone)
+        check_positive("step_m", self.step_m)
+        if not 0 <= self.cone <= 1:
+            raise ValueError(f"cone: {self.cone}; allowed is 0 to 1")
         self.info = dict(info or {})
         self.occupancy = occupancy or Occupancy.full()
         rng = dr.rng(seed=seed)
