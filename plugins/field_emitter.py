@@ -54,7 +54,8 @@ class FieldEmitter(mi.Emitter):
         super().__init__(props)
         shared.refuse_spectral("field_emitter")
         self.stop = read_stop(props)
-        self.volumes = read_volumes(props, "field_emitter")
+        self.volumes, others = read_nested(props, "field_emitter")
+        refuse_nested(others, "field_emitter")
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -132,19 +133,26 @@ def read_stop(props: mi.Properties) -> float:
     return stop
 
 
-def read_volumes(props: mi.Properties, plugin: str) -> list[Any]:
-    """Collect nested `grid_field` and `ngp_field` volumes."""
-    volumes = [item for _, item in props.objects() if is_field_volume(item)]
+def read_nested(props: mi.Properties, plugin: str) -> tuple[list[Any], list[Any]]:
+    """Split nested objects into field volumes, at least one, and the others."""
+    volumes, others = [], []
+    for _, item in props.objects():
+        is_volume = isinstance(item, shared.AbstractFieldVolume)
+        (volumes if is_volume else others).append(item)
     if not volumes:
         raise InputError(
             f"{plugin}: no nested grid_field or ngp_field; give one or more"
         )
-    return volumes
+    return volumes, others
 
 
-def is_field_volume(item: Any) -> bool:
-    """Whether a nested object is one of this package's volumes."""
-    return isinstance(item, shared.AbstractFieldVolume)
+def refuse_nested(others: list[Any], plugin: str, also: str = "") -> None:
+    """Raise InputError if a nested object is left over."""
+    if others:
+        raise InputError(
+            f"{plugin}: cannot use the nested {type(others[0]).__name__} "
+            f"{others[0].id()!r}; allowed: grid_field, ngp_field{also}"
+        )
 
 
 def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:

@@ -11,9 +11,9 @@ import mitsuba as mi
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.field_emitter import (
     background,
-    is_field_volume,
+    read_nested,
     read_stop,
-    read_volumes,
+    refuse_nested,
 )
 
 from mi_nerfattack.render.composite import depth_composite
@@ -67,9 +67,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         shared.refuse_spectral("field_integrator")
         self.stop = read_stop(props)
         self.jitter = bool(props.get("jitter", False))
-        self.volumes = read_volumes(props, "field_integrator")
-        others = [o for _, o in props.objects() if not is_field_volume(o)]
-        self.behind = others[0] if others else None
+        self.volumes, others = read_nested(props, "field_integrator")
+        is_first = bool(others) and isinstance(others[0], mi.SamplingIntegrator)
+        refuse_nested(
+            others[1:] if is_first else others,
+            "field_integrator",
+            ", and one sampling integrator such as path",
+        )
+        self.behind = others[0] if is_first else None
         self._has_aovs = True
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
