@@ -1,0 +1,301 @@
+"""The attack: ascent, checkpoints, run folder, interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from mi_nerfattack.scenes import bundled
+
+from mi_nerfattack.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SCENARIO = """\
+name = "toy"
+seed = 1
+[scene]
+field = "scene.safetensors"
+deployment = "deployment.xml"
+routes = "routes.json"
+route = "line"
+[[objects]]
+id = "ball"
+field = "object.safetensors"
+position_m = [7.0, 2.4, 1.0]
+scale = 1.5
+[policy]
+file = "policy.safetensors"
+[drive]
+horizon = 4
+runs = 2
+[attack]
+iterations = 3
+learning_rate = 0.5
+checkpoint_every = 1
+[deployment]
+spp = 1
+"""
+
+XML = """\
+<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+    <shape type="rectangle">
+        <transform name="to_world"><scale value="100"/></transform>
+        <bsdf type="diffuse"/>
+    </shape>
+    <emitter type="constant"><rgb name="radiance" value="0.5"/></emitter>
+</scene>
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A complete scenario with tiny fields and an untrained policy."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    import toy_loop as toy
+
+    from mi_nerfattack.fields import GridLayout, save_field
+    from mi_nerfattack.policy.pilotnet import PilotNet
+
+    path = tmp_path_factory.mktemp("scenario")
+    scene = toy.blob(GridLayout(2, 6, 9), 25.0, -2.0, 1.0, 1)
+    save_field(path / "scene.safetensors", scene)
+    item = toy.blob(GridLayout(2, 6, 8), 1.0, 3.0, 0.2, 2)
+    save_field(path / "object.safetensors", item)
+    torch.manual_seed(0)
+    net = PilotNet()
+    with torch.no_grad():  # an untrained network hardly reacts; raise its gain
+        for parameter in net.parameters():
+            if parameter.ndim > 1:
+                parameter.mul_(1.6)
+    net.save(path / "policy.safetensors")
+    points = [[-20.0, 0.0], [60.0, 0.0]]
+    route = {"goal": 0, "lane_width_m": 3.5, "speed_ms": 5.0, "points_m": points}
+    (path / "routes.json").write_text(json.dumps({"line": route}))
+    (path / "deployment.xml").write_text(XML)
+    (path / "scenario.toml").write_text(SCENARIO)
+    return path
+
+
+def run(*arguments, cwd, check=None, **options):
+    result = subprocess.run(
+        [sys.executable, "-m", "mi_nerfattack.cli", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        **options,
+    )
+    if check is not None:
+        assert result.returncode == check, result.stderr
+        assert "Traceback" not in result.stderr
+    return result
+
+
+@pytest.mark.slow
+def test_attack_writes_a_complete_run_folder(folder, tmp_path):
+    from mi_nerfattack.fields import load_grid
+    from mi_nerfattack.report.exr import read_layers
+    from mi_nerfattack.report.metrics import validate
+
+    output = tmp_path / "run"
+    result = run(
+        "attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
+    )
+    assert "gradient" in result.stdout and str(output) in result.stdout
+    document = json.loads((output / "metrics.json").read_text())
+    validate(document)
+    route = document["routes"]["line"]
+    counts = {"unperturbed": 2, "random": 3, "gradient": 2}
+    for environment in ("surrogate", "deployment"):
+        for case, count in counts.items():
+            assert route[environment][case]["n"] == count
+    # frames driven: two batches of 2, 3 random, 3 attacked forward and back; transfer
+    assert document["cost"]["renders"] >= 4 * (2 + 2 + 3 + 6 + 2 + 2 + 3)
+    rows = (output / "steps.csv").read_text().splitlines()
+    assert len(rows) == 1 + 4 * 2 * (2 + 3 + 2)
+    attacked = load_grid(output / "objects" / "ball.safetensors")
+    original = load_grid(folder / "object.safetensors")
+    change = attacked.texture.numpy() - original.texture.numpy()
+    assert np.abs(change).max() > 0.1
+    density = attacked.parameters()["density"].numpy()
+    assert np.array_equal(density, original.parameters()["density"].numpy())
+    for environment in ("surrogate", "deployment"):
+        layers, metadata = read_layers(
+            output / "frames" / f"{environment}_gradient_0000.exr"
+        )
+        assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
+        assert metadata["scenario"] == "toy"
+    for name in ("overhead", "errors", "convergence", "strip"):
+        assert (output / f"{name}.png").stat().st_size > 5000
+    assert "<html" in (output / "report.html").read_text()
+    # a second run into the same folder is refused and changes nothing
+    before = (output / "metrics.json").read_bytes()
+    again = run("attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=2)
+    assert "not an empty folder" in again.stderr
+    assert (output / "metrics.json").read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_attack_resumes(folder, tmp_path, number):
+    output = tmp_path / "run"
+    text = SCENARIO.replace("iterations = 3", "iterations = 400")
+    text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
+    path = folder / f"long_{number}.toml"
+    path.write_text(text)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mi_nerfattack.cli", "attack", path, "-o", output],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    checkpoint = output / "checkpoint.safetensors"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(process.pid, number)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert "Traceback" not in stderr and "interrupted" in stderr
+    assert not list(output.glob("*.tmp*")) and not list(output.glob(".*"))
+    assert not (output / "metrics.json").exists()
+    # another scenario may not continue it
+    refused = run(
+        "attack",
+        folder / "scenario.toml",
+        "-o",
+        output,
+        "--resume",
+        cwd=tmp_path,
+        check=2,
+    )
+    assert "checkpoint.safetensors" in refused.stderr
+
+
+def test_attack_raises_its_objective(folder):
+    from mi_nerfattack.attack.gradient import GradientAttack
+
+    attack = make_attack(folder)
+    for _ in range(8):
+        attack.step()
+    first, best = attack.history[0], attack.best_mean_m
+    assert best > first.cross_track_mean_m
+    assert isinstance(attack, GradientAttack)
+
+
+def make_attack(folder):
+    from mi_nerfattack.attack.gradient import GradientAttack
+    from mi_nerfattack.attack.objective import CrossTrackDeviation
+    from mi_nerfattack.attack.world import build_world
+    from mi_nerfattack.policy.adapter import TorchPolicy
+    from mi_nerfattack.policy.pilotnet import PilotNet
+    from mi_nerfattack.rollout.loop import to_state
+    from mi_nerfattack.scenario import load_scenario
+
+    scenario, _ = load_scenario(folder / "scenario.toml")
+    policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
+    world = build_world(scenario, folder, policy)
+    return GradientAttack(
+        world.loop(world.surrogate),
+        world.fields,
+        world.route,
+        CrossTrackDeviation(world.route),
+        to_state(world.initial[:1]),
+        4,
+        0.5,
+    )
+
+
+def test_a_checkpoint_continues_bit_for_bit(folder, tmp_path, single_thread):
+    from mi_nerfattack.attack.checkpoint import load_checkpoint, save_checkpoint
+
+    whole = make_attack(folder)
+    for _ in range(4):
+        whole.step()
+    half = make_attack(folder)
+    for _ in range(2):
+        half.step()
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, half, "digest")
+    resumed = make_attack(folder)
+    load_checkpoint(path, resumed, "digest")
+    for _ in range(2):
+        resumed.step()
+    assert resumed.history == whole.history
+    for name, value in whole.tensors().items():
+        assert np.array_equal(value, resumed.tensors()[name]), name
+
+
+def test_a_checkpoint_of_another_scenario_is_refused(folder, tmp_path):
+    from mi_nerfattack.attack.checkpoint import load_checkpoint, save_checkpoint
+
+    attack = make_attack(folder)
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, attack, "one")
+    with pytest.raises(InputError, match="scenario is 'one'"):
+        load_checkpoint(path, attack, "two")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("scene.safetensors", "absent.safetensors"), ["absent.safetensors"]),
+        (("iterations = 3", "iteratons = 3"), ["iteratons", ":19"]),
+        (('route = "line"', 'route = "loop"'), ["loop", "line"]),
+        (("object.safetensors", "truncated.safetensors"), ["truncated.safetensors"]),
+        (("object.safetensors", "nan.safetensors"), ["nan.safetensors", "texture"]),
+        (("policy.safetensors", "object.safetensors"), ["object.safetensors"]),
+    ],
+)
+def test_bad_input_is_named(folder, tmp_path, capsys, change, words):
+    from mi_nerfattack import cli, files
+
+    raw = (folder / "object.safetensors").read_bytes()
+    (folder / "truncated.safetensors").write_bytes(raw[: len(raw) // 2])
+    tensors, metadata = files.read_safetensors(folder / "object.safetensors")
+    tensors["texture"] = np.full_like(tensors["texture"], np.nan)
+    files.write_safetensors(folder / "nan.safetensors", tensors, metadata)
+    path = folder / "bad.toml"
+    path.write_text(SCENARIO.replace(*change))
+    assert cli.main(["attack", str(path), "-o", str(tmp_path / "run")]) == 2
+    message = capsys.readouterr().err
+    for word in words:
+        assert word in message
+    assert "Traceback" not in message
+
+
+def test_pasting_follows_depth_and_opacity():
+    import mitsuba as mi
+
+    from mi_nerfattack.deploy import paste
+    from mi_nerfattack.render.march import March
+
+    rgb = np.zeros((1, 4, 3), np.float32)
+    depth = np.array([[5.0, 5.0, 1.0, np.inf]])
+    opacity = np.array([1.0, 0.4, 1.0, 0.5], np.float32)
+    layer = March(
+        mi.Color3f(*[mi.Float(0.5 * opacity)] * 3),
+        mi.Float(opacity),
+        mi.Float(2.0 * opacity),
+    )
+    pasted = paste(rgb, depth, layer)[0, :, 0]
+    assert np.allclose(pasted, [0.5, 0.0, 0.0, 0.5])
+
+
+def test_bundled_demo_scenario_is_valid():
+    from mi_nerfattack.scenario import load_scenario
+
+    scenario, _ = load_scenario(bundled("demo.toml"))
+    assert scenario.scene.route in ("straight", "right", "left")

@@ -1,0 +1,97 @@
+"""The scenario file: defaults, refusals with lines, paths."""
+
+from __future__ import annotations
+
+import pytest
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenario import load_scenario, resolve
+
+MINIMAL = """\
+name = "test"
+[scene]
+field = "scene.safetensors"
+deployment = "bundled:intersection/scene.xml"
+routes = "routes.json"
+route = "right"
+
+[[objects]]
+id = "hydrant"
+field = "object.safetensors"
+position_m = [1.0, 2.0, 0.0]
+
+[[objects]]
+id = "second"
+field = "object.safetensors"
+position_m = [1.0, 2.0, 0.0]
+scale = 2.0
+
+[policy]
+file = "policy.safetensors"
+[attack]
+iterations = 3
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def inner(text):
+        path = tmp_path / "scenario.toml"
+        path.write_text(text)
+        return path
+
+    return inner
+
+
+def test_defaults_and_text(write):
+    scenario, text = load_scenario(write(MINIMAL))
+    assert text == MINIMAL
+    assert scenario.attack.iterations == 3
+    assert scenario.camera.width == 200 and scenario.camera.height == 66
+    assert [item.scale for item in scenario.objects] == [1.0, 2.0]
+
+
+def test_digest_tells_scenarios_apart(write):
+    first = load_scenario(write(MINIMAL))[0]
+    comment = load_scenario(write("# remark\n" + MINIMAL))[0]
+    other = load_scenario(write(MINIMAL.replace("= 3", "= 4")))[0]
+    assert first.digest() == comment.digest() != other.digest()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("iterations = 3", "iteratons = 3", 22, ["iteratons", "unknown", "iterations"]),
+        ("iterations = 3", "iterations = 0", 22, ["iterations", "0"]),
+        ("iterations = 3", 'iterations = "3"', 22, ["iterations"]),
+        ("scale = 2.0", "scale = -2.0", 17, ["scale", "-2"]),
+        ("scale = 2.0", "scale = nan", 17, ["scale"]),
+        ('route = "right"\n', "", 2, ["route", "required"]),
+        ("[policy]", "[polisy]", 19, ["polisy"]),
+        ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
+        ("[attack]", "[attack", None, ["scenario.toml"]),
+    ],
+)
+def test_errors_name_key_and_line(write, old, new, line, words):
+    path = write(MINIMAL.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_scenario(path)
+    message = str(caught.value)
+    assert str(path) in message
+    for word in words:
+        assert word in message
+    if line is not None:
+        assert f"{path}:{line}" in message
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(InputError, match="absent.toml"):
+        load_scenario(tmp_path / "absent.toml")
+
+
+def test_resolve(tmp_path):
+    assert resolve("a/b", tmp_path) == tmp_path / "a/b"
+    assert resolve(str(tmp_path / "c"), "elsewhere") == tmp_path / "c"
+    assert resolve("bundled:intersection/routes.json", tmp_path).is_file()
+    with pytest.raises(InputError, match="bundled"):
+        resolve("bundled:nothing.toml", tmp_path)
