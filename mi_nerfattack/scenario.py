@@ -170,6 +170,36 @@ def resolve(name: str, base: str | Path) -> Path:
     return path if path.is_absolute() else Path(base) / path
 
 
+def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenario, str]:
+    """Give every object another field file, in the scenario and in its text."""
+    name = str(field.resolve())
+    objects = tuple(
+        item.model_copy(update={"field": name}) for item in scenario.objects
+    )
+    changed = scenario.model_copy(update={"objects": objects})
+    head, *blocks = re.split(r"(?m)^(?=[ \t]*\[\[\s*objects\s*\]\])", text)
+    line = re.compile(r'(?m)^(\s*field\s*=\s*)(?:"[^"\n]*"|\'[^\'\n]*\')')
+    blocks = [
+        line.sub(lambda match: match.group(1) + json.dumps(name), block, count=1)
+        for block in blocks
+    ]
+    return changed, head + "".join(blocks)
+
+
+def portable_text(text: str, base: str | Path) -> str:
+    """Make the relative paths in a scenario's text absolute, to replay it anywhere."""
+    keys = "field|deployment|routes|file"
+    line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)["\']([^"\'\n]+)["\']')
+
+    def absolute(match: re.Match[str]) -> str:
+        value = match.group(2)
+        if not value.startswith(BUNDLED):
+            value = str(resolve(value, base).resolve())
+        return match.group(1) + json.dumps(value)
+
+    return line.sub(absolute, text)
+
+
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:
     problems = []
     for error in err.errors():

@@ -5,7 +5,12 @@ from __future__ import annotations
 import pytest
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.scenario import load_scenario, resolve
+from mi_nerfattack.scenario import (
+    load_scenario,
+    portable_text,
+    replace_objects,
+    resolve,
+)
 
 MINIMAL = """\
 name = "test"
@@ -95,3 +100,19 @@ def test_resolve(tmp_path):
     assert resolve("bundled:intersection/routes.json", tmp_path).is_file()
     with pytest.raises(InputError, match="bundled"):
         resolve("bundled:nothing.toml", tmp_path)
+
+
+def test_text_of_a_run_replays_anywhere(write, tmp_path):
+    path = write(MINIMAL)
+    scenario, text = load_scenario(path)
+    scenario, text = replace_objects(scenario, text, tmp_path / "mine.safetensors")
+    portable = tmp_path / "elsewhere" / "scenario.toml"
+    portable.parent.mkdir()
+    portable.write_text(portable_text(text, path.parent))
+    again, _ = load_scenario(portable)
+    mine = str(tmp_path / "mine.safetensors")
+    assert [item.field for item in again.objects] == [mine, mine]
+    assert [item.field for item in scenario.objects] == [mine, mine]
+    assert again.scene.field == str(tmp_path / "scene.safetensors")
+    assert again.scene.deployment == "bundled:intersection/scene.xml"
+    assert again.policy.file == str(tmp_path / "policy.safetensors")

@@ -26,7 +26,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.report.metrics import Drive
 from mi_nerfattack.rollout.loop import simulate, to_state
 from mi_nerfattack.rollout.sensor import AbstractSensor
-from mi_nerfattack.scenario import Scenario
+from mi_nerfattack.scenario import Scenario, portable_text
 
 CHECKPOINT = "checkpoint.safetensors"
 SCENARIO = "scenario.toml"
@@ -111,7 +111,7 @@ class Job:
                     "another, or continue with --resume"
                 )
         files.make_folder(self.output)
-        files.write_text(self.output / SCENARIO, self.text)
+        files.write_text(self.output / SCENARIO, portable_text(self.text, self.base))
 
     def _drive_all(self, world: World, sensor: AbstractSensor, case: str) -> None:
         """Drive all initial states as one batch."""

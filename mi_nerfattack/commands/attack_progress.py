@@ -1,29 +1,49 @@
-"""What ``attack`` and ``demo`` share: progress on the terminal and the final table."""
+"""What ``attack`` and ``demo`` share: running a scenario, and the final table."""
 
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 
-def run_scenario(path: Path, output: Path, resume: bool, as_json: bool) -> int:
-    """Run a scenario with a progress bar on stderr, and print its table."""
+def run_scenario(
+    path: Path,
+    output: Path,
+    resume: bool,
+    as_json: bool,
+    object_field: Path | None = None,
+) -> int:
+    """Run a scenario with a progress bar on stderr, and print its table.
+
+    Args:
+        path: the scenario file.
+        output: the run folder.
+        resume: continue from its checkpoint.
+        as_json: print the metrics as JSON in place of the table.
+        object_field: grid field that replaces the one of every object.
+    """
     from rich.console import Console
 
     from mi_nerfattack import variant
     from mi_nerfattack.attack.job import Job
+    from mi_nerfattack.commands.bars import StageBars
     from mi_nerfattack.policy.adapter import TorchPolicy
     from mi_nerfattack.policy.pilotnet import PilotNet
     from mi_nerfattack.report.table import metrics_table
-    from mi_nerfattack.scenario import load_scenario, resolve
+    from mi_nerfattack.scenario import load_scenario, replace_objects, resolve
 
     scenario, text = load_scenario(path)
+    if object_field is not None:
+        scenario, text = replace_objects(scenario, text, object_field)
     variant.ensure()
     policy = TorchPolicy(PilotNet.load(resolve(scenario.policy.file, path.parent)))
     with StageBars() as bars:
-        job = Job(scenario, text, path.parent, policy, output, bars.update)
+
+        def show(stage: str, done: int, total: int, remark: str) -> None:
+            bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+        job = Job(scenario, text, path.parent, policy, output, show)
         document = job.run(resume)
     if as_json:
         print(json.dumps(document, allow_nan=False))
@@ -50,49 +70,3 @@ def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
         ("frames/", "EXR frames with layers"),
     ):
         console.print(f"  {name:24s} {meaning}")
-
-
-class StageBars:
-    """One progress bar a stage, with rate and remaining time, on stderr."""
-
-    def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        self._console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description:28s}"),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[remark]}"),
-            console=self._console,
-            disable=not self._console.is_terminal,
-        )
-        self._tasks: dict[str, Any] = {}
-        self._last_line = 0.0
-
-    def __enter__(self) -> StageBars:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._progress.stop()
-
-    def update(self, stage: str, done: int, total: int, remark: str) -> None:
-        """Show where a stage is; without a terminal, a line every ten seconds."""
-        if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(stage, total=total, remark="")
-        self._progress.update(self._tasks[stage], completed=done, remark=remark)
-        due = done == total or time.monotonic() - self._last_line > 10
-        if not self._console.is_terminal and due:
-            self._last_line = time.monotonic()
-            self._console.print(f"{stage}: {done}/{total} {remark}", soft_wrap=True)

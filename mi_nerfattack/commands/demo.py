@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
+
+from mi_nerfattack.commands.asset import Asset
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,13 @@ class Demo:
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Run folder, new or empty; runs/demo-DATE-TIME by default."""
+    object: Path | None = None
+    """Attack this object in place of the bundled hydrant: a mesh (glTF, OBJ, PLY),
+    which is fitted first, or a grid field file made by asset."""
+    height_m: float = 0.75
+    """Height of a mesh, metres; the scene doubles it, as it does the hydrant's."""
+    resolution: Literal[64, 128] = 64
+    """Finest level of the grid that is fitted to a mesh."""
 
     def run(self) -> int:
         """Run the bundled scenario."""
@@ -27,4 +36,18 @@ class Demo:
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
         output = self.output or Path("runs") / f"demo-{stamp}"
-        return run_scenario(bundled("demo.toml"), output, resume=False, as_json=False)
+        field = self._object_field(output)
+        return run_scenario(bundled("demo.toml"), output, False, False, field)
+
+    def _object_field(self, output: Path) -> Path | None:
+        """Return the field file of the object, fitting a mesh beside the run folder."""
+        if self.object is None or self.object.suffix == ".safetensors":
+            return self.object
+        from mi_nerfattack import files
+
+        files.make_folder(output.parent)
+        field = output.parent / f"{output.name}-object.safetensors"
+        Asset(
+            self.object, field, height_m=self.height_m, resolution=self.resolution
+        ).run()
+        return field
