@@ -24,7 +24,8 @@ from mi_nerfattack.capture.fit_cells import (
     learned,
 )
 from mi_nerfattack.capture.fit_loss import LossWeights, loss_and_cotangent
-from mi_nerfattack.capture.fit_rays import RayBank
+from mi_nerfattack.capture.fit_order import coherent_order
+from mi_nerfattack.capture.fit_rays import RayBank, RayBatch
 from mi_nerfattack.capture.frames import PosedImages, held_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLayout
@@ -33,6 +34,8 @@ from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.march import PosedField, march, march_derivative
 
 _REPORT_EVERY = 25
+_NETWORK_WARM_UP = 200  # steps
+_STEPS_BEHIND = 4  # marching steps that a ray goes on behind a known surface
 _MIN_OPACITY = 0.01  # of a step; occupancy drops cells that reach less
 
 
@@ -53,6 +56,8 @@ class FitOptions:
         occupancy_resolution: cells along the longest edge of the box.
         occupancy_every: steps between two updates of the occupancy.
         occupancy_start: steps before the first one.
+        network_every: of an NGP, steps between two updates of the networks' weights,
+            whose gradient costs as much as that of the table; every step at first.
         loss: weights of the terms.
     """
 
@@ -65,6 +70,7 @@ class FitOptions:
     occupancy_resolution: int = 128
     occupancy_every: int = 250
     occupancy_start: int = 250
+    network_every: int = 4
     loss: LossWeights = field(default_factory=LossWeights)
 
     def __post_init__(self) -> None:
@@ -171,9 +177,11 @@ def fit_ngp(
     names = tuple(ngp.parameters())
     fit = _Fit(ngp, images, options, depth, ngp.parameters(), whole_images=True)
 
-    def install(values: Any) -> None:
+    def install(values: Any, step: int) -> None:
+        resting = step >= _NETWORK_WARM_UP and step % options.network_every != 0
         for name in names:
-            ngp.set_parameter(name, values[name])
+            rests = resting and name.endswith("weights")
+            ngp.set_parameter(name, dr.detach(values[name]) if rests else values[name])
 
     return fit.run(install, progress)
 
@@ -215,7 +223,8 @@ def fit_grid(
     )
     fit = _Fit(grid, images, options, depth, {"packed": grid.packed}, False)
 
-    def install(values: Any) -> None:
+    def install(values: Any, step: int) -> None:
+        del step
         grid.packed = values["packed"]
 
     def finish() -> None:
@@ -285,7 +294,7 @@ class _Fit:
 
     def run(
         self,
-        install: Callable[[Any], None],
+        install: Callable[[Any, int], None],
         progress: ProgressCallback,
         finish: Callable[[], None] = lambda: None,
     ) -> FitResult:
@@ -293,7 +302,7 @@ class _Fit:
         since = 0
         while done < self.options.steps and self._fraction(done) < 1:
             self.optimiser.set_learning_rate(self._rate(done))
-            install(self.optimiser)
+            install(self.optimiser, done)
             step_loss, step_square = self._step()
             self.optimiser.step(eval=False)
             loss, square = loss + step_loss, square + step_square
@@ -303,29 +312,46 @@ class _Fit:
                 self._report(done, loss[0] / since, square[0] / since, progress)
                 loss, square, since = mi.Float(0), mi.Float(0), 0
             self._update_occupancy(done)
-        install({name: dr.detach(value) for name, value in self.optimiser.items()})
+        install({name: dr.detach(value) for name, value in self.optimiser.items()}, 0)
         finish()
         self.field.occupancy = self._learned()
         return self._result(done)
 
     def _step(self) -> tuple[Any, Any]:
-        batch = self.bank.draw(self.options.batch_rays, self.random)
+        batch = self._batch()
         jitter = self.random.next_float32()
         shade = [self.random.next_float32() for _ in range(3)]
         if self.sky:
             background = self.field.background(batch.direction)
         else:
             background = mi.Color3f(*shade)
-        far, active = mi.Float(dr.inf), mi.Bool(True)
-        rays = (batch.origin, batch.direction, far, jitter, active)
+        far = self._ends(batch.depth)
+        rays = (batch.origin, batch.direction, far, jitter, mi.Bool(True))
         with dr.suspend_grad():
             primal = march(self.posed, *rays)
         dr.eval(batch, jitter, shade, primal, self.random)
         loss, square, cotangent = loss_and_cotangent(
             primal, background, batch, self.options.loss
         )
-        march_derivative(dr.ADMode.Backward, self.posed, *rays, primal, cotangent)
+        # rays of a packet rarely meet in a vertex: adding them up first is no gain
+        with dr.scoped_set_flag(dr.JitFlag.ScatterReduceLocal, False):
+            march_derivative(dr.ADMode.Backward, self.posed, *rays, primal, cotangent)
         return dr.mean(loss), dr.mean(square)
+
+    def _batch(self) -> RayBatch:
+        index = self.bank.draw(self.random)
+        rays = self.bank.batch(index)
+        order = coherent_order(
+            self.posed, rays.origin, rays.direction, self._ends(rays.depth)
+        )
+        return self.bank.batch(dr.gather(mi.UInt32, index, order))
+
+    def _ends(self, depth: Any) -> Any:
+        """End rays a little behind known surfaces: more samples would teach nothing."""
+        if depth is None:
+            return mi.Float(dr.inf)
+        step = dr.maximum(self.field.step_m, self.field.cone * depth)
+        return depth + _STEPS_BEHIND * step
 
     def _fraction(self, done: int) -> float:
         fraction = done / self.options.steps

@@ -22,9 +22,14 @@ _CHUNK = 1 << 20
 def grid_shape(
     lower: np.ndarray, upper: np.ndarray, resolution: int
 ) -> tuple[int, int, int]:
-    """Return the cells along each axis, `resolution` along the longest."""
+    """Return the cells along each axis, `resolution` along the longest.
+
+    No axis has fewer than half of that: in the flat box of a street the surfaces lie
+    flat too, and a ray above the ground should meet few occupied cells.
+    """
     extent = np.asarray(upper, float) - lower
-    x, y, z = np.maximum(1, np.round(resolution * extent / extent.max())).astype(int)
+    wanted = np.round(resolution * extent / extent.max())
+    x, y, z = np.maximum((resolution + 1) // 2, wanted).astype(int)
     return int(x), int(y), int(z)
 
 

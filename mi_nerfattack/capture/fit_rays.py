@@ -85,19 +85,16 @@ class RayBank:
         dr.make_opaque(self._pixels, self._depth, self._origin)
         self._chosen = None if box is None else self._seeing(*box)
 
-    def draw(self, count: int, random: Any) -> RayBatch:
-        """Draw a batch, pixels with replacement.
+    def draw(self, random: Any) -> Any:
+        """Draw pixels with replacement, `mi.UInt32` (n,), as `batch` takes them.
 
         Args:
-            count: number of rays.
-            random: `mi.PCG32` of that many streams; it is advanced.
+            random: `mi.PCG32` of n streams; it is advanced.
         """
         if self._chosen is None:
-            index = random.next_uint32_bounded(self.count)
-        else:
-            slot = random.next_uint32_bounded(dr.width(self._chosen))
-            index = dr.gather(mi.UInt32, self._chosen, slot)
-        return self.batch(index)
+            return random.next_uint32_bounded(self.count)
+        slot = random.next_uint32_bounded(dr.width(self._chosen))
+        return dr.gather(mi.UInt32, self._chosen, slot)
 
     def batch(self, index: Any) -> RayBatch:
         """Return the rays of given pixels, `mi.UInt32` (n,), image by image, by row."""
@@ -133,11 +130,12 @@ class RayBank:
             size = min(_CHUNK, self.count - start)
             index = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
             hit, _, far = box.ray_intersect(mi.Ray3f(*self._rays(index)))
-            found.append(dr.compress(hit & (far > 0)) + start)
-        chosen = dr.concat(found)
-        if dr.width(chosen) == 0:
+            seen = dr.compress(hit & (far > 0))
+            if dr.width(seen) > 0:
+                found.append(seen + start)
+        if not found:
             raise InputError(
                 f"bounds: {lower.tolist()} to {upper.tolist()}; no image sees this "
                 "box, give bounds around what the cameras look at"
             )
-        return chosen
+        return dr.concat(found)

@@ -1,0 +1,43 @@
+"""Order rays so that those of one SIMD packet take about equally many samples.
+
+A recorded loop runs until the longest ray of a packet ends. Rays of random pixels
+differ by a factor of ten, so that most lanes would idle.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.render.march import PosedField, _seek
+
+
+def coherent_order(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:
+    """Return the permutation, `mi.UInt32` (n,), that sorts rays by `sample_count`."""
+    count = sample_count(posed, origin, direction, t_max)
+    return mi.UInt32(dr.argsort(mi.UInt32(count)))
+
+
+@dr.syntax
+def sample_count(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:
+    """Count the samples a march would take if nothing stopped it, (n,).
+
+    Args:
+        posed: the field and its pose; only its occupancy is looked at.
+        origin: (3, n), metres in the world.
+        direction: (3, n), unit vectors.
+        t_max: (n,), metres.
+    """
+    o, d = posed.to_local(origin, direction)
+    near, far = posed.interval(o, d, t_max)
+    middle = mi.Float(0.5)
+    active = mi.Bool(near < far)
+    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
+    count = mi.Float(0)
+    while active:
+        index, t, width, active = _seek(posed, o, d, index, near, far, middle, active)
+        count += dr.select(active, 1.0, 0.0)
+        index += 1
+    return count
