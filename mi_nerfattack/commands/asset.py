@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -48,7 +49,13 @@ class Asset:
         from mi_nerfattack.capture.asset import render_asset
         from mi_nerfattack.capture.fit import FitOptions, fit_grid
         from mi_nerfattack.capture.mesh import load_mesh, normalise
-        from mi_nerfattack.commands.fit_report import Bars, check_output, finish
+        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.commands.fit_report import (
+            check_output,
+            finish,
+            show_fit,
+            show_views,
+        )
         from mi_nerfattack.fields.grid import GridLayout
 
         check_output(self.output)
@@ -66,13 +73,13 @@ class Asset:
         lower, upper = mesh.bounds
         # room for the outermost vertices' own cells
         room = 2.0 / self.resolution * float((upper - lower).max())
-        with Bars() as bars:
+        with StageBars() as bars:
             images, depth = render_asset(
                 mesh,
                 self.views,
                 self.size or 200 * self.resolution // 64,
                 self.seed,
-                progress=bars.views,
+                progress=partial(show_views, bars),
             )
             result = fit_grid(
                 images,
@@ -81,7 +88,7 @@ class Asset:
                 GridLayout(16, 16, self.resolution),
                 options,
                 depth,
-                progress=bars.fit,
+                progress=partial(show_fit, bars),
             )
         provenance = {"source": self.mesh.name, "seed": str(self.seed)}
         finish(result, images, self.output, provenance, self.json)

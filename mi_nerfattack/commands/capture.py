@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -36,7 +37,8 @@ class Capture:
         """Render and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.views import capture_scene
-        from mi_nerfattack.commands.fit_report import Bars
+        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.commands.fit_report import show_views
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.render.camera import from_fov
 
@@ -45,7 +47,7 @@ class Capture:
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: {getattr(self, name)}; at least 1")
         camera = from_fov(self.width, self.height, self.fov_deg)
-        with Bars() as bars:
+        with StageBars() as bars:
             path = capture_scene(
                 self.scene,
                 self.routes,
@@ -54,7 +56,7 @@ class Capture:
                 camera,
                 self.spp,
                 self.seed,
-                bars.views,
+                partial(show_views, bars),
             )
         print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
         print(f"  mi-nerfattack fit {path.parent} -o FIELD.safetensors")

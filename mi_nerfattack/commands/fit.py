@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -53,7 +54,8 @@ class Fit:
         from mi_nerfattack.capture.fit import FitOptions, fit_ngp
         from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
         from mi_nerfattack.capture.frames import read_transforms
-        from mi_nerfattack.commands.fit_report import Bars, check_output, finish
+        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
         from mi_nerfattack.fields.ngp import NGPLayout
 
         check_output(self.output)
@@ -69,7 +71,7 @@ class Fit:
             occupancy_resolution=self.occupancy,
         )
         layout = NGPLayout(12, 2, self.log2_table, 16, self.max_resolution, 32)
-        with Bars() as bars:
+        with StageBars() as bars:
             result = fit_ngp(
                 images,
                 lower,
@@ -78,7 +80,7 @@ class Fit:
                 options,
                 depth,
                 step_m=self.step_m,
-                progress=bars.fit,
+                progress=partial(show_fit, bars),
             )
         provenance = {"source": self.folder.name, "seed": str(self.seed)}
         finish(result, images, self.output, provenance, self.json)

@@ -6,75 +6,32 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+
+from mi_nerfattack.commands.bars import StageBars
 
 if TYPE_CHECKING:
     from mi_nerfattack.capture.fit import FitProgress, FitResult
     from mi_nerfattack.capture.frames import PosedImages
 
 _SHOWN_VIEWS = 4
-_PLAIN_EVERY = 10  # reports, where the output is no terminal
 
 
-class Bars:
-    """Progress on standard error: bars in a terminal, plain lines elsewhere."""
+def show_fit(bars: StageBars, at: FitProgress) -> None:
+    """Show the state of a fit."""
+    state = (
+        f"step {at.step}  loss {at.loss:.4f}  PSNR {at.psnr_db:.2f} dB  "
+        f"{at.remaining_s:.0f} s left"
+    )
+    bars.show("fitting", at.fraction, 1.0, state)
 
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[state]}"),
-            TimeRemainingColumn(),
-            console=self._console,
-            transient=True,
-        )
-        self._tasks: dict[str, int] = {}
-        self._reports = 0
 
-    def __enter__(self) -> Bars:
-        if self._console.is_terminal:
-            self._bars.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._console.is_terminal:
-            self._bars.stop()
-
-    def views(self, done: int, total: int) -> None:
-        """Show how many views are rendered."""
-        self._show("rendering views", done / total, f"{done}/{total}", done == total)
-
-    def fit(self, at: FitProgress) -> None:
-        """Show the state of a fit."""
-        state = (
-            f"step {at.step}  loss {at.loss:.5f}  PSNR {at.psnr_db:.2f} dB  "
-            f"occupied {100 * at.occupied:.1f} %"
-        )
-        if not self._console.is_terminal:
-            state += f"  {at.elapsed_s:.0f} s done, {at.remaining_s:.0f} s left"
-        self._show("fitting", at.fraction, state, at.fraction >= 1)
-
-    def _show(self, name: str, fraction: float, state: str, last: bool) -> None:
-        if self._console.is_terminal:
-            if name not in self._tasks:
-                self._tasks[name] = self._bars.add_task(name, total=1.0, state="")
-            task = self._bars.tasks[self._tasks[name]].id
-            self._bars.update(task, completed=fraction, state=state)
-        else:
-            self._reports += 1
-            if last or self._reports % _PLAIN_EVERY == 1:
-                self._console.print(f"{name}: {state}", highlight=False, soft_wrap=True)
+def show_views(bars: StageBars, done: int, total: int) -> None:
+    """Show how many views are rendered."""
+    bars.show("rendering views", done, total, f"{done}/{total}")
 
 
 def check_output(path: Path) -> None:
