@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -158,20 +159,20 @@ def _visit(
     """Collect one DAgger round in all worlds."""
     shards: list[Path] = []
     policy = TorchPolicy(module)
+    wanted = replace(
+        settings.collecting, frames=settings.dagger_frames, seed=settings.seed + number
+    )
     for world, origin in worlds:
-        shards += collect_visited(
-            world,
-            routes,
-            policy,
-            replace(
-                settings.collecting,
-                frames=settings.dagger_frames,
-                seed=settings.seed + number,
-            ),
-            folder / f"round_{number}",
-            json.dumps({"world": origin, "policy": _digest(module)}),
-            progress=_frames_of(progress, f"round {number}, {world.name}"),
-        )
+        with _one_thread():
+            shards += collect_visited(
+                world,
+                routes,
+                policy,
+                wanted,
+                folder / f"round_{number}",
+                json.dumps({"world": origin, "policy": _digest(module)}),
+                progress=_frames_of(progress, f"round {number}, {world.name}"),
+            )
     return shards
 
 
@@ -196,6 +197,17 @@ def _train(
     checkpoint = folder / f"checkpoint_{number}.safetensors"
     data = FrameDataset.from_folders(shards)
     return fit_policy(module, data, settings, checkpoint, progress=step)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch use one thread: several wait spinning while the renderer works."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _frames_of(progress: OnStage, name: str) -> Callable[[int, int], None]:

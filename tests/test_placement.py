@@ -1,0 +1,65 @@
+"""Where vehicles and roadside objects are put."""
+
+from __future__ import annotations
+
+import mi_nerfattack  # noqa: F401  before drjit
+
+# isort: split
+import numpy as np
+import pytest
+from roadside import KERB_M, bent, flat_ground, kerb_scene, small_grid, straight
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.policy.placement import Roadside, Scatter, scene_ground
+
+
+@pytest.fixture
+def grid(variant) -> GridField:
+    return small_grid()
+
+
+def test_scatter_has_its_deviations_and_cuts(rng):
+    scatter = Scatter(close_share=0.0)
+    states = scatter.states(straight(), np.full(4000, 7.0), rng)
+    assert np.abs(states[:, 1]).max() <= 1.5
+    assert np.abs(states[:, 2]).max() <= 0.4
+    # of a normal cut at three standard deviations: 0.9867 of the deviation
+    assert states[:, 1].std() == pytest.approx(0.4933, rel=0.04)
+    np.testing.assert_allclose(states[:, 0], 7.0)
+
+
+def test_close_states_deviate_a_fifth(rng):
+    states = Scatter(close_share=1.0).states(straight(), np.full(500, 7.0), rng)
+    assert np.abs(states[:, 1]).max() <= 0.3
+    assert np.abs(states[:, 2]).max() <= 0.08
+
+
+@pytest.mark.parametrize("route", [straight(), bent()], ids=lambda r: r.name)
+def test_objects_keep_clear_of_the_lane(grid, rng, route):
+    sides = []
+    for _ in range(50):
+        pose = Roadside().place(grid, route, (2.0, 20.0), flat_ground, rng)
+        state = np.array([*pose.translation[:2], 0.0])
+        (error,) = route.cross_track_numpy(state)
+        radius = pose.scale * np.hypot(0.2, 0.2)
+        assert abs(error) >= max(2.0, 0.9 + radius)
+        assert abs(error) <= 5.01
+        assert 1.0 <= pose.scale * 0.8 <= 2.5
+        assert pose.translation[2] == 0
+        sides.append(error > 0)
+    assert 5 < sum(sides) < 45
+
+
+def test_blocked_roadside_is_an_error(grid, rng):
+    def nowhere(points):
+        return np.full(len(points), np.nan)
+
+    with pytest.raises(InputError, match="'straight'.*no free ground"):
+        Roadside().place(grid, straight(), (2.0, 20.0), nowhere, rng)
+
+
+def test_ground_is_the_highest_low_surface(variant):
+    points = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 0.0], [200.0, 0.0]])
+    height = scene_ground(kerb_scene())(points)
+    np.testing.assert_allclose(height, [0, KERB_M, np.nan, np.nan], atol=1e-5)
