@@ -37,7 +37,8 @@ class StageBars:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._bars.stop()
+        if self._console.is_terminal:
+            self._bars.stop()
 
     def show(self, stage: str, done: float, total: float, state: str) -> None:
         """Show how far a stage is.
