@@ -37,6 +37,22 @@ def read_pose(props: mi.Properties) -> Pose:
         ) from err
 
 
+def place_unit_cube(
+    props: mi.Properties, field: AbstractField, pose: Pose
+) -> mi.Properties:
+    """Copy properties, with `to_world` from [0, 1]^3 to the field's box in the world.
+
+    Media clip their rays to the box that Mitsuba derives from `to_world` of a volume;
+    they never call a Python method for it.
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3] = pose.scale * pose.rotation @ np.diag(field.upper - field.lower)
+    matrix[:3, 3] = pose.translation + pose.scale * pose.rotation @ field.lower
+    copy = mi.Properties(props)
+    copy["to_world"] = mi.ScalarTransform4f(matrix)
+    return copy
+
+
 def read_quantity(props: mi.Properties) -> str:
     """Read `quantity`: what the volume evaluates to in a medium."""
     quantity = props.get("quantity", "density")
@@ -71,11 +87,12 @@ class AbstractFieldVolume(mi.Volume):
     parameter_names: tuple[str, ...] = ()
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
         refuse_spectral(self.kind)
-        self.quantity = read_quantity(props)
-        self.field = read_field(props, self.kind)
-        self.posed = PosedField(self.field, read_pose(props))
+        quantity, pose = read_quantity(props), read_pose(props)
+        field = read_field(props, self.kind)
+        super().__init__(place_unit_cube(props, field, pose))
+        self.quantity, self.field = quantity, field
+        self.posed = PosedField(field, pose)
         self.values = self.field.parameters()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -124,17 +141,6 @@ class AbstractFieldVolume(mi.Volume):
     def resolution(self) -> mi.ScalarVector3i:
         """Return vertices along the edges of the finest level."""
         return mi.ScalarVector3i(self.field.layout.max_resolution)
-
-    def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Return the bounding box in the world."""
-        box = mi.ScalarBoundingBox3f()
-        pose = self.posed.pose
-        for corner in range(8):
-            pick = [(corner >> axis) & 1 for axis in range(3)]
-            local = np.where(pick, self.field.upper, self.field.lower)
-            world = pose.rotation @ (local * pose.scale) + pose.translation
-            box.expand(mi.ScalarPoint3f(*map(float, world)))
-        return box
 
     def to_string(self) -> str:
         """Describe the checked parameters."""
