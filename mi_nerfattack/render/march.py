@@ -66,9 +66,10 @@ class Pose:
             ValueError: the matrix shears, reflects or scales unequally.
         """
         matrix = np.asarray(matrix, np.float64)
-        scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+        volume = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
+        scale = float(np.cbrt(abs(volume)))
         if not scale > 0:
-            raise ValueError(f"to_world: {matrix.tolist()} is singular")
+            raise ValueError(f"{matrix.tolist()} is singular or not finite")
         return Pose(matrix[:3, :3] / scale, matrix[:3, 3].copy(), scale)
 
     @staticmethod
@@ -353,8 +354,7 @@ def _march_derivative(
     transmittance = mi.Float(1)
     rest = mi.Color3f(primal.radiance)  # premultiplied radiance still to come
     rest_moment = mi.Float(primal.moment)
-    # derivatives that do not belong to the field's parameters
-    d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+    d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)  # along the ray so far
     d_heading = mi.Vector3f(0)
     out_radiance, out_opacity, out_moment = mi.Color3f(0), mi.Float(0), mi.Float(0)
     while active:
