@@ -62,7 +62,7 @@ def fit_ngp(
         images: RGB (or RGBA, whose alpha must then be 1 everywhere that matters).
         lower: corner of the field's box, metres; what lies outside becomes sky.
         upper: opposite corner, metres.
-        layout: None for a small network (12 levels of 2^17, width 32).
+        layout: None for a small network (10 levels of 2^17, width 32).
         options: None for the defaults.
         depth: (n, height, width), metres along the ray, infinite in the sky; it
             places density and keeps free space free. None fits to colour alone.
@@ -75,7 +75,7 @@ def fit_ngp(
     options = options or FitOptions()
     low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     ngp = NGPField(
-        layout or NGPLayout(12, 2, 17, 16, 2048, 32),
+        layout or NGPLayout(10, 2, 17, 16, 2048, 32),
         low,
         high,
         step_m=float((high - low).max()) / 1000 if step_m is None else step_m,

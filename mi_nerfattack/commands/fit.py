@@ -35,6 +35,8 @@ class Fit:
     """Box of the field: x0 y0 z0 x1 y1 z1, metres."""
     step_m: float | None = None
     """Marching step near the camera; a thousandth of the longest edge by default."""
+    levels: int = 10
+    """Levels of the hash grid."""
     log2_table: int = 17
     """Binary logarithm of the hash table's entries on each level."""
     max_resolution: int = 2048
@@ -70,7 +72,7 @@ class Fit:
             self.seed,
             occupancy_resolution=self.occupancy,
         )
-        layout = NGPLayout(12, 2, self.log2_table, 16, self.max_resolution, 32)
+        layout = NGPLayout(self.levels, 2, self.log2_table, 16, self.max_resolution, 32)
         with StageBars() as bars:
             result = fit_ngp(
                 images,
