@@ -47,7 +47,8 @@ class FieldEmitter(mi.Emitter):
 
     Limits: the shape should enclose the fields, whose own boxes end the march, and
     carry a black BSDF: it is opaque, so what lies behind it is not seen (use
-    ``field_integrator`` for that). RGB and monochromatic variants.
+    ``field_integrator`` for that). Not differentiable: ``field_integrator`` is. RGB
+    and monochromatic variants.
     """
 
     def __init__(self, props: mi.Properties) -> None:

@@ -139,6 +139,18 @@ def test_texture_that_is_not_finite(stored, bad: float) -> None:
         load_field(path)
 
 
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e5])
+def test_fields_that_no_file_can_hold_are_not_written(tmp_path, bad: float) -> None:
+    path = tmp_path / "f.safetensors"
+    field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
+    texture = np.zeros((field.n_vertices, 3), np.float32)
+    texture[5, 1] = bad
+    field.set_parameter("texture", texture)
+    with pytest.raises(InputError, match="tensor 'texture' holds NaN.*up to 65504"):
+        save_field(path, field)
+    assert not path.exists()
+
+
 @pytest.mark.parametrize("name", ["density", "texture", "occupancy"])
 def test_missing_tensors(stored, name: str) -> None:
     path, tensors, header = stored

@@ -24,10 +24,14 @@ def save_field(path: str | Path, field: AbstractField) -> None:
     """Write a field file atomically.
 
     Raises:
-        InputError: the path cannot be written.
+        InputError: the path cannot be written, or a parameter is not finite in the
+            precision of the file.
     """
     metadata = {"format": FORMAT, **field.metadata()}
-    files.write_safetensors(path, field.tensors(), metadata)
+    with np.errstate(over="ignore"):  # the check says which tensor it is
+        tensors = field.tensors()
+    _check_finite(path, tensors)
+    files.write_safetensors(path, tensors, metadata)
 
 
 def load_field(path: str | Path) -> AbstractField:
@@ -44,11 +48,7 @@ def load_field(path: str | Path) -> AbstractField:
             f"{path}: header entry 'format' is {metadata.get('format')!r}; expected "
             f"{FORMAT!r}; make field files with 'mi-nerfattack fit' or 'asset'"
         )
-    for name, value in tensors.items():
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            raise InputError(
-                f"{path}: tensor '{name}' holds NaN or infinity; fit the field again"
-            )
+    _check_finite(path, tensors)
     kinds = {"grid_field": _grid, "ngp_field": _ngp}
     kind = metadata.get("kind", "")
     if kind not in kinds:
@@ -69,6 +69,16 @@ def load_grid(path: str | Path) -> GridField:
     if not isinstance(field, GridField):
         raise InputError(f"{path}: is a {field.kind}; a grid_field is needed here")
     return field
+
+
+def _check_finite(path: str | Path, tensors: Mapping[str, np.ndarray]) -> None:
+    for name, value in tensors.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            limit = float(np.finfo(value.dtype).max)
+            raise InputError(
+                f"{path}: tensor '{name}' holds NaN or infinity; allowed are finite "
+                f"values up to {limit:g}, fit the field again"
+            )
 
 
 def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridField:
