@@ -47,8 +47,8 @@ class Train:
     """Images a training step."""
     learning_rate: float = 1e-3
     """Largest learning rate."""
-    dagger_rounds: int = 1
-    """Rounds in which the policy drives and the expert labels."""
+    dagger_rounds: int = 0
+    """Rounds in which the policy drives and the expert labels; if the error is high."""
     dagger_frames: int = 1024
     """Frames of each world in a round."""
     dagger_epochs: int = 3

@@ -49,7 +49,7 @@ class ImitationSettings:
 
     frames: dict[str, int]
     dagger_frames: int = 2048
-    dagger_rounds: int = 1
+    dagger_rounds: int = 0
     dagger_epochs: int = 4
     dagger_rate: float = 5e-4
     seed: int = 0

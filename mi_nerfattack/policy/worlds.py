@@ -94,6 +94,12 @@ def _origin(
     paths: Sequence[Path], camera: Camera, mount: CameraMount, **other: int
 ) -> str:
     """Describe what decides about the images: checksums and numbers, as JSON."""
-    sums = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
+    # the folder tells files of equal names apart
+    sums = {
+        f"{path.resolve().parent.name}/{path.name}": hashlib.sha256(
+            path.read_bytes()
+        ).hexdigest()
+        for path in paths
+    }
     about = {"files": sums, "camera": asdict(camera), "mount": asdict(mount), **other}
     return json.dumps(about, sort_keys=True)
