@@ -84,7 +84,7 @@ def loss_reference(values: np.ndarray, ray: dict, weights: LossWeights) -> float
     hit = np.isfinite(ray["depth"])
     if hit:
         loss += weights.depth * penalty(moment / ray["depth"] - 1, 0.1)
-    return float(loss + weights.opacity * penalty(opacity - hit, 0.1))
+    return float(loss + weights.opacity * penalty(opacity - hit, 0.02))
 
 
 @pytest.mark.parametrize("depth", [2.0, np.inf])

@@ -30,7 +30,7 @@ from mi_nerfattack.capture.fit_options import (
     ProgressCallback,
     no_progress,
 )
-from mi_nerfattack.capture.fit_order import coherent_order
+from mi_nerfattack.capture.fit_order import coherent_order, sample_count
 from mi_nerfattack.capture.fit_rays import RayBank, RayBatch
 from mi_nerfattack.capture.frames import PosedImages, held_out
 from mi_nerfattack.errors import InputError
@@ -40,6 +40,8 @@ from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.march import PosedField, march, march_derivative
 
 _REPORT_EVERY = 25
+_PROBE = 2048  # rays that tell how many samples a ray takes
+_LEAST_RAYS = 64
 _NETWORK_WARM_UP = 200  # steps
 _STEPS_BEHIND = 4  # marching steps that a ray goes on behind a known surface
 _MIN_OPACITY = 0.01  # of a step; occupancy drops cells that reach less
@@ -172,7 +174,6 @@ class _Fit:
         self.bank = RayBank(images, fitted, depth, box)
         self.sky = whole_images
         self.posed = PosedField(radiance_field)
-        self.random = mi.PCG32(options.batch_rays, initseq=options.seed)
         self.rng = np.random.default_rng(options.seed)
         self.allowed = self._allowed(fitted, depth)
         radiance_field.occupancy = Occupancy(self.allowed)
@@ -184,6 +185,7 @@ class _Fit:
             params=parameters,
             mask_updates=True,
         )
+        self.random = self._streams(0)
         self.history: list[FitProgress] = []
         self.started = time.perf_counter()
 
@@ -199,6 +201,17 @@ class _Fit:
                 f"bounds: {lower.tolist()} to {upper.tolist()}; no depth lies inside"
             )
         return cells
+
+    def _streams(self, done: int) -> Any:
+        """Make the random numbers of a batch, as large as `samples` allows."""
+        seed = np.random.SeedSequence([self.options.seed, done])
+        start, probe_start = seed.generate_state(2, np.uint64)
+        rays = self.bank.batch(self.bank.draw(_random(_PROBE, probe_start)))
+        far = self._ends(rays.depth)
+        count = sample_count(self.posed, rays.origin, rays.direction, far)
+        size = int(self.options.samples / max(1.0, dr.mean(count)[0]))
+        size = min(self.options.batch_rays, max(_LEAST_RAYS, size))
+        return _random(size, start)
 
     def run(
         self,
@@ -281,6 +294,7 @@ class _Fit:
         late = done - self.options.occupancy_start
         if late >= 0 and late % self.options.occupancy_every == 0:
             self.field.occupancy = self._learned()
+            self.random = self._streams(done)
 
     def _report(
         self, done: int, loss: float, square: float, progress: ProgressCallback
@@ -312,3 +326,10 @@ class _Fit:
             time.perf_counter() - self.started,
             done,
         )
+
+
+def _random(count: int, state: np.uint64) -> Any:
+    """Make `count` streams; the state does not become part of a kernel."""
+    streams = mi.PCG32(count, dr.opaque(mi.UInt64, int(state)))
+    dr.make_opaque(streams)
+    return streams

@@ -102,7 +102,8 @@ def learned(
 ) -> Occupancy:
     """Keep the allowed cells whose density, or a neighbour's, reaches a threshold.
 
-    As `fields.occupancy.build`, but evaluates allowed cells only.
+    As `fields.occupancy.build`, but evaluates allowed cells only, and lowers the
+    threshold to the mean density, so that a field that has learned little keeps cells.
 
     Args:
         field: the field as fitted so far.
@@ -125,7 +126,7 @@ def learned(
             density = field.density(position, mi.Bool(True)).numpy()
             peak[part] = np.maximum(peak[part], density)
     cells = np.zeros(allowed.shape, bool)
-    cells[tuple(candidates)] = peak >= threshold
+    cells[tuple(candidates)] = peak >= min(threshold, float(peak.mean()))
     if cells.any():
         cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)))
     return Occupancy(cells & allowed)

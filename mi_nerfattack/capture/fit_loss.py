@@ -14,6 +14,8 @@ from mi_nerfattack.render.march import March
 
 # Rounding may lift a white pixel above 1, where the sRGB curve has no derivative.
 _BELOW_WHITE = 1 - 1e-5
+_MOMENT_DELTA = 0.1  # of the depth, relative
+_OPACITY_DELTA = 0.02  # small: a bright sky shines through a road of opacity 0.96
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class LossWeights:
 
     huber: float = 0.1
     depth: float = 0.1
-    opacity: float = 0.02
+    opacity: float = 0.05
 
 
 def huber(error: Any, delta: float) -> Any:
@@ -73,7 +75,7 @@ def loss_and_cotangent(
     if batch.depth is not None:
         loss += _geometry_loss(seen, batch.depth, weights)
     square = dr.detach(dr.squared_norm(mi.Vector3f(error))) / 3
-    dr.backward(loss * (1 / dr.width(batch.direction)))
+    dr.backward(loss * dr.opaque(mi.Float, 1 / dr.width(batch.direction)))
     cotangent = March(*(dr.grad(leaf) for leaf in leaves))
     return dr.detach(loss), square, cotangent
 
@@ -83,6 +85,6 @@ def _geometry_loss(seen: March, depth: Any, weights: LossWeights) -> Any:
     known = dr.select(is_hit, depth, 1)
     moment_error = dr.select(is_hit, seen.moment / known - 1, 0)
     opacity_error = seen.opacity - dr.select(is_hit, mi.Float(1), 0)
-    return weights.depth * huber(moment_error, 0.1) + weights.opacity * huber(
-        opacity_error, 0.1
+    return weights.depth * huber(moment_error, _MOMENT_DELTA) + (
+        weights.opacity * huber(opacity_error, _OPACITY_DELTA)
     )

@@ -20,7 +20,9 @@ class FitOptions:
         steps: of the optimiser.
         budget_minutes: end after this time if `steps` are not done by then; the
             learning rate then decays by time. None sets no limit.
-        batch_rays: rays a step.
+        batch_rays: rays a step, at most.
+        samples: of a step, about; as long as the occupancy is full, and rays therefore
+            long, a batch has fewer rays.
         seed: of initialisation, pixels, sample positions and backgrounds. Results
             still differ in the last bits unless Dr.Jit runs on one thread.
         learning_rate: of Adam, constant in the first half of the fit.
@@ -37,6 +39,7 @@ class FitOptions:
     steps: int = 2000
     budget_minutes: float | None = None
     batch_rays: int = 4096
+    samples: int = 1 << 16
     seed: int = 0
     learning_rate: float = 1e-2
     final_rate: float = 0.03
@@ -48,7 +51,13 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("steps", "batch_rays", "occupancy_resolution", "occupancy_every"):
+        for name in (
+            "steps",
+            "batch_rays",
+            "samples",
+            "occupancy_resolution",
+            "occupancy_every",
+        ):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: {getattr(self, name)}; must be at least 1")
         if self.budget_minutes is not None and not self.budget_minutes > 0:

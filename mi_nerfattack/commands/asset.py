@@ -62,10 +62,10 @@ class Asset:
         variant.ensure()
         mesh = normalise(load_mesh(self.mesh), self.height_m, self.longest_m)
         options = FitOptions(
-            self.steps,
-            self.budget_minutes,
-            self.batch_rays,
-            self.seed,
+            steps=self.steps,
+            budget_minutes=self.budget_minutes,
+            batch_rays=self.batch_rays,
+            seed=self.seed,
             occupancy_resolution=self.resolution,
             occupancy_start=100,
             occupancy_every=100,

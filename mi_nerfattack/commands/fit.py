@@ -30,7 +30,7 @@ class Fit:
     budget_minutes: float | None = None
     """End the fit after this time."""
     batch_rays: int = 4096
-    """Rays a step."""
+    """Rays a step, at most."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box of the field: x0 y0 z0 x1 y1 z1, metres."""
     step_m: float | None = None
@@ -41,8 +41,8 @@ class Fit:
     """Binary logarithm of the hash table's entries on each level."""
     max_resolution: int = 2048
     """Resolution of the finest level."""
-    occupancy: int = 256
-    """Cells of the occupancy along the longest edge."""
+    occupancy: int | None = None
+    """Cells of the occupancy along the longest edge; 256 with depth, else 128."""
     seed: int = 0
     """Of all random numbers."""
     skip_missing: bool = False
@@ -66,11 +66,11 @@ class Fit:
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
         options = FitOptions(
-            self.steps,
-            self.budget_minutes,
-            self.batch_rays,
-            self.seed,
-            occupancy_resolution=self.occupancy,
+            steps=self.steps,
+            budget_minutes=self.budget_minutes,
+            batch_rays=self.batch_rays,
+            seed=self.seed,
+            occupancy_resolution=self.occupancy or (128 if depth is None else 256),
         )
         layout = NGPLayout(self.levels, 2, self.log2_table, 16, self.max_resolution, 32)
         with StageBars() as bars:
