@@ -6,9 +6,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from mi_nerfattack.plugins import field_volume as shared
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.render.composite import depth_composite
 from mi_nerfattack.render.march import STOP, march
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.field_emitter import (
     background,
@@ -15,7 +16,6 @@ from mi_nerfattack.plugins.field_emitter import (
     read_stop,
     refuse_nested,
 )
-
 from mi_nerfattack.render.composite import depth_composite
 from mi_nerfattack.render.march import March, march, march_derivative
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 

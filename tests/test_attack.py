@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 import torch
-from mi_nerfattack.scenes import bundled
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
 

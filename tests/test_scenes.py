@@ -154,14 +154,14 @@ def test_markings_are_where_the_lanes_are(variant: str) -> None:
         np.testing.assert_allclose(np.array(si.p.z), 0.0, atol=1e-5)
         return float(np.mean(np.array(si.bsdf(ray).eval_diffuse_reflectance(si))))
 
-    for paint, asphalt in (
+    for line, asphalt in (
         ((-30.0, 3.15), (-30.0, 2.6)),  # north edge line
         ((11.5, 0.0), (14.5, 0.0)),  # centre dash and gap
         ((0.0, -17.0), (0.0, -20.0)),  # the same on the side road
         ((1.5, -14.1), (-1.5, -14.1)),  # stop line of the northbound lane
         ((0.5, -11.5), (0.0, -11.5)),  # crosswalk
     ):
-        assert colour(*paint) > 2.5 * colour(*asphalt)
+        assert colour(*line) > 2.5 * colour(*asphalt)
 
 
 def test_hydrant_is_metric_closed_and_upright() -> None:

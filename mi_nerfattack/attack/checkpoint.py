@@ -19,8 +19,8 @@ def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     return {
         "mi_nerfattack": mi_nerfattack.__version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
+        "mitsuba": str(mi.__version__),
+        "drjit": str(dr.__version__),
         "variant": str(mi.variant()),
     }
 
