@@ -163,7 +163,7 @@ def resolve(name: str, base: str | Path) -> Path:
         base: folder of the scenario file.
     """
     if name.startswith(BUNDLED):
-        from mi_nerfattack.scenes import bundled
+        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
 
         return bundled(name[len(BUNDLED) :])
     path = Path(name).expanduser()

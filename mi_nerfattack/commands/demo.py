@@ -32,7 +32,7 @@ class Demo:
     def run(self) -> int:
         """Run the bundled scenario."""
         from mi_nerfattack.commands.attack_progress import run_scenario
-        from mi_nerfattack.scenes import bundled
+        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
         output = self.output or Path("runs") / f"demo-{stamp}"

@@ -88,7 +88,7 @@ class Train:
 
     def _paths(self) -> WorldFiles:
         from mi_nerfattack.policy.worlds import WorldFiles
-        from mi_nerfattack.scenes import bundled
+        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
 
         return WorldFiles(
             self.scene or bundled("intersection/scene.xml"),
