@@ -28,7 +28,7 @@ def run_scenario(
     from mi_nerfattack import variant
     from mi_nerfattack.attack.job import Job
     from mi_nerfattack.commands.bars import StageBars
-    from mi_nerfattack.policy.adapter import TorchPolicy
+    from mi_nerfattack.policy.adapter import TorchPolicy, one_thread
     from mi_nerfattack.policy.pilotnet import PilotNet
     from mi_nerfattack.report.table import metrics_table
     from mi_nerfattack.scenario import load_scenario, replace_objects, resolve
@@ -38,7 +38,7 @@ def run_scenario(
         scenario, text = replace_objects(scenario, text, object_field)
     variant.ensure()
     policy = TorchPolicy(PilotNet.load(resolve(scenario.policy.file, path.parent)))
-    with StageBars() as bars:
+    with StageBars() as bars, one_thread():
 
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -111,6 +113,17 @@ class TorchPolicy(AbstractPolicy):
         if ((values < 0) | (values >= self.goals)).any():
             raise InputError(f"goal: {goal}; at least 0 and below {self.goals}")
         return values.expand(len(image))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: several wait spinning while the renderer works."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def to_torch(array: Any) -> torch.Tensor:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import torch
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.adapter import TorchPolicy
+from mi_nerfattack.policy.adapter import TorchPolicy, one_thread
 from mi_nerfattack.policy.collect import (
     CollectSettings,
     World,
@@ -163,7 +162,7 @@ def _visit(
         settings.collecting, frames=settings.dagger_frames, seed=settings.seed + number
     )
     for world, origin in worlds:
-        with _one_thread():
+        with one_thread():
             shards += collect_visited(
                 world,
                 routes,
@@ -197,17 +196,6 @@ def _train(
     checkpoint = folder / f"checkpoint_{number}.safetensors"
     data = FrameDataset.from_folders(shards)
     return fit_policy(module, data, settings, checkpoint, progress=step)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch use one thread: several wait spinning while the renderer works."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _frames_of(progress: OnStage, name: str) -> Callable[[int, int], None]:
