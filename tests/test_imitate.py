@@ -21,6 +21,7 @@ from mi_nerfattack import cli, files
 from mi_nerfattack.commands.bars import StageBars
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.collect import World
 from mi_nerfattack.policy.evaluate import (
     EvaluateSettings,
@@ -29,7 +30,10 @@ from mi_nerfattack.policy.evaluate import (
     policy_card,
 )
 from mi_nerfattack.policy.imitate import ImitationSettings, imitate
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.train import TrainSettings
+from mi_nerfattack.policy.worlds import WorldFiles, load_deployment, load_surrogate
+from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -121,6 +125,31 @@ def test_imitation_runs_from_frames_to_card_and_resumes(grid, tmp_path):
         first.module.parameters(), again.module.parameters(), strict=True
     ):
         np.testing.assert_array_equal(one.numpy(force=True), other.numpy(force=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["surrogate", "deployment"])
+def test_bundled_policy_keeps_its_lane(variant, name):
+    """30 steps of each route: an error below what the attack may start from."""
+    paths = WorldFiles(
+        bundled("intersection/scene.xml"),
+        bundled("intersection/field.safetensors"),
+        (bundled("hydrant/field.safetensors"),),
+        bundled("intersection/routes.json"),
+    )
+    world, _ = (
+        load_surrogate(paths) if name == "surrogate" else load_deployment(paths, 4, 0)
+    )
+    module = PilotNet.load(bundled("policy/pilotnet.safetensors"))
+    settings = EvaluateSettings(
+        runs=1, objects=1, horizon=30, seed=3, ahead_m=(6.0, 1.0)
+    )
+    routes = paths.load_routes()
+    drives = drive_routes(TorchPolicy(module), [world], routes, settings)
+    assert len(drives) == 6
+    for drive in drives:
+        assert drive.distance_m.mean() < (0.15 if name == "surrogate" else 0.2)
+        assert drive.distance_m.max() < 0.85
 
 
 def test_train_names_a_missing_scene(tmp_path, capsys):
