@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.march import PosedField, _seek
+from mi_nerfattack.render.march import PosedField, seek
 
 
 def coherent_order(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:
@@ -37,7 +37,7 @@ def sample_count(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> 
     index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
     count = mi.Float(0)
     while active:
-        index, t, width, active = _seek(posed, o, d, index, near, far, middle, active)
+        index, t, width, active = seek(posed, o, d, index, near, far, middle, active)
         count += dr.select(active, 1.0, 0.0)
         index += 1
     return count

@@ -188,7 +188,7 @@ class March:
 
 
 @dr.syntax
-def _seek(
+def seek(
     posed: PosedField,
     o: mi.Point3f,
     d: mi.Vector3f,
@@ -197,8 +197,13 @@ def _seek(
     far: mi.Float,
     jitter: mi.Float,
     active: mi.Bool,
-):
-    """Advance each ray to its next lattice interval in an occupied cell."""
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Bool]:
+    """Advance local rays (n,) to their next lattice interval in an occupied cell.
+
+    Returns:
+        index, sample position and width (metres) of the interval, and which rays
+        found one before `far`; each (n,).
+    """
     occupancy = posed.field.occupancy
     t = mi.Float(0)
     width = mi.Float(0)
@@ -319,7 +324,7 @@ def _march(
     radiance = mi.Color3f(0)  # premultiplied radiance so far
     moment = mi.Float(0)  # integral of t sigma T so far
     while active:
-        index, t, width, active = _seek(posed, o, d, index, near, far, jitter, active)
+        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         density, colour = posed.eval(o + t * d, heading, active)
         passed = dr.select(active, dr.exp(-density * width), 1)
         weight = transmittance * (1 - passed)
@@ -358,7 +363,7 @@ def _march_derivative(
     d_heading = mi.Vector3f(0)
     out_radiance, out_opacity, out_moment = mi.Color3f(0), mi.Float(0), mi.Float(0)
     while active:
-        index, t, width, active = _seek(posed, o, d, index, near, far, jitter, active)
+        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         point = mi.Point3f(o + t * d)
         towards = mi.Vector3f(heading)
         with dr.resume_grad():
