@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, load_field
-from mi_nerfattack.render.march import Pose, PosedField
+from mi_nerfattack.render.posed import Pose, PosedField
 
 QUANTITIES = ("density", "radiance")
 

@@ -12,7 +12,7 @@ import numpy as np
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.policy.adapter import AbstractPolicy
 from mi_nerfattack.policy.collect import CollectSettings
-from mi_nerfattack.render.march import PosedField
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.vehicle.route import Route
 

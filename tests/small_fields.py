@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout
-from mi_nerfattack.render.march import March, Pose, PosedField
+from mi_nerfattack.render.march import March
+from mi_nerfattack.render.posed import Pose, PosedField
 
 ONES = np.ones(3)
 SMALL = GridLayout(levels=3, base_resolution=4, max_resolution=12)

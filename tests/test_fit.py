@@ -17,7 +17,8 @@ from mi_nerfattack.capture.frames import held_out, write_transforms
 from mi_nerfattack.colour import linear_to_srgb_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, NGPLayout
-from mi_nerfattack.render.march import PosedField, march
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
 

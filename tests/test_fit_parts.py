@@ -22,7 +22,8 @@ from mi_nerfattack.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera import from_fov, look_at
-from mi_nerfattack.render.march import March, PosedField
+from mi_nerfattack.render.march import March
+from mi_nerfattack.render.posed import PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
 

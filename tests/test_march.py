@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.fields.occupancy import build
-from mi_nerfattack.render.march import March, Pose, PosedField, march
+from mi_nerfattack.render.march import March, march
+from mi_nerfattack.render.posed import Pose, PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
 

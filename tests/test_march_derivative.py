@@ -14,13 +14,8 @@ import pytest
 import small_fields as small
 
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
-from mi_nerfattack.render.march import (
-    March,
-    Pose,
-    PosedField,
-    march,
-    march_derivative,
-)
+from mi_nerfattack.render.march import March, march, march_derivative
+from mi_nerfattack.render.posed import Pose, PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
 

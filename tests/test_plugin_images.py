@@ -15,7 +15,8 @@ import pytest
 import small_fields as small
 
 from mi_nerfattack.fields import GridField, load_field, save_field
-from mi_nerfattack.render.march import PosedField, march
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
 

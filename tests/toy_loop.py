@@ -8,7 +8,7 @@ import torch
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.render.camera import CameraMount, from_fov, mount_matrix
-from mi_nerfattack.render.march import Pose, PosedField
+from mi_nerfattack.render.posed import Pose, PosedField
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.sensor import FieldSensor
 from mi_nerfattack.vehicle.dynamics import Dubins

@@ -13,7 +13,8 @@ from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera import generate_rays, pose_arrays
-from mi_nerfattack.render.march import March, PosedField, march
+from mi_nerfattack.render.march import March, march
+from mi_nerfattack.render.posed import PosedField
 
 _WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
 

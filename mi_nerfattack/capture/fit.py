@@ -37,7 +37,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.render.march import PosedField, march, march_derivative
+from mi_nerfattack.render.march import march, march_derivative
+from mi_nerfattack.render.posed import PosedField
 
 _REPORT_EVERY = 25
 _PROBE = 2048  # rays that tell how many samples a ray takes

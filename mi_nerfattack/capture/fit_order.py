@@ -11,7 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.march import PosedField, seek
+from mi_nerfattack.render.march import seek
+from mi_nerfattack.render.posed import PosedField
 
 
 def coherent_order(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:

@@ -18,7 +18,8 @@ from mi_nerfattack.render.camera import (
     pose_arrays,
 )
 from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import STOP, March, PosedField, march
+from mi_nerfattack.render.march import STOP, March, march
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
 
 OPAQUE = 0.5

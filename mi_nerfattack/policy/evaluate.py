@@ -13,7 +13,7 @@ from mi_nerfattack.attack.textures import random_texture
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.collect import World
 from mi_nerfattack.policy.placement import Roadside
-from mi_nerfattack.render.march import PosedField
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.report.metrics import Drive, departure_limit, summarise
 from mi_nerfattack.report.table import metrics_table
 from mi_nerfattack.rollout.loop import ClosedLoop, simulate, to_state

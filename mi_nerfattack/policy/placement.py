@@ -12,7 +12,7 @@ from scipy.stats import truncnorm
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.render.march import Pose
+from mi_nerfattack.render.posed import Pose
 from mi_nerfattack.vehicle.route import Route
 
 #: Height of the ground (n,), metres, at points (n, 2); NaN where nothing can stand.

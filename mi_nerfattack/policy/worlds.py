@@ -17,7 +17,7 @@ from mi_nerfattack.policy.collect import World
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE
 from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
-from mi_nerfattack.render.march import PosedField
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.sensor import FieldSensor
 from mi_nerfattack.vehicle.route import Route
 

@@ -76,7 +76,7 @@ $figures
 _COLUMNS = {
     "n": "runs",
     "cross_track_mean_m": "mean (m)",
-    "cross_track_mean_ci95_m": "95 % interval of the mean (m)",
+    "cross_track_mean_ci95_m": "95 % interval (m)",
     "cross_track_max_m": "maximum (m)",
     "cross_track_total": "total (m × steps)",
     "departures": "steps departed",

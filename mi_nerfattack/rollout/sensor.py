@@ -13,7 +13,8 @@ from mi_nerfattack.colour import linear_to_srgb
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
 from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import STOP, March, PosedField, march, march_derivative
+from mi_nerfattack.render.march import STOP, March, march, march_derivative
+from mi_nerfattack.render.posed import PosedField
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,143 @@
+"""Fields at a pose in the world, as kernels see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.fields.base import AbstractField
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Rigid pose and uniform scale of a field in the world.
+
+    Attributes:
+        rotation: (3, 3) proper rotation, field to world.
+        translation: (3,) of the field's origin, metres in the world.
+        scale: world metres per metre of the field's frame.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        rotation = np.asarray(self.rotation, np.float64)
+        good = rotation.shape == (3, 3) and np.isfinite(rotation).all()
+        good = good and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        if not (good and np.linalg.det(rotation) > 0):
+            raise ValueError(f"rotation: {rotation.tolist()}; expected a 3x3 rotation")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale: {self.scale}; must be positive and finite")
+        if not np.isfinite(self.translation).all():
+            raise ValueError(f"translation: {self.translation}; must be finite")
+
+    @staticmethod
+    def identity() -> Pose:
+        """Return the pose that leaves a field where it is."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: np.ndarray) -> Pose:
+        """Split a 4x4 matrix into rotation, translation and uniform scale.
+
+        Raises:
+            ValueError: the matrix shears, reflects or scales unequally.
+        """
+        matrix = np.asarray(matrix, np.float64)
+        volume = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
+        scale = float(np.cbrt(abs(volume)))
+        if not scale > 0:
+            raise ValueError(f"{matrix.tolist()} is singular or not finite")
+        return Pose(matrix[:3, :3] / scale, matrix[:3, 3].copy(), scale)
+
+    @staticmethod
+    def upright(
+        position: tuple[float, float, float], yaw: float, scale: float = 1.0
+    ) -> Pose:
+        """Return a pose that turns about the z axis by `yaw` radians."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return Pose(rotation, np.asarray(position, float), scale)
+
+
+class PosedField:
+    """A field at a pose, as kernels see it: all numbers opaque.
+
+    Args:
+        field: the field.
+        pose: field to world; identity by default.
+    """
+
+    def __init__(self, field: AbstractField, pose: Pose | None = None) -> None:
+        self.field = field
+        self.pose = pose or Pose.identity()
+        rotation = np.asarray(self.pose.rotation, np.float32)
+        self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
+        self._origin = mi.Point3f(*map(float, self.pose.translation))
+        self._inverse_scale = mi.Float(1 / self.pose.scale)
+        self._step = mi.Float(field.step_m * self.pose.scale)
+        # cone -> 0 makes the lattice uniform; the floor keeps step / cone finite
+        self._cone = mi.Float(max(field.cone, 1e-6))
+        dr.make_opaque(
+            self._columns, self._origin, self._inverse_scale, self._step, self._cone
+        )
+
+    def to_local(
+        self, origin: mi.Point3f, direction: mi.Vector3f
+    ) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Map a world ray; ``o + t d`` keeps its meaning with t in world metres."""
+        offset = mi.Vector3f(origin - self._origin)
+        o = [dr.dot(column, offset) * self._inverse_scale for column in self._columns]
+        d = [
+            dr.dot(column, direction) * self._inverse_scale for column in self._columns
+        ]
+        return mi.Point3f(*o), mi.Vector3f(*d)
+
+    def to_world_gradient(
+        self, d_origin: mi.Vector3f, d_direction: mi.Vector3f
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Transpose of :meth:`to_local`, for cotangents."""
+
+        def turn(v: mi.Vector3f) -> mi.Vector3f:
+            axes = zip(self._columns, v, strict=True)
+            return sum((c * x for c, x in axes), mi.Vector3f(0)) * self._inverse_scale
+
+        return turn(d_origin), turn(d_direction)
+
+    def interval(
+        self, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float
+    ) -> tuple[mi.Float, mi.Float]:
+        """Intersect a local ray with the bounding box, clipped to [0, t_max]."""
+        lower = mi.Point3f(*map(float, self.field.lower))
+        upper = mi.Point3f(*map(float, self.field.upper))
+        safe = dr.select(dr.abs(d) < 1e-12, dr.copysign(mi.Vector3f(1e-12), d), d)
+        a, b = (lower - o) / safe, (upper - o) / safe
+        near = dr.max(dr.minimum(a, b))
+        far = dr.min(dr.maximum(a, b))
+        return dr.maximum(near, 0), dr.minimum(far, t_max)
+
+    def lattice(self, index: mi.Float) -> mi.Float:
+        """Distance of a lattice point, metres."""
+        knee = self._step / self._cone
+        bend = dr.rcp(self._cone)
+        grown = knee * dr.exp(self._cone * (dr.maximum(index, bend) - bend))
+        return dr.select(index <= bend, index * self._step, grown)
+
+    def lattice_index(self, t: mi.Float) -> mi.Float:
+        """Inverse of :meth:`lattice`."""
+        knee = self._step / self._cone
+        bend = dr.rcp(self._cone)
+        grown = bend + dr.log(dr.maximum(t, knee) / knee) * bend
+        return dr.select(t <= knee, t / self._step, grown)
+
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate at a local point: density in 1/(world metre), and radiance."""
+        density, radiance = self.field.eval(point, direction, active)
+        return density * self._inverse_scale, radiance
