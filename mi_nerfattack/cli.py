@@ -50,6 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"error: {err}", EXIT_INPUT, debug)
     except KeyboardInterrupt:
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
+    except RuntimeError as err:
+        # Dr.Jit wraps whatever is raised while it records a loop
+        if not _is_interrupt(err):
+            raise
+        return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except BrokenPipeError:
         # the interpreter flushes once more at its end; let that go nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -71,6 +76,14 @@ def _run(arguments: list[str]) -> int:
     except SystemExit as stop:  # help printed, or wrong usage reported
         return stop.code if isinstance(stop.code, int) else EXIT_INPUT
     return command.run()
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _fail(message: str, code: int, debug: bool) -> int:

@@ -127,9 +127,23 @@ class Scenario(_Section):
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSection = DeploymentSection()
 
-    def digest(self) -> str:
-        """Hash of all values, 16 hexadecimal digits; the same for equal scenarios."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+    def digest(self, base: str | Path) -> str:
+        """Hash all values, and the content of the files that they name.
+
+        Args:
+            base: folder of the scenario file.
+
+        Returns:
+            16 hexadecimal digits; equal where the results are, wherever the files lie.
+        """
+        data = self.model_dump(mode="json")
+        sections = (data["scene"], data["policy"], *data["objects"])
+        for section in sections:
+            for key in ("field", "deployment", "routes", "file"):
+                if key in section:
+                    raw = resolve(section[key], base).read_bytes()
+                    section[key] = hashlib.sha256(raw).hexdigest()
+        text = json.dumps(data, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -137,7 +151,7 @@ def load_scenario(path: str | Path) -> tuple[Scenario, str]:
     """Read and check a scenario file.
 
     Returns:
-        the scenario with absolute paths, and the text of the file.
+        the scenario with its paths as written, and the text of the file.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or a key is unknown,
@@ -189,10 +203,10 @@ def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenari
 def portable_text(text: str, base: str | Path) -> str:
     """Make the relative paths in a scenario's text absolute, to replay it anywhere."""
     keys = "field|deployment|routes|file"
-    line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)["\']([^"\'\n]+)["\']')
+    line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)(["\'])((?:(?!\2)[^\n])+)\2')
 
     def absolute(match: re.Match[str]) -> str:
-        value = match.group(2)
+        value = match.group(3)
         if not value.startswith(BUNDLED):
             value = str(resolve(value, base).resolve())
         return match.group(1) + json.dumps(value)

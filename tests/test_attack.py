@@ -150,7 +150,7 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_attack_resumes(folder, tmp_path, number):
     output = tmp_path / "run"
-    text = SCENARIO.replace("iterations = 3", "iterations = 400")
+    text = SCENARIO.replace("iterations = 3", "iterations = 60")
     text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
     path = folder / f"long_{number}.toml"
     path.write_text(text)
@@ -171,28 +171,27 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
     assert "Traceback" not in stderr and "interrupted" in stderr
     assert not list(output.glob("*.tmp*")) and not list(output.glob(".*"))
     assert not (output / "metrics.json").exists()
-    # another scenario may not continue it
-    refused = run(
-        "attack",
-        folder / "scenario.toml",
-        "-o",
-        output,
-        "--resume",
-        cwd=tmp_path,
-        check=2,
-    )
+    # another scenario may not continue it, and changes nothing
+    kept = (output / "scenario.toml").read_text()
+    other = folder / "scenario.toml"
+    refused = run("attack", other, "-o", output, "--resume", cwd=tmp_path, check=2)
     assert "checkpoint.safetensors" in refused.stderr
+    assert (output / "scenario.toml").read_text() == kept
+    # the text in the run folder replays the scenario
+    again = output / "scenario.toml"
+    run("attack", again, "-o", output, "--resume", cwd=tmp_path, check=0)
+    history = json.loads((output / "attack.json").read_text())
+    assert [record["iteration"] for record in history] == list(range(60))
+    assert (output / "metrics.json").exists()
 
 
 def test_attack_raises_its_objective(folder):
-    from mi_nerfattack.attack.gradient import GradientAttack
-
     attack = make_attack(folder)
     for _ in range(8):
         attack.step()
-    first, best = attack.history[0], attack.best_mean_m
-    assert best > first.cross_track_mean_m
-    assert isinstance(attack, GradientAttack)
+    last = attack.measure()
+    assert last.objective > 1.01 * attack.history[0].objective
+    assert attack.best_mean_m >= last.cross_track_mean_m
 
 
 def make_attack(folder):
@@ -274,6 +273,22 @@ def test_bad_input_is_named(folder, tmp_path, capsys, change, words):
     for word in words:
         assert word in message
     assert "Traceback" not in message
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupt_inside_a_recorded_loop_is_one(monkeypatch, capsys):
+    from mi_nerfattack import cli
+
+    def interrupted(arguments):
+        del arguments
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as err:
+            raise RuntimeError("dr.while_loop(): encountered an exception") from err
+
+    monkeypatch.setattr(cli, "_run", interrupted)
+    assert cli.main(["doctor"]) == 130
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_pasting_follows_depth_and_opacity():

@@ -57,10 +57,20 @@ def test_defaults_and_text(write):
 
 
 def test_digest_tells_scenarios_apart(write):
-    first = load_scenario(write(MINIMAL))[0]
-    comment = load_scenario(write("# remark\n" + MINIMAL))[0]
-    other = load_scenario(write(MINIMAL.replace("= 3", "= 4")))[0]
-    assert first.digest() == comment.digest() != other.digest()
+    folder = write(MINIMAL).parent
+    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
+        (folder / name).write_bytes(name.encode())
+    (folder / "routes.json").write_text("{}")
+
+    def digest(text):
+        return load_scenario(write(text))[0].digest(folder)
+
+    first = digest(MINIMAL)
+    assert first == digest("# remark\n" + MINIMAL)
+    assert first == digest(portable_text(MINIMAL, folder))
+    assert first != digest(MINIMAL.replace("= 3", "= 4"))
+    (folder / "policy.safetensors").write_bytes(b"another policy")
+    assert first != digest(MINIMAL)
 
 
 @pytest.mark.parametrize(
@@ -116,3 +126,10 @@ def test_text_of_a_run_replays_anywhere(write, tmp_path):
     assert again.scene.field == str(tmp_path / "scene.safetensors")
     assert again.scene.deployment == "bundled:intersection/scene.xml"
     assert again.policy.file == str(tmp_path / "policy.safetensors")
+
+
+def test_quotes_in_paths_survive():
+    text = """field = "it's/x.st"\nfile = 'a "b".st'\n"""
+    lines = portable_text(text, "/base").splitlines()
+    assert lines[0] == """field = "/base/it's/x.st\""""
+    assert lines[1] == 'file = "/base/a \\"b\\".st"'

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 import mi_nerfattack
 from mi_nerfattack import files
@@ -44,6 +45,20 @@ def load_checkpoint(path: str | Path, attack: GradientAttack, digest: str) -> No
         InputError: the file is no checkpoint, belongs to another scenario or was
             written by other versions.
     """
+    try:
+        attack.load_tensors(check_checkpoint(path, digest))
+    except KeyError as err:
+        raise InputError(
+            f"{path}: entry {err} is missing; the file is damaged"
+        ) from err
+
+
+def check_checkpoint(path: str | Path, digest: str) -> dict[str, np.ndarray]:
+    """Read the tensors of a checkpoint that belongs to a scenario.
+
+    Raises:
+        InputError: as :func:`load_checkpoint`.
+    """
     tensors, metadata = files.read_safetensors(path)
     expected = {"format": FORMAT, "scenario": digest, **versions()}
     for key, value in expected.items():
@@ -52,9 +67,4 @@ def load_checkpoint(path: str | Path, attack: GradientAttack, digest: str) -> No
                 f"{path}: {key} is {metadata.get(key)!r}, this run has {value!r}; "
                 "resume with the same scenario and versions, or start a new run folder"
             )
-    try:
-        attack.load_tensors(tensors)
-    except KeyError as err:
-        raise InputError(
-            f"{path}: entry {err} is missing; the file is damaged"
-        ) from err
+    return tensors

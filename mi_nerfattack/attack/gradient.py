@@ -94,13 +94,9 @@ class GradientAttack:
         Raises:
             InputError: the gradient is not finite; nothing is updated.
         """
-        for i, field in enumerate(self.fields):
-            field.set_parameter("texture", dr.detach(self.optimiser[str(i)]))
+        self._install()
         drive = simulate(self.loop, self.initial, self.horizon, on_step)
         record = self._record(drive)
-        if record.cross_track_mean_m > self.best_mean_m:
-            self.best_mean_m = record.cross_track_mean_m
-            self.best = [field.texture.numpy().copy() for field in self.fields]
         gradient = replay_gradient(self.loop, drive, self.cost, self.attached, on_step)
         for i, value in enumerate(gradient.textures):
             if not np.isfinite(value.numpy()).all():
@@ -112,6 +108,15 @@ class GradientAttack:
         self.optimiser.step()
         self.history.append(record)
         return record
+
+    def measure(self) -> IterationRecord:
+        """Drive with the present textures, so that the last update counts too."""
+        self._install()
+        return self._record(simulate(self.loop, self.initial, self.horizon))
+
+    def _install(self) -> None:
+        for i, field in enumerate(self.fields):
+            field.set_parameter("texture", dr.detach(self.optimiser[str(i)]))
 
     def restore_best(self) -> None:
         """Give the fields the textures of the iteration with the largest error."""
@@ -160,13 +165,15 @@ class GradientAttack:
             self.optimiser.state[key] = (value, promoted, rate, extra)
 
     def _record(self, drive: Trajectory) -> IterationRecord:
+        """Judge a drive with the present textures, and keep them if they are best."""
         states = drive.states_numpy()[:, 1:]
         error = self.route.cross_track_numpy(states.reshape(-1, 3))
         error = np.abs(error).reshape(states.shape[:2])
-        objective = float(error.sum(axis=1).mean())
-        return IterationRecord(
-            self.iteration, objective, float(error.mean()), float(error.max())
-        )
+        objective, mean = float(error.sum(axis=1).mean()), float(error.mean())
+        if mean > self.best_mean_m:
+            self.best_mean_m = mean
+            self.best = [field.texture.numpy().copy() for field in self.fields]
+        return IterationRecord(self.iteration, objective, mean, float(error.max()))
 
 
 def _scalar(value: Any) -> int:

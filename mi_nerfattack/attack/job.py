@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack import files
-from mi_nerfattack.attack.checkpoint import load_checkpoint, save_checkpoint
+from mi_nerfattack.attack.checkpoint import (
+    check_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objective import CrossTrackDeviation
 from mi_nerfattack.attack.results import write_results
@@ -23,7 +27,7 @@ from mi_nerfattack.attack.world import (
     peak_memory_mb,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.metrics import Drive
+from mi_nerfattack.report.metrics import Drive, departure_limit
 from mi_nerfattack.rollout.loop import simulate, to_state
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario import Scenario, portable_text
@@ -74,13 +78,23 @@ class Job:
                 holds a checkpoint of another scenario.
         """
         started = time.perf_counter()
-        self._prepare(resume)
+        self._check_folder(resume)
         world = build_world(self.scenario, self.base, self.policy)
+        departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
+        digest = self.scenario.digest(self.base)
+        checkpoint = self.output / CHECKPOINT
+        resume = resume and checkpoint.is_file()
+        if resume:
+            check_checkpoint(checkpoint, digest)
+        else:
+            files.make_folder(self.output)
+            text = portable_text(self.text, self.base)
+            files.write_text(self.output / SCENARIO, text)
         original = [grid.texture.numpy().copy() for grid in world.fields]
         self._drive_all(world, world.surrogate, "unperturbed")
         self._random(world, world.surrogate)
         world.set_textures(original)
-        attack = self._attack(world, resume)
+        attack = self._attack(world, digest, resume)
         attacked = attack.best
         self._drive_all(world, world.surrogate, "gradient")
         world.set_textures(original)
@@ -98,20 +112,19 @@ class Job:
             self.output, world, self.drives, attack, textures, self.text, cost
         )
 
-    def _prepare(self, resume: bool) -> None:
-        checkpoint = self.output / CHECKPOINT
-        if resume and not checkpoint.is_file():
-            raise InputError(
-                f"{checkpoint}: does not exist; there is nothing to resume"
-            )
-        if not resume and self.output.exists():
+    def _check_folder(self, resume: bool) -> None:
+        """Refuse a folder that holds something else; nothing is written."""
+        if resume:
+            if not (self.output / SCENARIO).is_file():
+                raise InputError(
+                    f"{self.output}: is no run folder; there is nothing to resume"
+                )
+        elif self.output.exists():
             if not self.output.is_dir() or any(self.output.iterdir()):
                 raise InputError(
                     f"{self.output}: exists and is not an empty folder; choose "
                     "another, or continue with --resume"
                 )
-        files.make_folder(self.output)
-        files.write_text(self.output / SCENARIO, portable_text(self.text, self.base))
 
     def _drive_all(self, world: World, sensor: AbstractSensor, case: str) -> None:
         """Drive all initial states as one batch."""
@@ -174,7 +187,7 @@ class Job:
         sequence = np.random.SeedSequence([self.scenario.seed, 1, k])
         return [int(s) for s in sequence.generate_state(len(world.fields))]
 
-    def _attack(self, world: World, resume: bool) -> GradientAttack:
+    def _attack(self, world: World, digest: str, resume: bool) -> GradientAttack:
         section = self.scenario.attack
         initial = initial_states(self.scenario, world.route, section.poses, 2)
         attack = GradientAttack(
@@ -187,7 +200,7 @@ class Job:
             section.learning_rate,
             section.attached,
         )
-        path, digest = self.output / CHECKPOINT, self.scenario.digest()
+        path = self.output / CHECKPOINT
         if resume:
             load_checkpoint(path, attack, digest)
         try:
@@ -198,6 +211,7 @@ class Job:
         finally:
             if attack.iteration:
                 save_checkpoint(path, attack, digest)
+        attack.measure()
         attack.restore_best()
         return attack
 

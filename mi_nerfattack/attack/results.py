@@ -158,7 +158,9 @@ def _write_frames(
                 "camera": str(world.surrogate.camera),
             }
             name = f"{environment}_{case}_{step:04d}.exr"
-            exr.write_layers(folder / name, layers, metadata)
+            # path-traced light sources may exceed the range of half precision
+            half = environment == "surrogate"
+            exr.write_layers(folder / name, layers, metadata, half)
 
 
 def _surrogate_layers(

@@ -28,6 +28,7 @@ def run_scenario(
     from mi_nerfattack import variant
     from mi_nerfattack.attack.job import Job
     from mi_nerfattack.commands.bars import StageBars
+    from mi_nerfattack.errors import InputError
     from mi_nerfattack.policy.adapter import TorchPolicy, one_thread
     from mi_nerfattack.policy.pilotnet import PilotNet
     from mi_nerfattack.report.table import metrics_table
@@ -36,6 +37,12 @@ def run_scenario(
     scenario, text = load_scenario(path)
     if object_field is not None:
         scenario, text = replace_objects(scenario, text, object_field)
+    if scenario.vehicle.model == "ackermann":
+        raise InputError(
+            f"{path}: vehicle.model: ackermann takes a steering angle in radians, "
+            "PilotNet gives a heading rate in rad/s; use dubins, or drive your own "
+            "policy from Python"
+        )
     variant.ensure()
     policy = TorchPolicy(PilotNet.load(resolve(scenario.policy.file, path.parent)))
     with StageBars() as bars, one_thread():

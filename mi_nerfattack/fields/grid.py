@@ -11,6 +11,7 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.colour import srgb_to_linear
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
 
@@ -31,9 +32,9 @@ class GridLayout:
 
     def __post_init__(self) -> None:
         if not 1 <= self.levels <= 32:
-            raise ValueError(f"levels: {self.levels}; allowed are 1 to 32")
+            raise InputError(f"levels: {self.levels}; allowed are 1 to 32")
         if not 2 <= self.base_resolution <= self.max_resolution <= 512:
-            raise ValueError(
+            raise InputError(
                 f"resolutions: {self.base_resolution} to {self.max_resolution}; "
                 "allowed is 2 <= base <= max <= 512"
             )
@@ -242,7 +243,7 @@ def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
         value = np.zeros(shape, np.float32)
     found = tuple(value.shape)
     if found not in (shape, (int(np.prod(shape)),)):
-        raise ValueError(f"{name}: shape {found}; expected {shape}")
+        raise InputError(f"{name}: shape {found}; expected {shape}")
     if isinstance(value, np.ndarray):
         flat = mi.Float(np.ascontiguousarray(value, np.float32).ravel())
     else:
@@ -251,13 +252,13 @@ def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
 
 
 def check_box(lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ValueError unless two (3,) corners are finite and in order."""
+    """Raise InputError unless two (3,) corners are finite and in order."""
     good = lower.shape == upper.shape == (3,) and np.isfinite(lower).all()
     if not (good and np.isfinite(upper).all() and (upper > lower).all()):
-        raise ValueError(f"bounding box: {lower} to {upper}; expected lower < upper")
+        raise InputError(f"bounding box: {lower} to {upper}; expected lower < upper")
 
 
 def check_positive(name: str, value: float) -> None:
-    """Raise ValueError unless a number is finite and above zero."""
+    """Raise InputError unless a number is finite and above zero."""
     if not 0 < value < np.inf:
-        raise ValueError(f"{name}: {value}; must be positive and finite")
+        raise InputError(f"{name}: {value}; must be positive and finite")

@@ -12,6 +12,7 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.colour import srgb_to_linear
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import (
     box_metadata,
@@ -56,7 +57,7 @@ class NGPLayout:
         }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
-                raise ValueError(
+                raise InputError(
                     f"{name}: {getattr(self, name)}; allowed are {low} to {high}"
                 )
 
@@ -118,7 +119,7 @@ class NGPField(AbstractField):
         self.cone = float(cone)
         check_positive("step_m", self.step_m)
         if not 0 <= self.cone <= 1:
-            raise ValueError(f"cone: {self.cone}; allowed is 0 to 1")
+            raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
         self.info = dict(info or {})
         self.occupancy = occupancy or Occupancy.full()
         rng = dr.rng(seed=seed)
@@ -151,14 +152,14 @@ class NGPField(AbstractField):
             for index, key in enumerate(module):
                 value = np.asarray(tensors[f"{prefix}.{index}"], np.float32)
                 if value.shape != tuple(module[key].shape):
-                    raise ValueError(
+                    raise InputError(
                         f"{prefix}.{index}: shape {value.shape}; expected "
                         f"{tuple(module[key].shape)}"
                     )
                 module[key] = type(module[key])(value)
         sky = np.asarray(tensors["sky"], np.float32)
         if sky.ndim != 3 or sky.shape[2] != 3:
-            raise ValueError(f"sky: shape {sky.shape}; expected (height, width, 3)")
+            raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")
         self.sky_shape = (sky.shape[0], sky.shape[1])
         self.sky = mi.Float(sky.ravel())
 
@@ -232,7 +233,7 @@ class NGPField(AbstractField):
             raise KeyError(f"{name}: an NGP has {', '.join(self.parameters())}")
         old = self.parameters()[name]
         if dr.width(value) != dr.width(old):
-            raise ValueError(
+            raise InputError(
                 f"{name}: {dr.width(value)} values; expected {dr.width(old)}"
             )
         if name == "table":

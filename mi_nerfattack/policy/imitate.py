@@ -98,7 +98,11 @@ def imitate(
         )
     shards: list[Path] = []
     for world, origin in used:
-        wanted = CollectSettings(frames=settings.frames[world.name], seed=settings.seed)
+        wanted = replace(
+            settings.collecting,
+            frames=settings.frames[world.name],
+            seed=settings.seed,
+        )
         shards += collect(
             world,
             routes,
