@@ -7,6 +7,7 @@ import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
 # isort: split
 import os
 import random
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,10 @@ import numpy as np
 import pytest
 
 SEED = 0
+
+# A job in the background of a shell ignores SIGINT, and so would what the tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
