@@ -18,9 +18,9 @@ class Train:
     """Train a driving policy on frames of the surrogate and of the path-traced scene.
 
     Collects frames (three quarters with an object of random texture beside the road),
-    trains PilotNet to imitate the expert, on request lets it drive and trains it on what
-    it saw (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA.
-    The validation is written beside the policy, as JSON.
+    trains PilotNet to imitate the expert, on request lets it drive and trains it on
+    what it saw (DAgger), and ends with its closed-loop error. Stopped, it continues
+    from DATA. The validation is written beside the policy, as JSON.
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
