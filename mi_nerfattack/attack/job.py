@@ -144,7 +144,7 @@ class Job:
         count = self._random_count if case == "random" else 1
 
         def on_step(step: int) -> None:
-            done = first_run * horizon + step + 1 if count > 1 else step + 1
+            done = first_run * horizon + step + 1
             self.on_progress(stage, done, count * horizon, "")
 
         drive = simulate(world.loop(sensor), to_state(initial), horizon, on_step)

@@ -42,10 +42,7 @@ class GridLayout:
     @property
     def growth(self) -> float:
         """Factor between the resolutions of neighbouring levels."""
-        if self.levels == 1:
-            return 1.0
-        ratio = self.max_resolution / self.base_resolution
-        return float(ratio ** (1 / (self.levels - 1)))
+        return level_growth(self.levels, self.base_resolution, self.max_resolution)
 
 
 class GridField(AbstractField):
@@ -249,6 +246,11 @@ def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
     else:
         flat = mi.Float(value.array if dr.is_tensor_v(value) else value)
     return flat
+
+
+def level_growth(levels: int, base: int, largest: int) -> float:
+    """Return the factor between neighbouring levels that leads from base to largest."""
+    return 1.0 if levels == 1 else float((largest / base) ** (1 / (levels - 1)))
 
 
 def check_box(lower: np.ndarray, upper: np.ndarray) -> None:

@@ -19,6 +19,7 @@ from mi_nerfattack.fields.grid import (
     check_box,
     check_positive,
     flat_parameter,
+    level_growth,
 )
 from mi_nerfattack.fields.occupancy import Occupancy
 
@@ -64,10 +65,7 @@ class NGPLayout:
     @property
     def growth(self) -> float:
         """Factor between the resolutions of neighbouring levels."""
-        if self.levels == 1:
-            return 1.0
-        ratio = self.max_resolution / self.base_resolution
-        return float(ratio ** (1 / (self.levels - 1)))
+        return level_growth(self.levels, self.base_resolution, self.max_resolution)
 
 
 class NGPField(AbstractField):

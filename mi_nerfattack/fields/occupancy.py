@@ -30,7 +30,8 @@ class Occupancy:
         self.cells = np.ascontiguousarray(cells, dtype=bool)
         if self.cells.ndim != 3 or min(self.cells.shape) < 1:
             raise ValueError(f"occupancy: shape {cells.shape}; expected (rx, ry, rz)")
-        self.shape: tuple[int, int, int] = tuple(int(n) for n in self.cells.shape)  # type: ignore[assignment]
+        rx, ry, rz = self.cells.shape
+        self.shape = (rx, ry, rz)
         if self.cells.all():
             distance = np.zeros(self.shape, np.uint8)
         elif not self.cells.any():
