@@ -18,6 +18,14 @@ import numpy as np
 import pytest
 
 SEED = 0
+VARIANTS = (
+    "llvm_ad_rgb",
+    "llvm_ad_mono",
+    "llvm_ad_spectral",
+    "cuda_ad_rgb",
+    "cuda_ad_mono",
+    "cuda_ad_spectral",
+)
 
 # A job in the background of a shell ignores SIGINT, and so would what the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -43,6 +51,23 @@ def rng() -> np.random.Generator:
 def variant() -> Iterator[str]:
     """Set llvm_ad_rgb, and afterwards the variant that was set before."""
     yield from _with_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def spectral() -> Iterator[str]:
+    """Set llvm_ad_spectral, and afterwards the variant that was set before."""
+    yield from _with_variant("llvm_ad_spectral")
+
+
+@pytest.fixture(params=VARIANTS)
+def each_variant(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Set each variant that the plugins support and this machine can run."""
+    name = request.param
+    if name not in mi.variants():
+        pytest.skip(f"this Mitsuba has no {name}")
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        pytest.skip(f"{name}: no CUDA device")
+    yield from _with_variant(name)
 
 
 @pytest.fixture
