@@ -54,9 +54,19 @@ _REASONS = {
 }
 
 
+def read_bytes(path: str | Path, limit: int) -> bytes:
+    """Read a regular file of at most `limit` bytes."""
+    _check_file(path, limit)
+    with _reported(path), open(path, "rb") as file:
+        raw = file.read(limit + 1)
+    if len(raw) > limit:
+        raise InputError(f"{path}: more than {limit} bytes; it grows while it is read")
+    return raw
+
+
 def read_text(path: str | Path) -> str:
     """Read a UTF-8 text file of at most 256 MiB; a byte order mark is dropped."""
-    raw = _read_bytes(path, MAX_TEXT_BYTES)
+    raw = read_bytes(path, MAX_TEXT_BYTES)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as err:
@@ -99,7 +109,7 @@ def read_image(path: str | Path) -> np.ndarray:
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
     """
-    raw = _read_bytes(path, MAX_IMAGE_BYTES)
+    raw = read_bytes(path, MAX_IMAGE_BYTES)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -240,6 +250,22 @@ def make_folder(path: str | Path) -> Path:
     return folder
 
 
+def check_writable(path: str | Path) -> None:
+    """Raise InputError if a file could not be written to a path.
+
+    To be called before long work; it makes a file beside the target and removes it.
+    """
+    with _reported(path):
+        target = Path(os.path.realpath(path))
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "is a folder")
+        probe = target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
+        try:
+            _write_new(probe, b"")
+        finally:
+            probe.unlink(missing_ok=True)
+
+
 @contextmanager
 def _reported(path: str | Path) -> Iterator[None]:
     try:
@@ -282,15 +308,6 @@ def _check_tensor_header(path: str | Path, start: bytes, size: int) -> None:
             f"{path}: header of {length} bytes in a file of {size} bytes, truncated "
             "or damaged; write or copy it again"
         )
-
-
-def _read_bytes(path: str | Path, limit: int) -> bytes:
-    _check_file(path, limit)
-    with _reported(path), open(path, "rb") as file:
-        raw = file.read(limit + 1)
-    if len(raw) > limit:
-        raise InputError(f"{path}: more than {limit} bytes; it grows while it is read")
-    return raw
 
 
 def _write_new(path: Path, data: bytes) -> None:

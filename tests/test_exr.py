@@ -56,6 +56,25 @@ def test_exr_channels_as_other_programs_see_them(tmp_path):
     assert header["chromaticities"] == pytest.approx(exr.REC709_CHROMATICITIES)
 
 
+def test_only_colour_and_opacity_are_shortened(tmp_path):
+    names = ["R", "A", "normal.X", "normal.Y", "normal.Z", "shape.I", "dd.T", "Z"]
+    layers = {name: np.full((2, 2), 4097.0) for name in names}
+    exr.write_layers(tmp_path / "a.exr", layers, {"step": "1"})
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        stored = {name: channel.pixels for name, channel in file.channels().items()}
+    for name in names:
+        is_short = name in ("R", "A")
+        assert stored[name].dtype == (np.float16 if is_short else np.float32), name
+        assert stored[name][0, 0] == (4096 if is_short else 4097), name
+    assert exr.read_metadata(tmp_path / "a.exr")["step"] == "1"
+
+
+def test_z_of_a_normal_is_no_depth(tmp_path):
+    far = {"normal.X": np.zeros((2, 2)), "normal.Z": np.full((2, 2), np.inf)}
+    with pytest.raises(InputError, match=r"'normal.Z' is infinite"):
+        exr.write_layers(tmp_path / "a.exr", far)
+
+
 @given(
     st.floats(0, 60000, width=32),
     st.integers(1, 5),

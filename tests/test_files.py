@@ -368,3 +368,12 @@ def test_webp_is_read(tmp_path):
     Image.new("RGB", (4, 3), (0, 0, 255)).save(buffer, "WEBP", lossless=True)
     (tmp_path / "image.webp").write_bytes(buffer.getvalue())
     assert (files.read_image(tmp_path / "image.webp") == (0, 0, 255)).all()
+
+
+def test_check_writable(tmp_path):
+    target = tmp_path / "a.bin"
+    files.check_writable(target)
+    assert not list(tmp_path.iterdir())
+    for wrong in (tmp_path, tmp_path / "none" / "a.bin"):
+        with pytest.raises(InputError, match=re.escape(str(wrong))):
+            files.check_writable(wrong)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,8 @@ def write_layers(
             linear Rec.709, `A` opacity, `Z` expected depth in metres, infinite where
             there is nothing.
         metadata: string attributes, e.g. {"step": "12"}.
-        half: store 16-bit floats; `Z` is 32-bit always.
+        half: store colour and opacity as 16-bit floats; depth and whatever else
+            there is (positions, normals, indices) is 32-bit always.
 
     Raises:
         InputError: for a wrong name or shape, NaN, infinity outside `Z`, or a value
@@ -55,7 +56,9 @@ def write_layers(
         for channel, values in _split(path, name, np.asarray(array)).items():
             if channel in channels:
                 raise InputError(f"{path}: channel {channel!r} twice; rename a layer")
-            channels[channel] = _encode(path, channel, values, half)
+            channels[channel] = values
+    for channel, values in channels.items():
+        channels[channel] = _encode(path, channel, values, half, channels)
     shapes = sorted({values.shape for values in channels.values()})
     if len(shapes) != 1 or 0 in shapes[0]:
         raise InputError(f"{path}: layers of shapes {shapes}; all need one (H, W)")
@@ -85,20 +88,33 @@ def read_layers(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]
         InputError: for a missing, foreign, truncated, deep, multi-part or subsampled
             file, or one of more than 2^28 values.
     """
-    raw = files._read_bytes(path, MAX_FILE_BYTES)
-    headers = _open(path, raw, header_only=True)
-    if len(headers.parts) != 1:
-        raise InputError(f"{path}: {len(headers.parts)} parts; single-part files only")
-    header = headers.header()
-    _check_header(path, header)
+    raw, header = _read_header(path)
     part = _open(path, raw, header_only=False)
     try:
         channels = {name: c.pixels for name, c in part.channels().items()}
     except (RuntimeError, ValueError) as err:
         raise InputError(f"{path}: truncated or damaged; copy it again") from err
     single = {n: p.astype(np.float32) for n, p in sorted(channels.items())}
-    strings = {n: v for n, v in header.items() if isinstance(v, str) and n != "name"}
-    return _join(single), strings
+    return _join(single), _strings(header)
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """Read the string attributes of an EXR file; see `read_layers`."""
+    return _strings(_read_header(path)[1])
+
+
+def _read_header(path: str | Path) -> tuple[bytes, dict[str, Any]]:
+    raw = files.read_bytes(path, MAX_FILE_BYTES)
+    headers = _open(path, raw, header_only=True)
+    if len(headers.parts) != 1:
+        raise InputError(f"{path}: {len(headers.parts)} parts; single-part files only")
+    header = headers.header()
+    _check_header(path, header)
+    return raw, header
+
+
+def _strings(header: Mapping[str, Any]) -> dict[str, str]:
+    return {n: v for n, v in header.items() if isinstance(v, str) and n != "name"}
 
 
 def _split(path: str | Path, name: str, array: np.ndarray) -> dict[str, np.ndarray]:
@@ -113,23 +129,33 @@ def _split(path: str | Path, name: str, array: np.ndarray) -> dict[str, np.ndarr
     )
 
 
-def _encode(path: str | Path, name: str, values: np.ndarray, half: bool) -> np.ndarray:
-    is_depth = name.rpartition(".")[2] == "Z"
+def _encode(
+    path: str | Path,
+    name: str,
+    values: np.ndarray,
+    half: bool,
+    names: Collection[str],
+) -> np.ndarray:
     if values.dtype.kind not in "fiu":
         raise InputError(f"{path}: channel {name!r} is {values.dtype}; give numbers")
     if np.any(np.isnan(values)) or np.any(np.isneginf(values)):
         raise InputError(f"{path}: channel {name!r} holds NaN or -inf; fix its source")
-    if not is_depth and np.any(np.isinf(values)):
+    if not _is_depth(name, names) and np.any(np.isinf(values)):
         raise InputError(f"{path}: channel {name!r} is infinite; only Z may be")
-    if half and not is_depth:
+    if half and name.rpartition(".")[2] in ("R", "G", "B", "A"):
         largest = float(np.max(np.abs(values), initial=0))
         if largest > _HALF_MAX:
             raise InputError(
                 f"{path}: channel {name!r} reaches {largest:g}, beyond 16-bit floats; "
-                "write with half=False"
+                "write 32-bit floats (half=False, --precision float)"
             )
         return np.ascontiguousarray(values, dtype=np.float16)
     return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _is_depth(name: str, names: Collection[str]) -> bool:
+    """Tell a depth from the third component of a normal or a position."""
+    return name.rpartition(".")[2] == "Z" and name[:-1] + "X" not in names
 
 
 def _checked_metadata(path: str | Path, metadata: Mapping[str, str]) -> dict[str, str]:
