@@ -5,6 +5,7 @@ import io
 import math
 import os
 import pickle
+import re
 import stat
 import zipfile
 from pathlib import Path
