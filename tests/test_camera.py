@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mi_nerfattack import colour
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render import camera as cam
+from mi_nerfattack.render.conventions import mitsuba_sensor_dict
 from mi_nerfattack.render.distortion import distort, undistort
 
 FOX = cam.Camera(
@@ -45,27 +46,6 @@ def rays_of(camera, poses, **kwargs):
     o, d = cam.generate_rays(camera, origin, rotation, len(poses), **kwargs)
     shape = (len(poses), camera.height, camera.width, 3)
     return o.numpy().T.reshape(shape), d.numpy().T.reshape(shape)
-
-
-def test_conversions_undo_each_other():
-    poses = random_poses(5)
-    there_and_back = [
-        (cam.opengl_to_opencv, cam.opencv_to_opengl),
-        (cam.opencv_to_mitsuba, cam.mitsuba_to_opencv),
-    ]
-    for there, back in there_and_back:
-        np.testing.assert_array_equal(back(there(poses)), poses)
-        assert np.all(np.linalg.det(there(poses)[:, :3, :3]) > 0)
-
-
-def test_conversions_of_known_axes():
-    opencv = np.eye(4)  # x right, y down, z forward, in a world like the camera
-    opengl = cam.opencv_to_opengl(opencv)
-    np.testing.assert_array_equal(opengl[:3, 1], [0, -1, 0])  # up is -down
-    np.testing.assert_array_equal(opengl[:3, 2], [0, 0, -1])  # looks along -z
-    mitsuba = cam.opencv_to_mitsuba(opencv)
-    np.testing.assert_array_equal(mitsuba[:3, 0], [-1, 0, 0])  # x is to the left
-    np.testing.assert_array_equal(mitsuba[:3, 2], [0, 0, 1])
 
 
 @pytest.mark.parametrize("eye", [(3.0, -2.0, 5.0), (0.0, 0.0, 4.0), (1.0, 0.0, 0.0)])
@@ -121,7 +101,7 @@ def test_rays_agree_with_mitsubas_sensor(principal):
         mi.Float(((column + 0.5) / 20).ravel()), mi.Float(((row + 0.5) / 12).ravel())
     )
     for i, pose in enumerate(poses):
-        sensor = mi.load_dict(cam.mitsuba_sensor_dict(camera, pose, 1))
+        sensor = mi.load_dict(mitsuba_sensor_dict(camera, pose, 1))
         ray, _ = sensor.sample_ray(0.0, 0.0, film, mi.Point2f(0))
         ours = directions[i].reshape(-1, 3)
         np.testing.assert_allclose(ray.d.numpy().T, ours, atol=2e-6)
@@ -224,13 +204,6 @@ def test_impossible_cameras(change, name):
     values = {"width": 10, "height": 10, "fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 5.0}
     with pytest.raises(InputError, match=name):
         cam.Camera(**{**values, **change})
-
-
-def test_mitsuba_sensor_refuses_what_it_cannot_do():
-    with pytest.raises(InputError, match="no distortion"):
-        cam.mitsuba_sensor_dict(FOX, np.eye(4), 1)
-    with pytest.raises(InputError, match="square pixels"):
-        cam.mitsuba_sensor_dict(cam.Camera(4, 4, 4.0, 5.0, 2.0, 2.0), np.eye(4), 1)
 
 
 def test_srgb_known_values():

@@ -18,7 +18,8 @@ from mi_nerfattack import files
 from mi_nerfattack.capture.intrinsics import read_camera
 from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera, opencv_to_opengl, opengl_to_opencv
+from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.conventions import opencv_to_opengl, opengl_to_opencv
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp")

@@ -9,9 +9,9 @@ from typing import Any
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.conventions import COLMAP_MODELS
 
 _NUMBERS = "w h fl_x fl_y cx cy camera_angle_x camera_angle_y k1 k2 p1 p2 k3 k4".split()
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
 def read_camera(
@@ -33,10 +33,11 @@ def read_camera(
             is not the image's.
     """
     model = table.get("camera_model", "OPENCV")
-    if model not in _MODELS or table.get("is_fisheye"):
+    if model not in COLMAP_MODELS or table.get("is_fisheye"):
         raise InputError(
             f"{source}: camera_model: {model!r}, is_fisheye: "
-            f"{table.get('is_fisheye', False)!r}; only {', '.join(_MODELS)} can be read"
+            f"{table.get('is_fisheye', False)!r}; only {', '.join(COLMAP_MODELS)} "
+            "can be read"
         )
     values = {key: _shared_number(source, key, table, frames) for key in _NUMBERS}
     for key in ("k3", "k4"):

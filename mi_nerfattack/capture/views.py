@@ -26,11 +26,10 @@ from mi_nerfattack.render.camera import (
     Camera,
     CameraMount,
     generate_rays,
-    mitsuba_sensor_dict,
     mount_matrix,
-    opencv_to_mitsuba,
     pose_arrays,
 )
+from mi_nerfattack.render.conventions import mitsuba_sensor_dict, opencv_to_mitsuba
 from mi_nerfattack.vehicle.route import Route
 
 _LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
@@ -63,7 +62,7 @@ class ViewRenderer:
 
     Args:
         scene: any scene; its own sensors are ignored.
-        camera: square pixels, no distortion.
+        camera: intrinsics.
         integrator: `mi.Integrator` for colour; None for the scene's own.
     """
 
@@ -139,7 +138,7 @@ def render_views(
 
     Args:
         scene: any scene; its own sensors are ignored.
-        camera: square pixels, no distortion.
+        camera: intrinsics.
         camera_to_world: (n, 4, 4), OpenCV axes, metres.
         spp: samples per pixel.
         seed: each view has samples of its own derived from it.
@@ -236,7 +235,7 @@ def capture_scene(
         routes_path: routes file of the scene; all its routes are used.
         out_folder: made if needed.
         n: number of views; see `drive_poses`.
-        camera: square pixels, no distortion.
+        camera: intrinsics.
         spp: samples per pixel.
         seed: of poses and samples.
         progress: called with (views done, n) after each view.

@@ -1,10 +1,9 @@
-"""Camera intrinsics, poses and rays: the only module that converts conventions.
+"""Camera intrinsics, poses and rays.
 
-Four frames meet here. World: right-handed, z up, metres. Camera in memory: OpenCV
-(x right, y down, z forward), 4x4 float64 named `camera_to_world`. `transforms.json`:
-OpenGL (x right, y up, looking along -z). Mitsuba's perspective sensor: looks along +z,
-x to the left, y up. Pixels: (0, 0) is the top-left corner of the image, so the centre
-of the first pixel is (0.5, 0.5).
+World: right-handed, z up, metres. A camera's frame is OpenCV's (x right, y down, z
+forward); its pose is a 4x4 float64 matrix named `camera_to_world`. Other frames are
+converted by :mod:`mi_nerfattack.render.conventions`. Pixels: (0, 0) is the top-left
+corner of the image, so the centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -29,7 +28,8 @@ class Camera:
     Args:
         width, height: image size in pixels.
         fx, fy: focal lengths in pixels.
-        cx, cy: principal point in pixels from the top-left corner of the image.
+        cx, cy: principal point in pixels from the top-left corner of the image; to one
+            that counts from the centre of the first pixel, as OpenCV's, add 0.5.
         k1, k2, p1, p2: distortion as in `cv2.projectPoints`, without unit.
 
     Raises:
@@ -119,30 +119,6 @@ def from_fov(width: int, height: int, fov_x_deg: float) -> Camera:
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
 
-def _flip_columns(matrix: np.ndarray, signs: tuple[int, int, int]) -> np.ndarray:
-    return np.asarray(matrix, np.float64) * np.array([*signs, 1.0])
-
-
-def opengl_to_opencv(matrix: np.ndarray) -> np.ndarray:
-    """Convert camera-to-world (..., 4, 4) from OpenGL's to OpenCV's camera axes."""
-    return _flip_columns(matrix, (1, -1, -1))
-
-
-def opencv_to_opengl(matrix: np.ndarray) -> np.ndarray:
-    """Convert camera-to-world (..., 4, 4) from OpenCV's to OpenGL's camera axes."""
-    return _flip_columns(matrix, (1, -1, -1))
-
-
-def opencv_to_mitsuba(matrix: np.ndarray) -> np.ndarray:
-    """Convert camera-to-world (..., 4, 4) from OpenCV's to Mitsuba's camera axes."""
-    return _flip_columns(matrix, (-1, -1, 1))
-
-
-def mitsuba_to_opencv(matrix: np.ndarray) -> np.ndarray:
-    """Convert camera-to-world (..., 4, 4) from Mitsuba's to OpenCV's camera axes."""
-    return _flip_columns(matrix, (-1, -1, 1))
-
-
 def look_at(eye: ArrayLike, target: ArrayLike) -> np.ndarray:
     """Place an upright camera (up is +z).
 
@@ -165,56 +141,6 @@ def look_at(eye: ArrayLike, target: ArrayLike) -> np.ndarray:
     matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     matrix[:3, 3] = eye
     return matrix
-
-
-def mitsuba_sensor_dict(
-    camera: Camera,
-    camera_to_world: np.ndarray,
-    spp: int,
-    film: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Describe the camera as a stock `perspective` sensor.
-
-    Args:
-        camera: square pixels, no distortion (the stock sensor has neither).
-        camera_to_world: (4, 4), OpenCV axes, metres.
-        spp: samples per pixel of the `multijitter` sampler.
-        film: more or other properties of the `hdrfilm`, whose defaults here are
-            32-bit RGB and a box filter.
-
-    Raises:
-        InputError: the camera is distorted or its pixels are not square.
-    """
-    if camera.is_distorted:
-        raise InputError(
-            f"camera.k1, k2, p1, p2: {camera.distortion}; Mitsuba's perspective "
-            "sensor has no distortion; pass a camera without"
-        )
-    if abs(camera.fx / camera.fy - 1) > 1e-5:
-        raise InputError(
-            f"camera.fx, fy: {camera.fx}, {camera.fy}; Mitsuba's perspective sensor "
-            "has square pixels; pass equal focal lengths"
-        )
-    return {
-        "type": "perspective",
-        "fov": math.degrees(2 * math.atan(0.5 * camera.width / camera.fx)),
-        "fov_axis": "x",
-        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
-        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-        "near_clip": 1e-2,
-        "far_clip": 1e4,
-        "to_world": mi.ScalarTransform4f(opencv_to_mitsuba(camera_to_world)),
-        "sampler": {"type": "multijitter", "sample_count": spp},
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-            **(film or {}),
-        },
-    }
 
 
 @dataclass(frozen=True)

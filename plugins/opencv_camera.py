@@ -1,0 +1,269 @@
+"""The sensor `opencv_camera`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.distortion import distort, jacobian, undistort
+
+_INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+class OpencvCamera(mi.Sensor):
+    r"""Pinhole camera with OpenCV's lens distortion (``opencv_camera``).
+
+    A point :math:`(X, Y, Z)` of the camera's frame (Mitsuba's: x to the left, y up, z
+    forward) is seen at the pixel :math:`u = f_x x' + c_x,\ v = f_y y' + c_y`, where
+    :math:`(x', y')` is the distorted position of :math:`(-X, -Y) / Z`:
+
+    .. math::
+
+        x' = x (1 + k_1 r^2 + k_2 r^4) + 2 p_1 x y + p_2 (r^2 + 2 x^2), \quad
+        y' = y (1 + k_1 r^2 + k_2 r^4) + p_1 (r^2 + 2 y^2) + 2 p_2 x y.
+
+    Rays follow from eight Newton steps. Pixels count from the top-left corner of the
+    full film, so that the centre of the first pixel is (0.5, 0.5), as in COLMAP; to a
+    principal point found with OpenCV, which counts from the centre of the first pixel,
+    add 0.5.
+
+    =================  =========  =====  ========  ===================================
+    name               type       unit   default   meaning
+    =================  =========  =====  ========  ===================================
+    fx                 float      pixel            focal length
+    fy                 float      pixel  fx        focal length along the columns
+    cx, cy             float      pixel  centre    principal point in the full film
+    k1, k2             float             0         radial distortion
+    p1, p2             float             0         tangential distortion
+    to_world           transform  metre  identity  rotation and translation
+    near_clip          float      metre  1e-2      rays start at this distance along z
+    far_clip           float      metre  1e4       rays end at this distance along z
+    shutter_open, shutter_close, srf, (nested) film and sampler: as of ``perspective``
+    ==================================================================================
+
+    All but the shutter and ``srf`` show in ``mi.traverse``. Other values need no other
+    kernel, unless the first distortion coefficient becomes other than zero.
+
+    .. code-block:: xml
+
+        <sensor type="opencv_camera">
+            <float name="fx" value="250"/>
+            <float name="fy" value="252"/>
+            <float name="k1" value="-0.1"/>
+            <transform name="to_world">
+                <lookat origin="3, 1, 1.5" target="0, 0, 0" up="0, 0, 1"/>
+            </transform>
+            <film type="hdrfilm">
+                <integer name="width" value="320"/>
+                <integer name="height" value="240"/>
+            </film>
+        </sensor>
+
+    .. code-block:: python
+
+        {"type": "opencv_camera", "fx": 250.0, "fy": 252.0, "k1": -0.1}
+
+    Differentiable with respect to the intrinsics and ``to_world``, as far as the
+    integrator is. Limits: no aperture; a distortion that cannot be inverted in the
+    whole film (and in the filter's border, where that is sampled) is refused.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        width, height = self.film().size()
+        fx = props["fx"]
+        values = [fx, props.get("fy", fx)]
+        values += [props.get("cx", 0.5 * width), props.get("cy", 0.5 * height)]
+        values += [props.get(name, 0.0) for name in ("k1", "k2", "p1", "p2")]
+        self.intrinsics = {
+            name: mi.Float(value)
+            for name, value in zip(_INTRINSICS, values, strict=True)
+        }
+        self.near_clip = mi.Float(props.get("near_clip", 1e-2))
+        self.far_clip = mi.Float(props.get("far_clip", 1e4))
+        self.m_needs_sample_3 = False
+        self.parameters_changed([])
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose intrinsics, clip distances and pose."""
+        super().traverse(callback)
+        fixed = mi.ParamFlags.NonDifferentiable
+        moves = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+        for name, value in self.intrinsics.items():
+            callback.put(name, value, moves)
+        callback.put("near_clip", self.near_clip, fixed)
+        callback.put("far_clip", self.far_clip, fixed)
+        callback.put("to_world", self.m_to_world, moves)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Check what changed and hand it to kernels as opaque values."""
+        super().parameters_changed(keys)
+        if not keys or "to_world" in keys:
+            _check_rigid(self.m_to_world)
+        if not keys or "near_clip" in keys or "far_clip" in keys:
+            _check_clip(self.near_clip, self.far_clip)
+        if not keys or not {"to_world", "near_clip", "far_clip"}.issuperset(keys):
+            self._film_or_lens_changed()
+        dr.make_opaque(self.m_to_world, self.near_clip, self.far_clip, self.intrinsics)
+
+    def _film_or_lens_changed(self) -> None:
+        film = self.film()
+        numbers = [float(dr.detach(v)[0]) for v in self.intrinsics.values()]
+        # Where the film samples its border, rays start beyond the image.
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        width, height = (int(v) + 2 * border for v in film.size())
+        fx, fy, cx, cy, *lens = numbers
+        camera = Camera(width, height, fx, fy, cx + border, cy + border, *lens)
+        self.is_distorted = camera.is_distorted
+        self._crop_size = mi.Vector2f(film.crop_size())
+        self._crop_offset = mi.Vector2f(film.crop_offset())
+        dr.make_opaque(self._crop_size, self._crop_offset)
+
+    def sample_ray(
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Ray3f, Any]:
+        """Make the ray through a position in the crop window."""
+        del sample3
+        x, y = self._unproject(mi.Point2f(sample2))
+        return self._ray(mi.Ray3f(), x, y, time, sample1, active)
+
+    def sample_ray_differential(
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.RayDifferential3f, Any]:
+        """Make the ray and, to first order, those of the next pixels."""
+        del sample3
+        x, y = self._unproject(mi.Point2f(sample2))
+        ray, weight = self._ray(mi.RayDifferential3f(), x, y, time, sample1, active)
+        lens = self.intrinsics
+        step_x, step_y = dr.rcp(lens["fx"]), dr.rcp(lens["fy"])
+        by_u, by_v = (step_x, mi.Float(0)), (mi.Float(0), step_y)
+        if self.is_distorted:
+            xx, xy, yy, determinant = jacobian(x, y, *self._distortion())
+            by_u = (yy * step_x / determinant, -xy * step_x / determinant)
+            by_v = (-xy * step_y / determinant, xx * step_y / determinant)
+        ray.o_x = ray.o_y = ray.o
+        ray.d_x = self._direction(x + by_u[0], y + by_u[1])
+        ray.d_y = self._direction(x + by_v[0], y + by_v[1])
+        ray.has_differentials = True
+        return ray, weight
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, Any]:
+        """Connect points to the camera; ``uv`` is in pixels of the crop window."""
+        del sample
+        local = self.m_to_world.inverse() @ mi.Point3f(it.p)
+        z = dr.select(local.z > 0, local.z, 1)
+        x, y = -local.x / z, -local.y / z
+        position, density = self._project(x, y)
+        seen = mi.Bool(active) & (local.z >= self.near_clip)
+        seen &= (local.z <= self.far_clip) & (density > 0)
+        seen &= dr.all((position >= 0) & (position <= self._crop_size))
+        distance = dr.norm(local)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(local))
+        ds.uv = position
+        ds.p = self.m_to_world.translation()
+        ds.n = self.m_to_world @ mi.Normal3f(0, 0, 1)
+        ds.d = (ds.p - it.p) / distance
+        ds.dist = distance
+        ds.pdf = dr.select(seen, mi.Float(1), 0)
+        # On the plane z = 1, solid angle is area times the cosine's cube.
+        secant = distance / z
+        importance = density * secant**3 / distance**2
+        return ds, mi.Spectrum(dr.select(seen, importance, 0))
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """Return the box that holds nothing but the pinhole."""
+        place = [float(v[0]) for v in dr.detach(self.m_to_world.translation())]
+        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(place))
+
+    def _ray(
+        self, ray: Any, x: mi.Float, y: mi.Float, time: Any, sample1: Any, active: Any
+    ) -> tuple[Any, Any]:
+        nothing = dr.zeros(mi.SurfaceInteraction3f)
+        ray.wavelengths, weight = self.sample_wavelengths(nothing, sample1, active)
+        ray.time = time
+        ray.d = self._direction(x, y)
+        secant = dr.sqrt(x * x + y * y + 1)
+        near = self.near_clip * secant
+        ray.o = self.m_to_world.translation() + near * ray.d
+        ray.maxt = self.far_clip * secant - near
+        return ray, weight
+
+    def _direction(self, x: mi.Float, y: mi.Float) -> mi.Vector3f:
+        return self.m_to_world @ dr.normalize(mi.Vector3f(-x, -y, 1))
+
+    def _distortion(self) -> tuple[mi.Float, ...]:
+        return tuple(self.intrinsics[name] for name in ("k1", "k2", "p1", "p2"))
+
+    def _unproject(self, sample: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        """Map the crop window's [0, 1]^2 to the undistorted plane z = 1."""
+        lens = self.intrinsics
+        pixel = sample * self._crop_size + self._crop_offset
+        x = (pixel.x - lens["cx"]) / lens["fx"]
+        y = (pixel.y - lens["cy"]) / lens["fy"]
+        return undistort(x, y, *self._distortion()) if self.is_distorted else (x, y)
+
+    def _project(self, x: mi.Float, y: mi.Float) -> tuple[mi.Point2f, mi.Float]:
+        """Map the plane z = 1 to pixels of the crop window.
+
+        Returns:
+            the position, and the density of uniform samples of the window per area of
+            the plane; zero where the distortion folds the plane over the image.
+        """
+        lens = self.intrinsics
+        density = lens["fx"] * lens["fy"] / dr.prod(self._crop_size)
+        u, v = x, y
+        if self.is_distorted:
+            distortion = self._distortion()
+            u, v = distort(x, y, *distortion)
+            back_x, back_y = undistort(u, v, *distortion)
+            pixels = dr.maximum(
+                dr.abs(back_x - x) * lens["fx"], dr.abs(back_y - y) * lens["fy"]
+            )
+            stretch = jacobian(x, y, *distortion)[3]
+            density = dr.select(pixels < 1e-2, density * stretch, 0)
+        place = mi.Point2f(u * lens["fx"] + lens["cx"], v * lens["fy"] + lens["cy"])
+        return place - self._crop_offset, density
+
+    def to_string(self) -> str:
+        """Describe the checked parameters."""
+        values = ", ".join(
+            f"{name}={dr.detach(value)[0]:g}" for name, value in self.intrinsics.items()
+        )
+        return f"OpencvCamera[{values}, film={self.film()}]"
+
+
+def _check_rigid(to_world: Any) -> None:
+    matrix = np.array(dr.detach(to_world.matrix), np.float64).reshape(4, 4)
+    linear = matrix[:3, :3]
+    if not np.allclose(linear.T @ linear, np.eye(3), atol=1e-4):
+        raise InputError(
+            f"to_world: {matrix[:3].tolist()}; opencv_camera takes rotation and "
+            "translation"
+        )
+
+
+def _check_clip(near: mi.Float, far: mi.Float) -> None:
+    if not 0 < near[0] < far[0]:
+        raise InputError(
+            f"near_clip, far_clip: {near[0]:g}, {far[0]:g}; expected 0 < near < far"
+        )
+
+
+mi.register_sensor("opencv_camera", lambda props: OpencvCamera(props))
