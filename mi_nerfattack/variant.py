@@ -40,6 +40,11 @@ def ensure() -> str:
     return name
 
 
+def usable() -> list[str]:
+    """Name the variants of this Mitsuba that the plugins run in."""
+    return [name for name in mi.variants() if _is_usable(name)]
+
+
 def install() -> None:
     """Register the plugins now if a variant is set, and after every change."""
     mi.detail.add_variant_callback(_on_change)
@@ -50,9 +55,8 @@ def install() -> None:
 
 def _check_name(name: str) -> None:
     if name not in mi.variants():
-        usable = [item for item in mi.variants() if _is_usable(item)]
         raise SetupError(
-            f"{VARIABLE}: unknown variant {name!r}; allowed: {', '.join(usable)}"
+            f"{VARIABLE}: unknown variant {name!r}; allowed: {', '.join(usable())}"
         )
     if not _is_usable(name):
         raise SetupError(
@@ -78,15 +82,16 @@ def _check_backend(name: str) -> None:
 
 
 def _on_change(old: str | None, new: str) -> None:
-    """Register the plugins for a variant; log what goes wrong, never raise.
+    """Register the plugins, or stubs that say why not; log errors, never raise.
 
     Mitsuba calls all callbacks in no order, and an exception in one of them keeps
     the others from running.
     """
     del old
-    if not _is_usable(new):
-        return
     try:
+        if not _is_usable(new):
+            importlib.import_module(_PLUGINS).refuse(new, usable())
+            return
         if new.startswith("llvm"):
             llvm.check_version()
         _register()

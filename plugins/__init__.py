@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib
 import sys
+from typing import Any, NoReturn
+
+from mi_nerfattack.errors import SetupError
 
 _MODULES = (
     "field_volume",
@@ -11,7 +14,14 @@ _MODULES = (
     "ngp_field",
     "field_emitter",
     "field_integrator",
+    "opencv_camera",
 )
+_REGISTERED = {
+    "register_texture": ("grid_field", "ngp_field"),
+    "register_emitter": ("field_emitter",),
+    "register_integrator": ("field_integrator",),
+    "register_sensor": ("opencv_camera",),
+}
 
 
 def register() -> None:
@@ -26,3 +36,35 @@ def register() -> None:
             importlib.reload(sys.modules[full])
         else:
             importlib.import_module(full)
+
+
+def refuse(variant: str, usable: list[str]) -> None:
+    """Register stubs for an active variant that the plugins cannot run in.
+
+    Without them Mitsuba would say that it knows no plugin of that name, as it does
+    for the volumes in scalar_rgb: it takes the kind of a plugin of any variant from
+    what is registered there, Python can register no volume, and whatever else has
+    the name makes dictionaries with that name fail in all other variants.
+
+    Args:
+        variant: the active variant.
+        usable: the variants that the message names.
+    """
+    import mitsuba as mi
+
+    for function, names in _REGISTERED.items():
+        if variant == "scalar_rgb" and function == "register_texture":
+            continue
+        for name in names:
+            getattr(mi, function)(name, _stub(name, variant, usable))
+
+
+def _stub(name: str, variant: str, usable: list[str]) -> Any:
+    def construct(props: Any) -> NoReturn:
+        del props
+        raise SetupError(
+            f"{name}: variant {variant} has no derivatives or is polarised; call "
+            f"mitsuba.set_variant with one of {', '.join(usable)}"
+        )
+
+    return construct
