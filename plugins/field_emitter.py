@@ -9,15 +9,18 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import field_volume as shared
-from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import STOP, march
+from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.march import STOP, Rays
+
+COMPOSITES = {"interleaved": InterleavedComposite, "depth": DepthComposite}
 
 
 class FieldEmitter(mi.Emitter):
     r"""Fields behind the surface of a closed shape (``field_emitter``).
 
-    Radiance that leaves the surface along a ray is the ``depth`` composite (A.4 to
-    A.6) of the nested fields along that ray, over the background of the first field
+    Radiance that leaves the surface along a ray is the composite of the nested fields
+    along that ray (see ``field_integrator``), over the background of the first field
     that has one. Seen from outside, the march starts on the surface; seen from
     inside, it starts at the ray's origin and ends on the surface. So stock
     integrators (``path``, ``direct``) show the fields, and light other surfaces with
@@ -27,6 +30,8 @@ class FieldEmitter(mi.Emitter):
     name         type      unit     default  meaning
     ===========  ========  =======  =======  ========================================
     (nested)     volume                      ``grid_field``, ``ngp_field``; 1 or more
+    composite    string             inter-   ``interleaved`` or ``depth``
+                                    leaved
     stop         float              1e-3     transmittance at which a ray ends
     ===========  ========  =======  =======  ========================================
 
@@ -55,6 +60,7 @@ class FieldEmitter(mi.Emitter):
         super().__init__(props)
         shared.refuse_spectral("field_emitter")
         self.stop = read_stop(props)
+        self.composite = read_composite(props)
         self.volumes, others = read_nested(props, "field_emitter")
         refuse_nested(others, "field_emitter")
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
@@ -70,14 +76,9 @@ class FieldEmitter(mi.Emitter):
         inside = dr.dot(direction, si.n) > 0
         origin = dr.select(inside, si.p - si.t * direction, si.p)
         t_max = dr.select(inside, si.t, dr.inf)
-        total = depth_composite(
-            [
-                march(
-                    v.posed, origin, direction, t_max, mi.Float(0.5), active, self.stop
-                )
-                for v in self.volumes
-            ]
-        )
+        rays = Rays(origin, direction, t_max, mi.Float(0.5), mi.Bool(active))
+        posed = [volume.posed for volume in self.volumes]
+        total = self.composite.render(posed, rays, self.stop).total
         behind = background(self.volumes, direction)
         radiance = total.radiance + (1 - total.opacity) * behind
         return shared.to_spectrum(radiance) & active
@@ -132,6 +133,14 @@ def read_stop(props: mi.Properties) -> float:
     if not 0 <= stop < 1:
         raise InputError(f"stop: {stop}; allowed is 0 <= stop < 1")
     return stop
+
+
+def read_composite(props: mi.Properties) -> AbstractComposite:
+    """Read `composite`, the rule by which fields become one colour."""
+    name = props.get("composite", "interleaved")
+    if name not in COMPOSITES:
+        raise InputError(f"composite: {name!r}; allowed: {', '.join(COMPOSITES)}")
+    return COMPOSITES[name]()
 
 
 def read_nested(props: mi.Properties, plugin: str) -> tuple[list[Any], list[Any]]:

@@ -12,24 +12,28 @@ import mitsuba as mi
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.field_emitter import (
     background,
+    read_composite,
     read_nested,
     read_stop,
     refuse_nested,
 )
-from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import March, march, march_derivative
+from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.march import March, Rays
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
-    r"""Depth composite of radiance fields (``field_integrator``).
+    r"""Composite of radiance fields (``field_integrator``).
 
-    Every camera ray is marched through each nested field up to the nearest surface
-    of the scene; the fields are folded front to back by expected depth, ``I = I_f +
-    (1 - a_f) I_b`` (A.4 to A.6), over what a nested integrator sees behind, or over
-    the background of the first field that has one.
+    Every camera ray is marched through the nested fields up to the nearest surface
+    of the scene, and lies over what a nested integrator sees behind, or over the
+    background of the first field that has one: ``L = I + (1 - a) L_b``. The composite
+    is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum sigma_k L_k /
+    sigma``) or ``depth`` (each field alone, folded front to back by expected depth,
+    ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do not overlap.
 
     AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
-    ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``. Depths are
+    ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of the field's
+    share of the image (``interleaved``) or of the field alone (``depth``). Depths are
     infinite where opacity is 0; take a ``box`` filter and one sample where that
     matters.
 
@@ -38,6 +42,8 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     ===========  ==========  ====  =======  =========================================
     (nested)     volume                     ``grid_field``, ``ngp_field``; 1 or more
     (nested)     integrator         none    renders surfaces and lights behind
+    composite    string             inter-  ``interleaved`` or ``depth``
+                                    leaved
     stop         float              1e-3    transmittance at which a ray ends
     jitter       bool               false   random instead of middle sample positions
     ===========  ==========  ====  =======  =========================================
@@ -66,6 +72,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         super().__init__(props)
         shared.refuse_spectral("field_integrator")
         self.stop = read_stop(props)
+        self.composite = read_composite(props)
         self.jitter = bool(props.get("jitter", False))
         self.volumes, others = read_nested(props, "field_integrator")
         is_first = bool(others) and isinstance(others[0], mi.SamplingIntegrator)
@@ -74,6 +81,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             "field_integrator",
             ", and one sampling integrator such as path",
         )
+        self.posed = [volume.posed for volume in self.volumes]
         self.behind = others[0] if is_first else None
         self._has_aovs = True
 
@@ -150,58 +158,36 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
         t_max = self._surface(scene, ray, active)
-        fixed = (ray.o, ray.d, t_max, jitter, active)
+        rays = Rays(ray.o, ray.d, t_max, jitter, active)
+        if state_in is None:  # primal mode, or forward mode, which comes without
+            seen = self.composite.render(self.posed, rays, self.stop)
+            state_in = seen, self._behind(scene, sampler, ray, t_max, active)
+        seen, behind = state_in
         if mode == dr.ADMode.Primal:
-            layers = [march(v.posed, *fixed, self.stop) for v in self.volumes]
-            behind = self._behind(scene, sampler, ray, t_max, active)
-        else:
-            # Forward mode comes without the state of a primal pass.
-            layers, behind = state_in or (
-                [march(v.posed, *fixed, self.stop) for v in self.volumes],
-                self._behind(scene, sampler, ray, t_max, active),
-            )
-        if mode == dr.ADMode.Primal:
-            radiance = shared.to_spectrum(self._fold(layers, behind))
-            state = (layers, behind)
-            return radiance, active, self._aovs(layers), state
+            radiance = shared.to_spectrum(_over(seen.total, behind))
+            return radiance, active, self._aovs(seen), state_in
         if mode == dr.ADMode.Backward:
-            self._backward(layers, behind, fixed, δL)
+            self._backward(rays, seen, behind, δL)
             return δL, active, [], None
-        tangent = self._forward(layers, behind, fixed)
-        return tangent, active, [], None
+        return self._forward(rays, seen, behind), active, [], None
 
-    def _backward(self, layers: Any, behind: Any, fixed: Any, δL: Any) -> None:
+    def _backward(self, rays: Rays, seen: Seen, behind: Any, δL: Any) -> None:
         with dr.resume_grad():
-            leaves = [_copy(layer) for layer in layers]
-            dr.enable_grad(leaves)
-            radiance = shared.to_spectrum(self._fold(leaves, behind))
+            total = seen.total.copy()
+            dr.enable_grad(total)
+            radiance = shared.to_spectrum(_over(total, behind))
             dr.backward_from(dr.sum(radiance * δL))
-            cotangents = [dr.grad(leaf) for leaf in leaves]
-        for volume, primal, cotangent in zip(
-            self.volumes, layers, cotangents, strict=True
-        ):
-            march_derivative(
-                dr.ADMode.Backward, volume.posed, *fixed, primal, cotangent, self.stop
-            )
+            cotangent = dr.grad(total)
+        self.composite.backward(self.posed, rays, seen, cotangent, self.stop)
 
-    def _forward(self, layers: Any, behind: Any, fixed: Any) -> Any:
-        tangents = [
-            march_derivative(
-                dr.ADMode.Forward, volume.posed, *fixed, primal, March(), self.stop
-            )[0]
-            for volume, primal in zip(self.volumes, layers, strict=True)
-        ]
+    def _forward(self, rays: Rays, seen: Seen, behind: Any) -> Any:
+        tangent = self.composite.forward(self.posed, rays, seen, self.stop)
         with dr.resume_grad():
-            leaves = [_copy(layer) for layer in layers]
-            dr.enable_grad(leaves)
-            for leaf, tangent in zip(leaves, tangents, strict=True):
-                dr.set_grad(leaf, tangent)
-            radiance = shared.to_spectrum(self._fold(leaves, behind))
+            total = seen.total.copy()
+            dr.enable_grad(total)
+            dr.set_grad(total, tangent)
+            radiance = shared.to_spectrum(_over(total, behind))
             return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
-
-    def _fold(self, layers: list[March], behind: mi.Color3f) -> mi.Color3f:
-        total = depth_composite(layers)
-        return total.radiance + (1 - total.opacity) * behind
 
     def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         if len(scene.shapes()) == 0:
@@ -224,29 +210,27 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         )[0]
         return mi.Color3f(spectrum if not mi.is_monochromatic else spectrum.x)
 
-    def _aovs(self, layers: list[March]) -> list[mi.Float]:
+    def _aovs(self, seen: Seen) -> list[mi.Float]:
         if not self._has_aovs:
             return []
-        total = depth_composite(layers)
-        result = [total.opacity, total.depth]
-        for layer in layers:
+        result = [seen.total.opacity, seen.total.depth]
+        for layer in seen.layers:
             result += [*layer.radiance, layer.opacity, layer.depth]
         return result
 
     def to_string(self) -> str:
         """Describe the checked parameters."""
         names = ", ".join(volume.id() for volume in self.volumes)
-        return f"FieldIntegrator[fields=({names}), stop={self.stop}]"
+        kind = type(self.composite).__name__
+        return f"FieldIntegrator[fields=({names}), {kind}, stop={self.stop}]"
 
 
 def _film(scene: mi.Scene, sensor: Any) -> mi.Film:
     return (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
 
 
-def _copy(layer: March) -> March:
-    return March(
-        mi.Color3f(layer.radiance), mi.Float(layer.opacity), mi.Float(layer.moment)
-    )
+def _over(total: March, behind: mi.Color3f) -> mi.Color3f:
+    return total.radiance + (1 - total.opacity) * behind
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

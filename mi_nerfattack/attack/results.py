@@ -14,7 +14,6 @@ from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.world import World, object_footprints
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.render.camera import mount_matrix
-from mi_nerfattack.render.composite import depth_composite
 from mi_nerfattack.render.march import March
 from mi_nerfattack.report import exr, plots
 from mi_nerfattack.report.metrics import Drive, departure_limit, metrics_document
@@ -167,12 +166,13 @@ def _surrogate_layers(
     world: World, state: np.ndarray, step: int
 ) -> dict[str, np.ndarray]:
     sensor = world.surrogate
-    seen = sensor.observe(to_state(state), step)
-    total = depth_composite(list(seen.layers))
-    behind = sensor.scene.field.background(seen.direction)
+    observation = sensor.observe(to_state(state), step)
+    seen, rays = observation.seen, observation.rays
+    assert seen is not None and rays is not None
+    behind = sensor.scene.field.background(rays.direction)
     shape = (sensor.camera.height, sensor.camera.width)
-    layers = _march_layers("", total, shape)
-    through = (1 - total.opacity) * behind
+    layers = _march_layers("", seen.total, shape)
+    through = (1 - seen.total.opacity) * behind
     layers[""][..., :3] += through.numpy().T.reshape(*shape, 3)
     layers[""][..., 3] = 1.0
     names = ["scene", *(item.id for item in world.scenario.objects)]

@@ -17,8 +17,8 @@ from mi_nerfattack.render.camera import (
     mount_matrix,
     pose_arrays,
 )
-from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import STOP, March, march
+from mi_nerfattack.render.composite import DepthComposite
+from mi_nerfattack.render.march import STOP, March, Rays
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
 
@@ -61,7 +61,7 @@ class PathTracedSensor(AbstractSensor):
     Args:
         scene: any Mitsuba scene, metric, z up; its own integrator renders it.
         objects: fields that are pasted by depth at opacity 1; may be empty.
-        camera: square pixels, no distortion.
+        camera: intrinsics.
         mount: pose on the vehicle.
         spp: samples per pixel.
         seed: of the samples.
@@ -94,7 +94,7 @@ class PathTracedSensor(AbstractSensor):
         self.renders += len(images)
         image = mi.TensorXf(np.stack(images).astype(np.float32))
         dr.eval(image)
-        return Observation(image, step=step)
+        return Observation(image)
 
     def linear(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
         """Render one image with its objects, (height, width, 3), linear."""
@@ -140,10 +140,7 @@ class PathTracedSensor(AbstractSensor):
         origin, rotation = pose_arrays(camera_to_world)
         o, d = generate_rays(self.camera, origin, rotation, 1)
         jitter, far = dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, dr.inf)
-        layers = [
-            march(posed, o, d, far, jitter, mi.Bool(True), STOP)
-            for posed in self.objects
-        ]
-        result = depth_composite(layers)
+        rays = Rays(o, d, far, jitter, mi.Bool(True))
+        result = DepthComposite().render(self.objects, rays, STOP).total
         dr.eval(result)
         return result

@@ -72,6 +72,12 @@ class AbstractField(ABC):
     def density_bound(self) -> float:
         """Return an upper bound of the density, 1/metre, for delta tracking."""
 
+    @property
+    def has_gradients(self) -> bool:
+        """Whether derivatives with respect to a parameter are asked for."""
+        with dr.resume_grad():
+            return any(dr.grad_enabled(value) for value in self.parameters().values())
+
     def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Evaluate density alone, (n,), 1/metre of the field's frame."""
         up = mi.Vector3f(0, 0, 1)

@@ -188,6 +188,12 @@ class GridField(AbstractField):
             total += values
         return self.density_scale * float(np.exp(min(total.max(), 15.0)))
 
+    @property
+    def has_gradients(self) -> bool:
+        """Whether derivatives with respect to `packed` are asked for."""
+        with dr.resume_grad():
+            return dr.grad_enabled(self.packed)
+
     def parameters(self) -> dict[str, Any]:
         """Return ``texture`` (n_vertices, 3) and ``density`` (n_vertices,)."""
         return {"texture": self.texture, "density": self._density}

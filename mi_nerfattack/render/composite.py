@@ -1,11 +1,181 @@
-"""Composite of several fields along a ray (A.4 to A.6)."""
+"""Composites of several fields along a ray: what is seen, and its derivatives."""
 
 from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.march import March
+from mi_nerfattack.render.march import March, Rays, march, march_derivative
+from mi_nerfattack.render.posed import PosedField
+
+
+@dataclass
+class Seen:
+    """What a composite gives.
+
+    Attributes:
+        total: of everything along a ray.
+        layers: one march a field, in the order of the fields.
+    """
+
+    total: March = field(default_factory=March)
+    layers: list[March] = field(default_factory=list)
+
+
+class AbstractComposite(ABC):
+    """Rule by which several fields along a ray become one colour.
+
+    None of the methods is differentiable by Dr.Jit: :meth:`forward`,
+    :meth:`backward` and :meth:`backward_rays` are the derivatives of :meth:`render`.
+    """
+
+    @abstractmethod
+    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
+        """March rays through fields.
+
+        Args:
+            posed: the fields, at least one.
+            rays: n rays.
+            stop: transmittance below which a ray ends.
+        """
+
+    @abstractmethod
+    def forward(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+    ) -> March:
+        """Return the tangent of the total, from those of the fields' parameters."""
+
+    @abstractmethod
+    def backward(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> None:
+        """Accumulate gradients of the parameters of the fields that ask for them.
+
+        Only rays that meet such a field are marched again.
+
+        Args:
+            posed: as given to :meth:`render`.
+            rays: likewise.
+            seen: what it returned.
+            cotangent: derivative of the objective by the total, per ray.
+            stop: as given to :meth:`render`.
+        """
+
+    @abstractmethod
+    def backward_rays(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Do what :meth:`backward` does, and differentiate by the rays.
+
+        Returns:
+            the objective's derivatives by origin and direction, (3, n).
+        """
+
+
+class DepthComposite(AbstractComposite):
+    """Every field by itself, then folded front to back by expected depth.
+
+    Exact where fields do not overlap along a ray; see :func:`depth_composite`.
+    Cost: one march a field. Source: appendix A.4 to A.6.
+    """
+
+    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
+        """See :meth:`AbstractComposite.render`; a layer is the field alone."""
+        layers = [march(item, *rays, stop) for item in posed]
+        return Seen(depth_composite(layers), layers)
+
+    def forward(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+    ) -> March:
+        """See :meth:`AbstractComposite.forward`."""
+        mode, none = dr.ADMode.Forward, March()
+        tangents = [
+            march_derivative(mode, item, *rays, layer, none, stop)[0]
+            for item, layer in zip(posed, seen.layers, strict=True)
+        ]
+        with dr.resume_grad():
+            leaves = [layer.copy() for layer in seen.layers]
+            dr.enable_grad(leaves)
+            for leaf, tangent in zip(leaves, tangents, strict=True):
+                dr.set_grad(leaf, tangent)
+            total = depth_composite(leaves)
+            return dr.forward_to(total, flags=dr.ADFlag.ClearEdges)
+
+    def backward(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> None:
+        """See :meth:`AbstractComposite.backward`."""
+        parts = self._cotangents(seen, cotangent)
+        for item, layer, part in zip(posed, seen.layers, parts, strict=True):
+            if not item.field.has_gradients:
+                continue
+            index = dr.compress(layer.opacity > 0)
+            if dr.width(index):
+                some, layer, part = (pick(x, index) for x in (rays, layer, part))
+                march_derivative(dr.ADMode.Backward, item, *some, layer, part, stop)
+
+    def backward_rays(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """See :meth:`AbstractComposite.backward_rays`."""
+        d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+        parts = self._cotangents(seen, cotangent)
+        for item, layer, part in zip(posed, seen.layers, parts, strict=True):
+            _, by_origin, by_direction = march_derivative(
+                dr.ADMode.Backward, item, *rays, layer, part, stop
+            )
+            d_origin += by_origin
+            d_direction += by_direction
+        return d_origin, d_direction
+
+    def _cotangents(self, seen: Seen, cotangent: March) -> list[March]:
+        """Return the derivatives of the objective by each layer."""
+        with dr.resume_grad():
+            leaves = [layer.copy() for layer in seen.layers]
+            dr.enable_grad(leaves)
+            total = depth_composite(leaves)
+            dr.backward_from(
+                dr.dot(total.radiance, cotangent.radiance)
+                + total.opacity * cotangent.opacity
+                + total.moment * cotangent.moment
+            )
+            parts = [dr.grad(leaf) for leaf in leaves]
+        dr.eval(parts)
+        return parts
+
+
+def pick(value: Any, index: mi.UInt32) -> Any:
+    """Gather some rays of a :class:`Rays` or :class:`March`; one for all stays so."""
+    chosen = {}
+    for item in fields(value):
+        array = getattr(value, item.name)
+        one = dr.width(array) == 1
+        chosen[item.name] = array if one else dr.gather(type(array), array, index)
+    return type(value)(**chosen)
 
 
 def depth_composite(layers: list[March]) -> March:

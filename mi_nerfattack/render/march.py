@@ -16,7 +16,9 @@ Error bounds. Termination below transmittance ``stop`` changes opacity by at mos
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +27,29 @@ from mi_nerfattack.render.posed import PosedField
 
 MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
 STOP = 1e-3
+
+
+@dataclass
+class Rays:
+    """Rays in the world, and where a march places its samples on them.
+
+    Attributes:
+        origin: (3, n), metres.
+        direction: (3, n), unit vectors.
+        t_max: (n,), metres; where the ray ends.
+        jitter: (n,) in [0, 1), position of the sample in its interval.
+        active: (n,) mask.
+    """
+
+    origin: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0, 0, 1))
+    t_max: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
+    jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
+    active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the attributes in the order that :func:`march` takes them."""
+        yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
 
 
 @dataclass
@@ -46,6 +71,12 @@ class March:
         """Return a march of `count` empty rays."""
         black = dr.zeros(mi.Color3f, count)
         return March(black, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
+
+    def copy(self) -> March:
+        """Return a march of the same values with no derivatives attached."""
+        colour = mi.Color3f(dr.detach(self.radiance))
+        opacity, moment = dr.detach(self.opacity), dr.detach(self.moment)
+        return March(colour, mi.Float(opacity), mi.Float(moment))
 
     @property
     def depth(self) -> mi.Float:
@@ -91,6 +122,24 @@ def seek(
         jump = dr.maximum(index + 1, dr.floor(posed.lattice_index(t_exit)))
         index = dr.select(searching, jump, index)
     return index, t, dr.maximum(width, 0), found
+
+
+def absorption(x: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Return ``phi(x) = (1 - exp(-x)) / x`` and its derivative, accurate at 0.
+
+    ``x phi(x)`` is the opacity of optical depth x; in single precision ``1 - exp(-x)``
+    loses the digits that thin media live on.
+    """
+    small = x < 0.1
+    safe = dr.select(small, 1, x)
+    passed = dr.exp(-safe)
+    phi = (1 - passed) / safe
+    series = 1 + x * (-1 / 2 + x * (1 / 6 + x * (-1 / 24 + x / 120)))
+    slope = -1 / 2 + x * (1 / 3 + x * (-1 / 8 + x * (1 / 30 - x / 144)))
+    return (
+        dr.select(small, series, phi),
+        dr.select(small, slope, (passed - phi) / safe),
+    )
 
 
 def march(
@@ -187,20 +236,20 @@ def _march(
     active = mi.Bool(active) & (near < far)
 
     index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
-    transmittance = mi.Float(1)  # T, from the origin to the interval
+    tau = mi.Float(0)  # optical depth from the origin to the interval
     radiance = mi.Color3f(0)  # premultiplied radiance so far
     moment = mi.Float(0)  # integral of t sigma T so far
     while active:
         index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         density, colour = posed.eval(o + t * d, heading, active)
-        passed = dr.select(active, dr.exp(-density * width), 1)
-        weight = transmittance * (1 - passed)
+        x = dr.select(active, density * width, 0)
+        weight = dr.exp(-tau) * x * absorption(x)[0]
         radiance += weight * colour
         moment += weight * t
-        transmittance *= passed
+        tau += x
         index += 1
-        active &= (transmittance > stop) & (index < MAX_INTERVALS)
-    return March(radiance, 1 - transmittance, moment)
+        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
+    return March(radiance, tau * absorption(tau)[0], moment)
 
 
 @dr.syntax
@@ -223,7 +272,7 @@ def _march_derivative(
     active = mi.Bool(active) & (near < far)
 
     index = dr.floor(posed.lattice_index(near))
-    transmittance = mi.Float(1)
+    tau = mi.Float(0)
     rest = mi.Color3f(primal.radiance)  # premultiplied radiance still to come
     rest_moment = mi.Float(primal.moment)
     d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)  # along the ray so far
@@ -238,9 +287,9 @@ def _march_derivative(
                 dr.enable_grad(point, towards)
             density, colour = posed.eval(point, towards, active)
             sigma, value = dr.detach(density), dr.detach(colour)
-            passed = dr.select(active, dr.exp(-sigma * width), 1)
-            weight = transmittance * (1 - passed)
-            behind = transmittance * passed
+            x = dr.select(active, sigma * width, 0)
+            weight = dr.exp(-tau) * x * absorption(x)[0]
+            behind = dr.exp(-tau - x)
             rest -= weight * value
             rest_moment -= weight * t
             by_density = dr.select(active, width, 0)
@@ -263,9 +312,9 @@ def _march_derivative(
                 out_radiance += dr.select(active, tangent[0], 0)
                 out_opacity += dr.select(active, tangent[1], 0)
                 out_moment += dr.select(active, tangent[2], 0)
-        transmittance = behind
+        tau += x
         index += 1
-        active &= (transmittance > stop) & (index < MAX_INTERVALS)
+        active &= (behind > stop) & (index < MAX_INTERVALS)
     unit = d_heading - heading * dr.dot(heading, d_heading)
     d_direction += unit * dr.rcp(dr.norm(d))
     d_origin, d_direction = posed.to_world_gradient(d_origin, d_direction)

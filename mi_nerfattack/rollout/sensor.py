@@ -12,8 +12,8 @@ import mitsuba as mi
 from mi_nerfattack.colour import linear_to_srgb
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
-from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import STOP, March, march, march_derivative
+from mi_nerfattack.render.composite import AbstractComposite, DepthComposite, Seen
+from mi_nerfattack.render.march import STOP, March, Rays
 from mi_nerfattack.render.posed import PosedField
 
 
@@ -23,17 +23,14 @@ class Observation:
 
     Attributes:
         image: tensor (n, height, width, 3), sRGB in [0, 1], evaluated.
-        layers: one march a field, scene first; empty where there are none.
-        origin: (3, n height width) ray origins, metres.
-        direction: (3, n height width) ray directions.
-        step: the step that seeded the jitter.
+        seen: the composite, one ray a pixel, its layers scene first; None where the
+            sensor has no fields.
+        rays: n height width rays; None where the sensor traces none.
     """
 
     image: Any
-    layers: tuple[March, ...] = ()
-    origin: Any = None
-    direction: Any = None
-    step: int = 0
+    seen: Seen | None = None
+    rays: Rays | None = None
 
 
 class AbstractSensor(ABC):
@@ -80,8 +77,8 @@ class AbstractDifferentiableSensor(AbstractSensor):
 class FieldSensor(AbstractDifferentiableSensor):
     """Camera in a scene field with objects: the surrogate simulator.
 
-    One ray a pixel through its centre; the `depth` composite; behind everything the
-    background of the scene's field. All fields are marched in one kernel.
+    One ray a pixel through its centre; behind everything the background of the
+    scene's field. All fields are marched in one kernel, for all vehicles together.
 
     Cost of an observation: one march. Cost of a product: one march derivative over
     the rays that meet an object (over all rays and fields when attached).
@@ -94,6 +91,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         jitter_seed: seed of per-ray sample positions, renewed each step and replayed
             by products; None places samples at the middle of their intervals.
         stop: transmittance at which rays end.
+        composite: how fields become one colour; `DepthComposite` by default.
     """
 
     def __init__(
@@ -104,6 +102,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         mount: CameraMount | None = None,
         jitter_seed: int | None = None,
         stop: float = STOP,
+        composite: AbstractComposite | None = None,
     ) -> None:
         for posed in objects:
             if not isinstance(posed.field, GridField):
@@ -114,6 +113,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         self.mount = mount or CameraMount()
         self.jitter_seed = jitter_seed
         self.stop = stop
+        self.composite = composite or DepthComposite()
         self.renders = 0
 
     def observe(self, state: Any, step: int) -> Observation:
@@ -121,45 +121,35 @@ class FieldSensor(AbstractDifferentiableSensor):
         count = dr.width(state)
         origin, direction = self._rays(dr.detach(state))
         jitter = self._jitter(step, dr.width(direction))
-        t_max = dr.opaque(mi.Float, dr.inf)
-        layers = tuple(
-            march(posed, origin, direction, t_max, jitter, mi.Bool(True), self.stop)
-            for posed in (self.scene, *self.objects)
-        )
-        pixels = self._develop(layers, direction)
-        dr.eval(layers, pixels, origin, direction)
+        far, active = dr.opaque(mi.Float, dr.inf), mi.Bool(True)
+        rays = Rays(origin, direction, far, jitter, active)
+        seen = self.composite.render(self._fields, rays, self.stop)
+        pixels = self._develop(seen.total, direction)
+        dr.eval(seen, pixels, origin, direction)
         self.renders += count
-        image = self._tensor(pixels, count)
-        return Observation(image, layers, origin, direction, step)
+        return Observation(self._tensor(pixels, count), seen, rays)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
     ) -> Any:
         """See :meth:`AbstractDifferentiableSensor.vjp`."""
-        layers = [_leaf(layer) for layer in observation.layers]
-        direction = mi.Vector3f(observation.direction)
+        rays, seen = observation.rays, observation.seen
+        assert rays is not None and seen is not None
+        total, direction = seen.total.copy(), mi.Vector3f(rays.direction)
+        dr.enable_grad(total)
         if attached:
             dr.enable_grad(direction)
-        pixels = self._develop(layers, direction)
-        count = dr.width(pixels)
-        index = 3 * dr.arange(mi.UInt32, count)
-        dr.backward_from(
-            sum(
-                (
-                    pixels[c] * dr.gather(mi.Float, d_image.array, index + c)
-                    for c in range(3)
-                ),
-                mi.Float(0),
-            )
-        )
-        cotangents = [_gradient(layer) for layer in layers]
+        pixels = self._develop(total, direction)
+        index = 3 * dr.arange(mi.UInt32, dr.width(pixels))
+        weights = [dr.gather(mi.Float, d_image.array, index + c) for c in range(3)]
+        dr.backward_from(dr.dot(pixels, mi.Color3f(*weights)))
+        cotangent = dr.grad(total)
         if attached:
-            return self._attached(observation, state, cotangents, dr.grad(direction))
-        dr.eval(cotangents)
-        for posed, primal, cotangent in zip(
-            self.objects, observation.layers[1:], cotangents[1:], strict=True
-        ):
-            self._scatter(posed, observation, primal, cotangent)
+            by_direction = dr.grad(direction)
+            return self._attached(observation, state, cotangent, by_direction)
+        dr.eval(cotangent)
+        self.composite.backward(self._fields, rays, seen, cotangent, self.stop)
+        dr.eval([dr.grad(posed.field.packed) for posed in self.objects])
         return None
 
     def start_gradient(self) -> None:
@@ -195,8 +185,11 @@ class FieldSensor(AbstractDifferentiableSensor):
         key = mi.sample_tea_32(seed, dr.opaque(mi.UInt32, step))[0]
         return mi.sample_tea_float32(key, dr.arange(mi.UInt32, count))
 
-    def _develop(self, layers: Any, direction: mi.Vector3f) -> mi.Color3f:
-        total = depth_composite(list(layers))
+    @property
+    def _fields(self) -> list[PosedField]:
+        return [self.scene, *self.objects]
+
+    def _develop(self, total: March, direction: mi.Vector3f) -> mi.Color3f:
         behind = self.scene.field.background(direction)
         return linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
 
@@ -204,57 +197,14 @@ class FieldSensor(AbstractDifferentiableSensor):
         shape = (count, self.camera.height, self.camera.width, 3)
         return mi.TensorXf(dr.ravel(pixels), shape)
 
-    def _scatter(
-        self, posed: PosedField, seen: Observation, primal: March, cotangent: March
-    ) -> None:
-        """Differentiate the march of one object over the rays that meet it."""
-        index = dr.compress(primal.opacity > 0)
-        if dr.width(index) == 0:
-            return
-
-        def pick(value: Any) -> Any:
-            return dr.gather(type(value), value, index)
-
-        jitter = self._jitter(seen.step, dr.width(seen.direction))
-        if dr.width(jitter) > 1:
-            jitter = pick(jitter)
-        march_derivative(
-            dr.ADMode.Backward,
-            posed,
-            pick(seen.origin),
-            pick(seen.direction),
-            dr.opaque(mi.Float, dr.inf),
-            jitter,
-            mi.Bool(True),
-            pick(primal),
-            pick(cotangent),
-            self.stop,
-        )
-        dr.eval(dr.grad(posed.field.packed))
-
     def _attached(
-        self, seen: Observation, state: Any, cotangents: list[March], d_direction: Any
+        self, seen: Observation, state: Any, cotangent: March, d_direction: Any
     ) -> Any:
         """Differentiate all marches, then the rays by the state."""
-        d_origin = mi.Vector3f(0)
-        jitter = self._jitter(seen.step, dr.width(seen.direction))
-        for posed, primal, cotangent in zip(
-            (self.scene, *self.objects), seen.layers, cotangents, strict=True
-        ):
-            _, by_origin, by_direction = march_derivative(
-                dr.ADMode.Backward,
-                posed,
-                seen.origin,
-                seen.direction,
-                dr.opaque(mi.Float, dr.inf),
-                jitter,
-                mi.Bool(True),
-                primal,
-                cotangent,
-                self.stop,
-            )
-            d_origin += by_origin
-            d_direction += by_direction
+        d_origin, by_direction = self.composite.backward_rays(
+            self._fields, seen.rays, seen.seen, cotangent, self.stop
+        )
+        d_direction += by_direction
         dr.eval(d_origin, d_direction)
         leaf = type(state)(dr.detach(state))
         dr.enable_grad(leaf)
@@ -263,15 +213,3 @@ class FieldSensor(AbstractDifferentiableSensor):
         result = dr.grad(leaf)
         dr.eval(result, [dr.grad(posed.field.packed) for posed in self.objects])
         return result
-
-
-def _leaf(layer: March) -> March:
-    copy = March(
-        mi.Color3f(layer.radiance), mi.Float(layer.opacity), mi.Float(layer.moment)
-    )
-    dr.enable_grad(copy)
-    return copy
-
-
-def _gradient(layer: March) -> March:
-    return March(dr.grad(layer.radiance), dr.grad(layer.opacity), dr.grad(layer.moment))

@@ -1,0 +1,383 @@
+"""The exact composite: one march through all fields at once.
+
+Along a ray, the lattice intervals of all fields are merged into segments on which the
+set of fields does not change. A segment of width δ at transmittance T, with density
+``sigma = sum_k sigma_k`` and emission ``E = sum_k sigma_k L_k`` taken as constant on
+it, adds ``T δ phi(sigma δ) E`` to the radiance, ``phi(x) = (1 - exp(-x)) / x``.
+"""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass, field
+from functools import reduce
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.render.composite import AbstractComposite, Seen, pick
+from mi_nerfattack.render.march import March, Rays, absorption, seek
+from mi_nerfattack.render.posed import PosedField
+
+
+class InterleavedComposite(AbstractComposite):
+    """All fields in one medium: ``sigma = sum sigma_k``, ``L`` their weighted mean.
+
+    Exact also where fields overlap; the steps are those of all fields together.
+    Cost: about the sum of the fields' marches, as :class:`DepthComposite`, in one
+    loop; its derivative evaluates every field again, also those that ask for no
+    gradient. A layer is the field's share of the total, behind whatever hides it, and
+    the total is the sum of the shares.
+    """
+
+    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
+        """See :meth:`AbstractComposite.render`."""
+        with dr.suspend_grad():
+            shares = _march(posed, rays, stop)
+        return Seen(_total(shares), shares)
+
+    def forward(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+    ) -> March:
+        """See :meth:`AbstractComposite.forward`."""
+        with dr.suspend_grad():
+            return _derivative(
+                dr.ADMode.Forward, posed, rays, seen.total, March(), stop, False
+            )[0]
+
+    def backward(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> None:
+        """See :meth:`AbstractComposite.backward`."""
+        met = [
+            layer.opacity > 0
+            for item, layer in zip(posed, seen.layers, strict=True)
+            if item.field.has_gradients
+        ]
+        if not met:
+            return
+        index = dr.compress(reduce(operator.or_, met))
+        if not dr.width(index):
+            return
+        rays, total, cotangent = (pick(x, index) for x in (rays, seen.total, cotangent))
+        with dr.suspend_grad():
+            _derivative(dr.ADMode.Backward, posed, rays, total, cotangent, stop, False)
+
+    def backward_rays(
+        self,
+        posed: list[PosedField],
+        rays: Rays,
+        seen: Seen,
+        cotangent: March,
+        stop: float,
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """See :meth:`AbstractComposite.backward_rays`."""
+        with dr.suspend_grad():
+            _, d_origin, d_direction = _derivative(
+                dr.ADMode.Backward, posed, rays, seen.total, cotangent, stop, True
+            )
+        return d_origin, d_direction
+
+
+@dataclass
+class _Path:
+    """Rays in the frame of one field, and where they are inside its box."""
+
+    o: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    d: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    near: mi.Float = field(default_factory=lambda: mi.Float(0))
+    far: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+
+@dataclass
+class _Cursor:
+    """One field's lattice interval at or ahead of the march, metres."""
+
+    following: mi.Float = field(default_factory=lambda: mi.Float(0))
+    start: mi.Float = field(default_factory=lambda: mi.Float(0))
+    end: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+
+@dataclass
+class _Segment:
+    """Part of the rays on which the set of fields does not change."""
+
+    t: mi.Float = field(default_factory=lambda: mi.Float(0))
+    width: mi.Float = field(default_factory=lambda: mi.Float(0))
+    end: mi.Float = field(default_factory=lambda: mi.Float(0))
+    inside: list[mi.Bool] = field(default_factory=list)
+
+
+def _enter(posed: PosedField, rays: Rays) -> tuple[_Path, _Cursor]:
+    o, d = posed.to_local(rays.origin, rays.direction)
+    near, far = posed.interval(o, d, rays.t_max)
+    first = dr.floor(posed.lattice_index(near))
+    missed = ~(near < far)
+    end = dr.select(missed, dr.inf, -1)  # -1 is spent: the first interval is sought
+    path = _Path(o, d, dr.normalize(d), near, far)
+    return path, _Cursor(first, dr.select(missed, dr.inf, 0), end)
+
+
+def _advance(
+    posed: PosedField,
+    path: _Path,
+    cursor: _Cursor,
+    t: mi.Float,
+    jitter: mi.Float,
+    active: mi.Bool,
+) -> _Cursor:
+    """Move on to the next occupied interval where the present one lies behind t."""
+    spent = active & (cursor.end <= t)
+    index, _, _, found = seek(
+        posed, path.o, path.d, cursor.following, path.near, path.far, jitter, spent
+    )
+    start = dr.maximum(posed.lattice(index), path.near)
+    end = dr.maximum(dr.minimum(posed.lattice(index + 1), path.far), start)
+    start, end = dr.select(found, start, dr.inf), dr.select(found, end, dr.inf)
+    return _Cursor(
+        dr.select(spent, index + 1, cursor.following),
+        dr.select(spent, start, cursor.start),
+        dr.select(spent, end, cursor.end),
+    )
+
+
+def _segment(
+    cursors: list[_Cursor], t: mi.Float, jitter: mi.Float, active: mi.Bool
+) -> _Segment:
+    """Find the next segment at or after t; its end is infinite where there is none."""
+    nearest = mi.Float(dr.inf)
+    for cursor in cursors:
+        nearest = dr.minimum(nearest, cursor.start)
+    begin = dr.maximum(t, nearest)
+    end = mi.Float(dr.inf)
+    inside = []
+    for cursor in cursors:
+        entered = cursor.start <= begin
+        end = dr.minimum(end, dr.select(entered, cursor.end, cursor.start))
+        inside.append(active & entered & (cursor.end < dr.inf))
+    exists = active & (nearest < dr.inf)
+    width = dr.select(exists, end - begin, 0)
+    sample = dr.select(exists, begin + jitter * width, 0)
+    return _Segment(sample, width, end, inside)
+
+
+def _total(shares: list[March]) -> March:
+    total = shares[0]
+    for share in shares[1:]:
+        total = March(
+            total.radiance + share.radiance,
+            total.opacity + share.opacity,
+            total.moment + share.moment,
+        )
+    return total
+
+
+@dr.syntax
+def _march(posed: list[PosedField], rays: Rays, stop: float) -> list[March]:
+    paths, cursors = _enter_all(posed, rays)
+    shares = [March() for _ in posed]  # what each field has given so far
+    active = mi.Bool(rays.active)
+    t = mi.Float(0)  # end of the segments behind, metres
+    tau = mi.Float(0)  # optical depth so far
+    while active:
+        cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
+        here = _segment(cursors, t, rays.jitter, active)
+        active &= here.end < dr.inf
+        values, _ = _evaluate(posed, paths, here, False)
+        depth = _density(values) * here.width
+        given = dr.exp(-tau) * here.width * absorption(depth)[0]
+        shares = _share(shares, values, dr.select(active, given, 0), here.t)
+        tau += dr.select(active, depth, 0)
+        t = dr.select(active, here.end, t)
+        active &= dr.exp(-tau) > stop
+    return shares
+
+
+@dr.syntax
+def _derivative(
+    mode: dr.ADMode,
+    posed: list[PosedField],
+    rays: Rays,
+    primal: March,
+    cotangent: March,
+    stop: float,
+    with_rays: bool,
+) -> tuple[March, mi.Vector3f, mi.Vector3f]:
+    paths, cursors = _enter_all(posed, rays)
+    slopes = [_RayGradient() for _ in posed]
+    tangent = March()
+    active = mi.Bool(rays.active)
+    t = mi.Float(0)
+    tau = mi.Float(0)
+    rest = primal.copy()  # what is still to come; opacity stays that of the ray
+    while active:
+        cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
+        here = _segment(cursors, t, rays.jitter, active)
+        active &= here.end < dr.inf
+        with dr.resume_grad():
+            values, places = _evaluate(posed, paths, here, with_rays)
+            rest, change = _change(values, here, tau, rest)
+            if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
+                dr.backward_from(dr.select(active, _pair(cotangent, change), 0))
+                slopes = _collect(slopes, places, here.t, active, with_rays)
+            else:
+                tangent = _masked_sum(tangent, dr.forward_to(change), active)
+        depth = dr.detach(_density(values)) * here.width
+        tau += dr.select(active, depth, 0)
+        t = dr.select(active, here.end, t)
+        active &= dr.exp(-tau) > stop
+    return tangent, *_finish(posed, paths, slopes)
+
+
+def _enter_all(
+    posed: list[PosedField], rays: Rays
+) -> tuple[list[_Path], list[_Cursor]]:
+    entries = [_enter(item, rays) for item in posed]
+    return [path for path, _ in entries], [cursor for _, cursor in entries]
+
+
+def _advance_all(
+    posed: list[PosedField],
+    paths: list[_Path],
+    cursors: list[_Cursor],
+    t: mi.Float,
+    jitter: mi.Float,
+    active: mi.Bool,
+) -> list[_Cursor]:
+    return [
+        _advance(item, path, cursor, t, jitter, active)
+        for item, path, cursor in zip(posed, paths, cursors, strict=True)
+    ]
+
+
+def _density(values: list) -> mi.Float:
+    return sum((density for density, _ in values), mi.Float(0))
+
+
+def _share(
+    shares: list[March], values: list, given: mi.Float, t: mi.Float
+) -> list[March]:
+    """Add each field's part of a segment to its share."""
+    result = []
+    for share, (density, colour) in zip(shares, values, strict=True):
+        weight = given * density
+        result.append(
+            March(
+                share.radiance + weight * colour,
+                share.opacity + weight,
+                share.moment + weight * t,
+            )
+        )
+    return result
+
+
+def _change(
+    values: list, here: _Segment, tau: mi.Float, rest: March
+) -> tuple[March, March]:
+    """Linearise the march in one segment.
+
+    Returns:
+        what comes behind the segment, and a quantity whose derivative by the values
+        of the fields is that of the whole march.
+    """
+    density = _density(values)
+    emission = sum((a * b for a, b in values), mi.Color3f(0))
+    sigma, light = dr.detach(density), dr.detach(emission)
+    through = dr.exp(-tau)
+    behind = dr.exp(-tau - sigma * here.width)
+    phi, slope = absorption(sigma * here.width)
+    given = through * phi * here.width
+    radiance = rest.radiance - light * given
+    moment = rest.moment - sigma * given * here.t
+    curve = through * here.width * here.width * slope
+    change = March(
+        given * emission + density * (curve * light - here.width * radiance),
+        density * here.width * (1 - rest.opacity),
+        density * here.width * (behind * here.t - moment),
+    )
+    return March(radiance, rest.opacity, moment), change
+
+
+@dataclass
+class _RayGradient:
+    """Derivatives by the ray in the frame of one field, so far."""
+
+    origin: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+
+
+def _evaluate(
+    posed: list[PosedField], paths: list[_Path], here: _Segment, with_rays: bool
+) -> tuple[list, list]:
+    """Evaluate all fields, attached; also return the points and directions used."""
+    values, places = [], []
+    for item, path, inside in zip(posed, paths, here.inside, strict=True):
+        point = mi.Point3f(path.o + here.t * path.d)
+        heading = mi.Vector3f(path.heading)
+        if with_rays:
+            dr.enable_grad(point, heading)
+        values.append(item.eval(point, heading, inside))
+        places.append((point, heading))
+    return values, places
+
+
+def _pair(cotangent: March, change: March) -> mi.Float:
+    return (
+        dr.dot(cotangent.radiance, change.radiance)
+        + cotangent.opacity * change.opacity
+        + cotangent.moment * change.moment
+    )
+
+
+def _masked_sum(total: March, change: March, active: mi.Bool) -> March:
+    return March(
+        total.radiance + dr.select(active, change.radiance, 0),
+        total.opacity + dr.select(active, change.opacity, 0),
+        total.moment + dr.select(active, change.moment, 0),
+    )
+
+
+def _collect(
+    slopes: list[_RayGradient],
+    places: list,
+    t: mi.Float,
+    active: mi.Bool,
+    with_rays: bool,
+) -> list[_RayGradient]:
+    if not with_rays:
+        return slopes
+    result = []
+    for slope, (point, heading) in zip(slopes, places, strict=True):
+        by_point = dr.select(active, mi.Vector3f(dr.grad(point)), 0)
+        by_heading = dr.select(active, dr.grad(heading), 0)
+        result.append(
+            _RayGradient(
+                slope.origin + by_point,
+                slope.direction + t * by_point,
+                slope.heading + by_heading,
+            )
+        )
+    return result
+
+
+def _finish(
+    posed: list[PosedField], paths: list[_Path], slopes: list[_RayGradient]
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Return the derivatives by origin and direction in the world."""
+    d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+    for item, path, slope in zip(posed, paths, slopes, strict=True):
+        along = path.heading * dr.dot(path.heading, slope.heading)
+        turned = (slope.heading - along) * dr.rcp(dr.norm(path.d))
+        by_origin, by_direction = item.to_world_gradient(
+            slope.origin, slope.direction + turned
+        )
+        d_origin += by_origin
+        d_direction += by_direction
+    return d_origin, d_direction
