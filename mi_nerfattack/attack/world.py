@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.capture.views import load_scene
 from mi_nerfattack.deploy.mitsuba import PathTracedSensor
 from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
 from mi_nerfattack.render.posed import Pose, PosedField
+from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor
 from mi_nerfattack.scenario import Scenario, VehicleSection, resolve

@@ -119,7 +119,7 @@ def read_transforms(
     Raises:
         InputError: naming the file and the field that cannot be used.
     """
-    source = _find_json(Path(path))
+    source = find_transforms(Path(path))
     table = files.read_json(source)
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -140,7 +140,7 @@ def read_transforms(
             f"{missing[0]!r}; restore the files or leave these frames out "
             "(skip_missing)"
         )
-    poses = np.stack([_read_pose(source, i, frames[i]) for i, _ in found])
+    poses = np.stack([read_pose(source, i, frames[i]) for i, _ in found])
     first = files.read_image(found[0][1])
     camera = read_camera(source, table, [frames[i] for i, _ in found], first.shape)
     target = _reduced(camera, long_edge_px)
@@ -209,7 +209,8 @@ def write_poses(
     files.write_json(path, table)
 
 
-def _find_json(path: Path) -> Path:
+def find_transforms(path: Path) -> Path:
+    """Return the JSON file that a path names: itself, or the one in the folder."""
     if not path.is_dir():
         return path
     for name in _FILE_NAMES:
@@ -230,7 +231,20 @@ def _find_image(source: Path, index: int, frame: Any) -> Path | None:
     return None
 
 
-def _read_pose(source: Path, index: int, frame: Mapping[str, Any]) -> np.ndarray:
+def read_pose(source: Path, index: int, frame: Mapping[str, Any]) -> np.ndarray:
+    """Read the pose of one frame.
+
+    Args:
+        source: the JSON file, for messages.
+        index: of the frame, for messages.
+        frame: with `transform_matrix`, OpenGL axes, (4, 4) or (3, 4).
+
+    Returns:
+        camera_to_world: (4, 4), OpenCV axes, float64.
+
+    Raises:
+        InputError: the matrix is missing or not a rigid pose.
+    """
     where = f"{source}: frames[{index}].transform_matrix"
     try:
         matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)

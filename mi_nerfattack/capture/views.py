@@ -30,6 +30,7 @@ from mi_nerfattack.render.camera import (
     pose_arrays,
 )
 from mi_nerfattack.render.conventions import mitsuba_sensor_dict, opencv_to_mitsuba
+from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.vehicle.route import Route
 
 _LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
@@ -203,16 +204,6 @@ def drive_poses(
         here = CameraMount(float(height[i]), mount.forward_m, float(pitch[i]))
         poses.append(mount_matrix(state, here)[0])
     return np.stack(poses)
-
-
-def load_scene(path: str | Path) -> Any:
-    """Load a Mitsuba XML scene; RuntimeError of the parser becomes InputError."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
-    try:
-        return mi.load_file(str(path), parallel=False)
-    except RuntimeError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def capture_scene(

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mi_nerfattack import files
-from mi_nerfattack.capture.views import load_scene
 from mi_nerfattack.deploy.mitsuba import PathTracedSensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field, load_grid
@@ -18,6 +17,7 @@ from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE
 from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.rollout.sensor import FieldSensor
 from mi_nerfattack.vehicle.route import Route
 
