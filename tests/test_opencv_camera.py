@@ -1,0 +1,410 @@
+"""The sensor `opencv_camera` against the stock sensor and OpenCV's projection."""
+
+from __future__ import annotations
+
+import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
+
+# isort: split
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import small_fields as small
+
+from mi_nerfattack.fields import save_field
+
+WIDTH, HEIGHT, FOCAL = 48, 32, 30.0
+CROP = {"crop_width": 20, "crop_height": 16, "crop_offset_x": 15, "crop_offset_y": 7}
+LENS = {
+    "fx": 30.0,
+    "fy": 36.0,
+    "cx": 22.5,
+    "cy": 18.0,
+    "k1": -0.08,
+    "k2": 0.02,
+    "p1": 2e-3,
+    "p2": -3e-3,
+}
+PINHOLE = {"type": "opencv_camera", "fx": FOCAL, "cx": 20.0, "cy": 18.0}
+STOCK = {
+    "type": "perspective",
+    "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
+    "fov_axis": "x",
+    "principal_point_offset_x": 0.5 - 20 / WIDTH,
+    "principal_point_offset_y": 0.5 - 18 / HEIGHT,
+}
+EYE = [1.0, 2.0, -3.0]
+INTEGRATORS = {
+    "path": {"type": "path", "max_depth": 3},
+    "direct": {"type": "direct"},
+    "prb": {"type": "prb", "max_depth": 3},
+    "aov": {
+        "type": "aov",
+        "aovs": "d:depth,x:position,u:duv_dx,v:duv_dy",
+        "inner": {"type": "direct"},
+    },
+}
+
+
+@pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
+def each_variant(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = mi.variant()
+    mi.set_variant(request.param)
+    yield request.param
+    if before is not None and before != request.param:
+        mi.set_variant(before)
+
+
+def film(**more: Any) -> dict[str, Any]:
+    pixels = "luminance" if mi.is_monochromatic else "rgb"
+    base = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
+    return {**base, "pixel_format": pixels, "component_format": "float32", **more}
+
+
+def sensor(description: dict[str, Any], **film_more: Any) -> dict[str, Any]:
+    to_world = mi.ScalarTransform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
+    return {**description, "to_world": to_world, "film": film(**film_more)}
+
+
+def load(description: dict[str, Any]) -> mi.Sensor:
+    return mi.load_dict(description, parallel=False)
+
+
+def world(camera: dict[str, Any], integrator: dict[str, Any], **more: Any) -> mi.Scene:
+    """Load a chequered ball under a sky, with the camera as `eye`."""
+    chequers = {
+        "type": "checkerboard",
+        "color0": {"type": "rgb", "value": [0.8, 0.3, 0.1]},
+        "to_uv": mi.ScalarTransform4f().scale([8, 8, 1]),
+    }
+    ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": chequers}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "eye": camera,
+            "ball": ball,
+            "sky": {"type": "constant"},
+            **more,
+        },
+        parallel=False,
+    )
+
+
+def rays(camera: mi.Sensor, pixel: np.ndarray) -> tuple[mi.RayDifferential3f, Any]:
+    """Sample the rays of pixels (n, 2), counted in the full film."""
+    crop = np.array(camera.film().crop_size())
+    place = (pixel - np.array(camera.film().crop_offset())) / crop
+    sample = mi.Point2f(np.ascontiguousarray(place.T, np.float32))
+    return camera.sample_ray_differential(
+        mi.Float(0), mi.Float(0.3), sample, mi.Point2f(0)
+    )
+
+
+def grid_of_pixels(step: float = 4.0) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(0, WIDTH + 1, step), np.arange(0, HEIGHT + 1, step))
+    return np.stack([u.ravel(), v.ravel()], 1)
+
+
+def opencv_pixels(points: np.ndarray) -> np.ndarray:
+    """Project points (n, 3) of Mitsuba's camera frame with OpenCV, (n, 2)."""
+    import cv2
+
+    # OpenCV counts from the centre of the first pixel.
+    matrix = np.array(
+        [
+            [LENS["fx"], 0, LENS["cx"] - 0.5],
+            [0, LENS["fy"], LENS["cy"] - 0.5],
+            [0, 0, 1],
+        ]
+    )
+    lens = np.array([LENS[name] for name in ("k1", "k2", "p1", "p2")])
+    axes = points * [-1.0, -1.0, 1.0]
+    projected = cv2.projectPoints(axes, np.zeros(3), np.zeros(3), matrix, lens)[0]
+    return projected[:, 0] + 0.5
+
+
+# Against the stock sensor
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"rfilter": {"type": "box"}},
+        {"rfilter": {"type": "gaussian"}, "sample_border": True, **CROP},
+        {"rfilter": {"type": "lanczos"}},
+    ],
+    ids=["box", "gaussian crop", "lanczos"],
+)
+def test_image_of_the_stock_sensor(each_variant: str, kind: str, more: Any) -> None:
+    images = [
+        np.array(mi.render(world(sensor(d, **more), INTEGRATORS[kind]), spp=4, seed=3))
+        for d in (PINHOLE, STOCK)
+    ]
+    assert np.nanmax(images[1]) > 0.5
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
+def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+    ours, theirs = (load(sensor(d, **more)) for d in (PINHOLE, STOCK))
+    (a, weight_a), (b, weight_b) = (rays(s, grid_of_pixels()) for s in (ours, theirs))
+    for name in ("o", "d", "maxt", "d_x", "d_y", "o_x", "wavelengths"):
+        x, y = (np.array(getattr(ray, name)) for ray in (a, b))
+        np.testing.assert_allclose(x, y, rtol=2e-6, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(np.array(weight_a), np.array(weight_b), rtol=1e-6)
+
+
+@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
+def test_directions_of_the_stock_sensor(each_variant: str, more: Any) -> None:
+    # Centred: the stock sensor leaves out a strip where the principal point is not.
+    centred = {"cx": 0.5 * WIDTH, "cy": 0.5 * HEIGHT}
+    shifted = ("principal_point_offset_x", "principal_point_offset_y")
+    stock = {key: value for key, value in STOCK.items() if key not in shifted}
+    ours = load(sensor({**PINHOLE, **centred}, **more))
+    theirs = load(sensor(stock, **more))
+    spread = np.random.default_rng(0).normal(size=(3, 500)) * 1.5
+    it = dr.zeros(mi.Interaction3f, 500)
+    it.p = mi.Point3f(spread.astype(np.float32))
+    (a, a_weight), (b, b_weight) = (
+        s.sample_direction(it, mi.Point2f(0)) for s in (ours, theirs)
+    )
+    seen = np.array(b.pdf) > 0
+    np.testing.assert_array_equal(np.array(a.pdf) > 0, seen)
+    assert 0.05 < seen.mean() < 0.95
+    for name in ("uv", "d", "dist"):
+        x, y = (np.array(getattr(ds, name))[..., seen] for ds in (a, b))
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
+    x, y = (np.array(mi.Spectrum(w)[0])[seen] for w in (a_weight, b_weight))
+    np.testing.assert_allclose(x, y, rtol=1e-5)
+
+
+# Against OpenCV
+
+
+@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
+def test_rays_project_back_with_opencv(variant: str, more: Any) -> None:
+    camera = load(sensor({"type": "opencv_camera", **LENS}, **more))
+    pixel = grid_of_pixels()
+    ray, _ = rays(camera, pixel)
+    to_local = np.linalg.inv(np.array(camera.world_transform().matrix).reshape(4, 4))
+    local = ray.d.numpy().T.astype(np.float64) @ to_local[:3, :3].T
+    np.testing.assert_allclose(opencv_pixels(local), pixel, atol=1e-4)
+
+
+def test_ray_differentials_are_the_next_pixels(variant: str) -> None:
+    camera = load(sensor({"type": "opencv_camera", **LENS}))
+    pixel = grid_of_pixels() * 0.9
+    ray, _ = rays(camera, pixel)
+    for name, step in (("d_x", [0.25, 0]), ("d_y", [0, 0.25])):
+        # The differential is the tangent: central differences within a pixel.
+        ahead, back = (rays(camera, pixel + sign * np.array(step)) for sign in (1, -1))
+        expected = (ahead[0].d - back[0].d).numpy() / 0.5
+        tangent = (getattr(ray, name) - ray.d).numpy()
+        size = np.linalg.norm(expected, axis=0)
+        # A unit vector of the next pixel differs by the curvature of the sphere.
+        assert np.all(np.abs(tangent - expected) < 0.04 * size)
+
+
+def test_directions_are_rays_reversed(variant: str) -> None:
+    camera = load(sensor({"type": "opencv_camera", **LENS}, **CROP))
+    offset, size = np.array([15.0, 7.0]), np.array([20, 16])
+    pixel = offset + np.random.default_rng(1).uniform(0.02, 0.98, (200, 2)) * size
+    ray, _ = rays(camera, pixel)
+    it = dr.zeros(mi.Interaction3f, 200)
+    it.p = ray(mi.Float(2.5))
+    ds, weight = camera.sample_direction(it, mi.Point2f(0))
+    assert np.all(np.array(ds.pdf) == 1)
+    np.testing.assert_allclose(ds.uv.numpy().T, pixel - offset, atol=2e-3)
+    np.testing.assert_allclose(ds.d.numpy(), -ray.d.numpy(), atol=1e-5)
+    # Importance: samples of the window per solid angle, over squared distance.
+    steps = 0.25 * np.eye(2)
+    by = [
+        (rays(camera, pixel + s)[0].d - rays(camera, pixel - s)[0].d).numpy() / 0.5
+        for s in steps
+    ]
+    solid_angle = np.linalg.norm(np.cross(by[0].T, by[1].T), axis=1)
+    expected = 1 / (solid_angle * size.prod() * ds.dist.numpy() ** 2)
+    np.testing.assert_allclose(weight.x.numpy(), expected, rtol=2e-3)
+
+
+def test_points_that_fold_into_the_image_are_not_seen(variant: str) -> None:
+    # With k1 < 0 the lens maps far directions back into the image: at x = 3,
+    # x (1 + k1 x^2) = 0.3. OpenCV projects them there, but no ray goes that way.
+    folding = {"type": "opencv_camera", "fx": 60.0, "k1": -0.1}
+    it = dr.zeros(mi.Interaction3f, 1)
+    camera = load({**folding, "film": film()})
+    for x, seen in ((0.29, True), (3.0, False)):
+        it.p = mi.Point3f(x, 0, 1)
+        ds, weight = camera.sample_direction(it, mi.Point2f(0))
+        assert abs(ds.uv.x[0] - WIDTH / 2) < WIDTH / 2
+        assert (ds.pdf[0] > 0, weight.x[0] > 0) == (seen, seen)
+
+
+# Derivatives and kernels
+
+
+@pytest.mark.parametrize("name", [*LENS, "to_world"])
+def test_rays_derivative(variant: str, name: str) -> None:
+    pixel = grid_of_pixels(8.0) * 0.95
+    towards = np.random.default_rng(0).normal(size=(3, len(pixel)))
+
+    def along(shift: Any) -> Any:
+        camera = load(sensor({"type": "opencv_camera", **LENS}))
+        params = mi.traverse(camera)
+        if name == "to_world":
+            moved = mi.Transform4f().rotate([0, 1, 0], shift)
+            params[name] = moved @ mi.Transform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
+        else:
+            params[name] = mi.Float(LENS[name]) + shift
+        params.update()
+        return rays(camera, pixel)[0].d
+
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    direction = along(shift)
+    dr.forward(shift, dr.ADFlag.ClearEdges)
+    found = (dr.grad(direction).numpy() * towards).sum()
+    step = 0.05 if name[0] in "fct" else 5e-3
+    ahead, back = (along(mi.Float(s)).numpy().astype(float) for s in (step, -step))
+    expected = ((ahead - back) * towards).sum() / (2 * step)
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("lens", [{"fx": 30.0}, LENS], ids=["pinhole", "lens"])
+def test_nothing_is_compiled_for_another_pose_or_lens(variant: str, lens: Any) -> None:
+    camera = sensor({"type": "opencv_camera", **lens}, width=31, height=17)
+    scene = world(camera, INTEGRATORS["prb"])
+    params = mi.traverse(scene)
+
+    def frame(index: int) -> np.ndarray:
+        eye = [1.0, index, -4.0]
+        params["eye.to_world"] = mi.Transform4f().look_at(eye, [0, 0, 0], [0, 1, 0])
+        params["eye.fx"] = 31.0 + index
+        for name in ("k1", "p2"):
+            if name in lens:
+                params[f"eye.{name}"] = lens[name] + 1e-3 * index
+        params.update()
+        return np.array(mi.render(scene, spp=2, seed=1))
+
+    def kernels(index: int) -> tuple[set[str], np.ndarray]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            image = frame(index)
+            history = dr.kernel_history()
+        return {k["hash"] for k in history if k["type"] == dr.KernelType.JIT}, image
+
+    # By their hash: what another process compiled comes from a cache on disk. The
+    # second frame of a scene differs from the first with the stock sensor too.
+    kernels(1)
+    known, image = kernels(2)
+    for index in (3, 4):
+        later, other = kernels(index)
+        assert later and later <= known
+        assert abs(other - image).max() > 0.1
+
+
+def test_moved_camera_is_the_camera_that_was_there(variant: str) -> None:
+    there = world(sensor({"type": "opencv_camera", **LENS}), INTEGRATORS["direct"])
+    start = sensor({"type": "opencv_camera", "fx": 10.0, "k1": 1e-3})
+    start["to_world"] = mi.ScalarTransform4f().translate([9, 9, 9])
+    moved = world(start, INTEGRATORS["direct"])
+    params = mi.traverse(moved)
+    for name, value in LENS.items():
+        params[f"eye.{name}"] = value
+    params["eye.to_world"] = mi.Transform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
+    params.update()
+    a, b = (np.array(mi.render(scene, spp=2)) for scene in (there, moved))
+    np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+# With fields
+
+
+def test_field_integrator_with_a_lens(variant: str, tmp_path: Path) -> None:
+    path = tmp_path / "box.safetensors"
+    save_field(path, small.homogeneous(0.7))
+    volume = {"type": "grid_field", "filename": str(path)}
+    integrator = {"type": "field_integrator", "stop": 0.0, "box": volume}
+    camera = sensor({"type": "opencv_camera", **LENS}, rfilter={"type": "box"})
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": integrator, "eye": camera}, parallel=False
+    )
+    opacity = np.array(mi.render(scene, spp=256))[..., 3]
+    parts = np.arange(8) / 8 + 1 / 16
+    u, v = np.meshgrid(np.add.outer(np.arange(48), parts).ravel(), np.arange(32))
+    pixel = np.stack([u[:, :, None] + 0 * parts, v[:, :, None] + parts], -1)
+    ray, _ = rays(scene.sensors()[0], pixel.reshape(-1, 2))
+    o, d = ray.o.numpy().T.astype(float), ray.d.numpy().T.astype(float)
+    sides = np.sort(np.stack([(-1 - o) / d, (1 - o) / d]), axis=0)
+    inside = np.maximum(sides[1].min(1) - np.maximum(sides[0].max(1), 0), 0)
+    expected = (1 - np.exp(-0.7 * inside)).reshape(32, 48, -1).mean(-1)
+    assert expected.max() > 0.8 and (expected == 0).any()
+    error = np.abs(opacity - expected)
+    assert error.max() < 0.1 and error.mean() < 5e-3  # of 256 random samples
+
+
+# Properties
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"fx": -3.0}, "camera.fx: -3.0; must be positive"),
+        ({"fy": 0.0}, "camera.fy: 0.0; must be positive"),
+        ({"cx": float("nan")}, "camera.cx: nan; must be finite"),
+        ({"k1": -5.0}, "folds the image over itself"),
+        ({"near_clip": 0.0}, "near_clip, far_clip: 0, .*expected 0 < near < far"),
+        ({"near_clip": 2.0, "far_clip": 1.0}, "near_clip, far_clip: 2, 1"),
+        ({"k3": 0.1}, 'unreferenced property.*\n.*"k3"'),
+        ({"fov": 40.0}, 'unreferenced property.*\n.*"fov"'),
+    ],
+)
+def test_wrong_properties(variant: str, more: Any, message: str) -> None:
+    with pytest.raises(RuntimeError, match=message):
+        load({"type": "opencv_camera", "fx": 30.0, "film": film(), **more})
+
+
+def test_focal_length_is_required(variant: str) -> None:
+    with pytest.raises(RuntimeError, match='property named "fx"'):
+        load({"type": "opencv_camera", "film": film()})
+
+
+def test_scaled_pose_is_refused(variant: str) -> None:
+    scaled = mi.ScalarTransform4f().scale(2)
+    with pytest.raises(RuntimeError, match="takes rotation and translation"):
+        load({"type": "opencv_camera", "fx": 9.0, "to_world": scaled})
+
+
+def test_impossible_changes_are_refused(variant: str) -> None:
+    params = mi.traverse(load({"type": "opencv_camera", "fx": 30.0, "film": film()}))
+    for name, value, message in (
+        ("k1", -5.0, "folds"),
+        ("fx", -1.0, "camera.fx"),
+        ("to_world", mi.Transform4f().scale(2), "rotation and translation"),
+    ):
+        before = type(params[name])(params[name])
+        params[name] = value
+        with pytest.raises(ValueError, match=message):
+            params.update()
+        params[name] = before
+        params.update()
+
+
+def test_xml(variant: str) -> None:
+    scene = mi.load_string(
+        '<scene version="3.0.0"><sensor type="opencv_camera">'
+        '<float name="fx" value="250"/><float name="fy" value="252"/>'
+        '<float name="k1" value="-0.1"/><transform name="to_world"><lookat '
+        'origin="3, 1, 1.5" target="0, 0, 0" up="0, 0, 1"/></transform>'
+        '<film type="hdrfilm"><integer name="width" value="320"/>'
+        '<integer name="height" value="240"/></film></sensor></scene>',
+        parallel=False,
+    )
+    text = str(scene.sensors()[0])
+    assert "fx=250, fy=252, cx=160, cy=120, k1=-0.1" in text
