@@ -10,6 +10,8 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, load_field
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render import spectrum
 from mi_nerfattack.render.posed import Pose, PosedField
 
 QUANTITIES = ("density", "radiance")
@@ -87,7 +89,7 @@ class AbstractFieldVolume(mi.Volume):
     parameter_names: tuple[str, ...] = ()
 
     def __init__(self, props: mi.Properties) -> None:
-        refuse_spectral(self.kind)
+        spectrum.prepare()
         quantity, pose = read_quantity(props), read_pose(props)
         field = read_field(props, self.kind)
         super().__init__(place_unit_cube(props, field, pose))
@@ -101,16 +103,25 @@ class AbstractFieldVolume(mi.Volume):
             callback.put(name, self.values[name], mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Hand changed parameters to the field."""
+        """Hand changed parameters to the field.
+
+        What was empty may not be so after a change of ``density``: from then on the
+        march skips nothing.
+        """
         for name in self.parameter_names:
             if not keys or name in keys:
                 self.field.set_parameter(name, self.values[name])
+        if "density" in keys:
+            self.field.occupancy = Occupancy.full()
 
     def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> Any:
-        """Evaluate the quantity as a spectrum, (channels, n)."""
+        """Evaluate the quantity as a spectrum, (channels, n).
+
+        Radiance counts as a reflectance: white is 1 in every channel.
+        """
         if self.quantity == "density":
             return mi.Spectrum(self.eval_1(it, active))
-        return to_spectrum(self._evaluate(it, active)[1])
+        return spectrum.reflectance(self._evaluate(it, active)[1], it.wavelengths)
 
     def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
         """Evaluate density (n,), 1/metre, or the luminance of the radiance."""
@@ -129,7 +140,10 @@ class AbstractFieldVolume(mi.Volume):
         return self.posed.eval(point, mi.Vector3f(0, 0, 1), inside)
 
     def max(self) -> float:
-        """Return an upper bound of the density, 1/metre; 1 for radiance."""
+        """Return an upper bound of the density, 1/metre; 1 for radiance.
+
+        A medium asks for it when it is built and after a change of its parameters.
+        """
         if self.quantity == "radiance":
             return 1.0
         return self.field.density_bound() / self.posed.pose.scale

@@ -23,6 +23,7 @@ class GridFieldVolume(AbstractFieldVolume):
     to_world      transform  metre    identity  rotation, translation, uniform scale
     quantity      string              density   ``density`` or ``radiance``
     texture       tensor                        (n, 3) raw colours; differentiable
+    density       array                         (n,) raw densities; differentiable
     ============  =========  =======  ========  =====================================
 
     .. code-block:: xml
@@ -36,11 +37,12 @@ class GridFieldVolume(AbstractFieldVolume):
 
         {"type": "grid_field", "filename": "hydrant.safetensors"}
 
-    Limits: RGB and monochromatic variants; the pose is not differentiable.
+    Not differentiable: the pose. After a change of ``density`` the march skips no
+    empty space, since what the file calls empty may have been filled.
     """
 
     kind = "grid_field"
-    parameter_names = ("texture",)
+    parameter_names = ("texture", "density")
 
 
 mi.register_texture("grid_field", lambda props: GridFieldVolume(props))

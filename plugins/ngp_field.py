@@ -35,7 +35,8 @@ class NGPFieldVolume(AbstractFieldVolume):
 
         {"type": "ngp_field", "filename": "field.safetensors"}
 
-    Limits: RGB and monochromatic variants; the pose is not differentiable.
+    Not differentiable: the pose. The majorant of the density is an estimate, see
+    ``NGPField.density_bound``.
     """
 
     kind = "ngp_field"
