@@ -15,6 +15,7 @@ from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.fit import Fit
+from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.train import Train
 
 
@@ -29,6 +30,7 @@ class Command(Protocol):
 COMMANDS: dict[str, type[Command]] = {
     "doctor": Doctor,
     "demo": Demo,
+    "render": Render,
     "capture": Capture,
     "fit": Fit,
     "asset": Asset,

@@ -1,0 +1,209 @@
+"""``mi-nerfattack render``: a frame or a camera path of any Mitsuba scene."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mi_nerfattack.commands.bars import StageBars
+    from mi_nerfattack.report.film import FrameRenderer
+    from mi_nerfattack.report.sequence import Shot
+
+
+class _Pace:
+    """Shows how far a path is, and at an early end how to continue."""
+
+    def __init__(self, bars: StageBars, folder: Path) -> None:
+        self.finished = False
+        self._bars, self._folder = bars, folder
+        self._done = self._total = self._rendered = 0
+        self._start = time.monotonic()
+
+    def __enter__(self) -> _Pace:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if not self.finished and self._done:
+            print(
+                f"{self._done} of {self._total} frames are in {self._folder}; the same "
+                "command with --skip-existing continues",
+                file=sys.stderr,
+            )
+
+    def show(self, done: int, total: int, kept: bool) -> None:
+        """Take note of a frame."""
+        self._done, self._total = done, total
+        self._rendered += not kept
+        pace = (time.monotonic() - self._start) / max(self._rendered, 1)
+        state = f"{done}/{total}"
+        if not kept:
+            state += f"  {pace:.2f} s a frame, {pace * (total - done):.0f} s left"
+        self._bars.show("rendering", done, total, state)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a Mitsuba scene with its own integrator: one frame, or a camera path.
+
+    The suffix of --output says what is written: .exr (all channels, linear) or .png
+    (colour, sRGB) for one frame; .mp4, or a folder of frame_0000.exr ... (a name
+    without suffix), for a path.
+    """
+
+    scene: tyro.conf.Positional[str]
+    """Scene file (.xml), or bundled:FILE."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """.exr, .png, .mp4 or a folder."""
+    sensor: int = 0
+    """Which of the scene's sensors, from 0."""
+    spp: int | None = None
+    """Samples per pixel; the scene's by default."""
+    seed: int = 0
+    """Of the samples; frame i of a path has SEED + i."""
+    size: tuple[int, int] | None = None
+    """Width and height in pixels, in place of the film's."""
+    precision: Literal["half", "float"] = "half"
+    """Of colour and opacity in .exr; everything else is float."""
+    parameters: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")
+    ] = ()
+    """NAME=VALUE for a <default> of the scene; may be repeated."""
+    path: Path | None = None
+    """Camera path: transforms.json (OpenGL camera to world, images not needed)."""
+    route: str | None = None
+    """Camera path: drive this route of --routes at its speed."""
+    routes: str | None = None
+    """Routes file (.json), or bundled:FILE."""
+    mount: tuple[float, float, float] = (1.4, 0.5, 6.0)
+    """With --route: camera's height and place ahead (metres), pitch down (degrees)."""
+    fps: float = 25.0
+    """Frames per second of .mp4 and of --route."""
+    skip_existing: bool = False
+    """Continue: keep the frames that are there, after checking what they show."""
+
+    def run(self) -> int:
+        """Render and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.report.film import FrameRenderer
+        from mi_nerfattack.report.sequence import Shot
+        from mi_nerfattack.scenario import resolve
+
+        is_path = self.path is not None or self.route is not None
+        self._check_output(is_path)
+        variant.ensure()
+        poses = self._poses() if is_path else None
+        renderer = FrameRenderer(
+            resolve(self.scene, Path()),
+            self.sensor,
+            self.spp,
+            self._parameters(),
+            self.size,
+        )
+        if poses is None:
+            return self._run_frame(renderer)
+        shot = Shot(renderer, poses, self.seed, self.precision, self.skip_existing)
+        return self._run_path(shot)
+
+    def _check_output(self, is_path: bool) -> None:
+        from mi_nerfattack import files
+        from mi_nerfattack.errors import InputError
+
+        suffix = self.output.suffix.lower()
+        if self.path is not None and self.route is not None:
+            raise InputError("--path, --route: both given; give one camera path")
+        if (self.route is None) != (self.routes is None):
+            raise InputError("--route, --routes: one without the other; give both")
+        if is_path and suffix in (".exr", ".png"):
+            raise InputError(
+                f"{self.output}: one image cannot hold a camera path; give .mp4, or "
+                "the name of a folder"
+            )
+        if is_path:
+            return
+        if suffix not in (".exr", ".png"):
+            raise InputError(
+                f"{self.output}: one frame is written as .exr or .png; for .mp4 or a "
+                "folder of frames give --path or --route"
+            )
+        if self.skip_existing:
+            raise InputError("--skip-existing: there is one frame; leave it out")
+        files.check_writable(self.output)
+
+    def _parameters(self) -> dict[str, str]:
+        from mi_nerfattack.errors import InputError
+
+        result: dict[str, str] = {}
+        for item in self.parameters:
+            name, equals, value = item.partition("=")
+            if not name or not equals or name in result:
+                raise InputError(f"--set {item}: needs NAME=VALUE, each name once")
+            result[name] = value
+        return result
+
+    def _poses(self) -> np.ndarray:
+        from mi_nerfattack.render.camera import CameraMount
+        from mi_nerfattack.report.camera_path import read_path, route_path
+        from mi_nerfattack.scenario import resolve
+        from mi_nerfattack.vehicle.route import Route
+
+        if self.path is not None:
+            return read_path(self.path)
+        assert self.route is not None and self.routes is not None
+        route = Route.from_file(resolve(self.routes, Path()), self.route)
+        return route_path(route, CameraMount(*self.mount), self.fps)
+
+    def _run_frame(self, renderer: FrameRenderer) -> int:
+        from mi_nerfattack.report.film import write_frame
+
+        start = time.monotonic()
+        frame = renderer.render(seed=self.seed)
+        write_frame(self.output, frame, self.precision)
+        width, height = renderer.size_px
+        print(
+            f"Wrote {self.output}: {width} x {height} px, {frame.metadata['spp']} "
+            f"samples per pixel, {time.monotonic() - start:.1f} s"
+        )
+        if self.output.suffix.lower() == ".exr":
+            print(f"  channels {' '.join(frame.channels)}")
+        return 0
+
+    def _run_path(self, shot: Shot) -> int:
+        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.report.sequence import (
+            render_folder,
+            render_video,
+            working_folder,
+        )
+
+        is_video = self.output.suffix.lower() == ".mp4"
+        folder = working_folder(self.output) if is_video else self.output
+        with StageBars() as bars, _Pace(bars, folder) as pace:
+            if is_video:
+                size = render_video(shot, self.output, self.fps, pace.show)
+            else:
+                size = shot.renderer.size_px
+                render_folder(shot, folder, pace.show)
+            pace.finished = True
+        count = len(shot.camera_to_world)
+        print(f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px")
+        if size != shot.renderer.size_px:
+            width, height = shot.renderer.size_px
+            print(
+                f"  the frames have {width} x {height} px; the last column or row is "
+                "repeated, since H.264 (yuv420p) needs even sizes"
+            )
+        return 0
