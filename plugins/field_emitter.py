@@ -166,10 +166,14 @@ def refuse_nested(others: list[Any], plugin: str, also: str = "") -> None:
 
 
 def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
-    """Return the background of the first NGP among the volumes, black without one."""
+    """Return what lies behind the first NGP among the volumes; black without one.
+
+    The sky turns with the field.
+    """
     for volume in volumes:
         if volume.field.kind == "ngp_field":
-            return volume.field.background(direction)
+            _, heading = volume.posed.to_local(mi.Point3f(0), direction)
+            return volume.field.background(dr.normalize(heading))
     return mi.Color3f(0)
 
 
