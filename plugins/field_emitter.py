@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import field_volume as shared
+from mi_nerfattack.render import spectrum
 from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import STOP, Rays
@@ -58,7 +59,7 @@ class FieldEmitter(mi.Emitter):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        shared.refuse_spectral("field_emitter")
+        spectrum.prepare()
         self.stop = read_stop(props)
         self.composite = read_composite(props)
         self.volumes, others = read_nested(props, "field_emitter")
@@ -81,7 +82,7 @@ class FieldEmitter(mi.Emitter):
         total = self.composite.render(posed, rays, self.stop).total
         behind = background(self.volumes, direction)
         radiance = total.radiance + (1 - total.opacity) * behind
-        return shared.to_spectrum(radiance) & active
+        return spectrum.emission(radiance, si.wavelengths) & active
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
@@ -110,6 +111,7 @@ class FieldEmitter(mi.Emitter):
     ) -> mi.SurfaceInteraction3f:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n, si.t = ds.p, ds.n, ds.dist
+        si.wavelengths = it.wavelengths
         si.sh_frame = mi.Frame3f(ds.n)
         si.wi = si.to_local(-ds.d)
         return si

@@ -9,7 +9,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.field_emitter import (
     background,
     read_composite,
@@ -17,6 +16,7 @@ from mi_nerfattack.plugins.field_emitter import (
     read_stop,
     refuse_nested,
 )
+from mi_nerfattack.render import spectrum
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.march import March, Rays
 
@@ -33,9 +33,9 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
 
     AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
     ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of the field's
-    share of the image (``interleaved``) or of the field alone (``depth``). Depths are
-    infinite where opacity is 0; take a ``box`` filter and one sample where that
-    matters.
+    share of the image (``interleaved``) or of the field alone (``depth``). The depth of
+    a pixel is the mean of its samples weighted by their opacity, infinite where none
+    is above 0; ``mi.render`` returns it, the film alone holds depth times opacity.
 
     ===========  ==========  ====  =======  =========================================
     name         type        unit  default  meaning
@@ -65,12 +65,13 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
 
     Differentiable in primal, forward and backward mode with respect to the fields'
     parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces.
-    RGB and monochromatic variants.
+    Monochromatic variants show luminance; spectral ones the linear spectrum of
+    ``render.spectrum``; AOVs are RGB everywhere.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        shared.refuse_spectral("field_integrator")
+        spectrum.prepare()
         self.stop = read_stop(props)
         self.composite = read_composite(props)
         self.jitter = bool(props.get("jitter", False))
@@ -96,6 +97,40 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             return []
         layers = [f"{v.id()}.{c}" for v in self.volumes for c in "RGBAZ"]
         return ["opacity", "depth", *layers]
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: Any = 0,
+        seed: mi.UInt32 = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render the image with its AOVs."""
+        image = super().render(scene, sensor, seed, spp, develop, evaluate)
+        return self._with_depths(image)
+
+    def _with_depths(self, image: mi.TensorXf) -> mi.TensorXf:
+        """Divide the depth moments, which filters can average, by the opacities."""
+        height, width, count = image.shape
+        names = self.aov_names()
+        first = count - len(names)
+        pixel = count * dr.arange(mi.UInt32, height * width)
+        values = mi.Float(image.array)
+        ids = [volume.id() for volume in self.volumes]
+        pairs = [("opacity", "depth"), *((f"{i}.A", f"{i}.Z") for i in ids)]
+        for name, moment in pairs:
+            opacity = dr.gather(
+                mi.Float, image.array, pixel + first + names.index(name)
+            )
+            target = pixel + first + names.index(moment)
+            hit = opacity > 0
+            depth = dr.gather(mi.Float, image.array, target) / dr.select(
+                hit, opacity, 1
+            )
+            dr.scatter(values, dr.select(hit, depth, dr.inf), target)
+        return mi.TensorXf(values, image.shape)
 
     def render_backward(
         self,
@@ -164,29 +199,32 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             state_in = seen, self._behind(scene, sampler, ray, t_max, active)
         seen, behind = state_in
         if mode == dr.ADMode.Primal:
-            radiance = shared.to_spectrum(_over(seen.total, behind))
+            radiance = _over(seen.total, behind, ray.wavelengths)
             return radiance, active, self._aovs(seen), state_in
         if mode == dr.ADMode.Backward:
-            self._backward(rays, seen, behind, δL)
+            self._backward(rays, seen, behind, ray.wavelengths, δL)
             return δL, active, [], None
-        return self._forward(rays, seen, behind), active, [], None
+        tangent = self._forward(rays, seen, behind, ray.wavelengths)
+        return tangent, active, [], None
 
-    def _backward(self, rays: Rays, seen: Seen, behind: Any, δL: Any) -> None:
+    def _backward(
+        self, rays: Rays, seen: Seen, behind: Any, wavelengths: Any, δL: Any
+    ) -> None:
         with dr.resume_grad():
             total = seen.total.copy()
             dr.enable_grad(total)
-            radiance = shared.to_spectrum(_over(total, behind))
+            radiance = _over(total, behind, wavelengths)
             dr.backward_from(dr.sum(radiance * δL))
             cotangent = dr.grad(total)
         self.composite.backward(self.posed, rays, seen, cotangent, self.stop)
 
-    def _forward(self, rays: Rays, seen: Seen, behind: Any) -> Any:
+    def _forward(self, rays: Rays, seen: Seen, behind: Any, wavelengths: Any) -> Any:
         tangent = self.composite.forward(self.posed, rays, seen, self.stop)
         with dr.resume_grad():
             total = seen.total.copy()
             dr.enable_grad(total)
             dr.set_grad(total, tangent)
-            radiance = shared.to_spectrum(_over(total, behind))
+            radiance = _over(total, behind, wavelengths)
             return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
 
     def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
@@ -202,20 +240,20 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         ray: mi.Ray3f,
         t_max: mi.Float,
         active: mi.Bool,
-    ) -> mi.Color3f:
+    ) -> Any:
+        """Return the spectrum of what lies behind the fields."""
         if self.behind is None:
-            return background(self.volumes, ray.d) & (t_max == dr.inf)
-        spectrum = self.behind.sample(
-            scene, sampler, mi.RayDifferential3f(ray), active=active
-        )[0]
-        return mi.Color3f(spectrum if not mi.is_monochromatic else spectrum.x)
+            sky = background(self.volumes, ray.d) & (t_max == dr.inf)
+            return spectrum.emission(sky, ray.wavelengths)
+        ray = mi.RayDifferential3f(ray)
+        return self.behind.sample(scene, sampler, ray, active=active)[0]
 
     def _aovs(self, seen: Seen) -> list[mi.Float]:
         if not self._has_aovs:
             return []
-        result = [seen.total.opacity, seen.total.depth]
+        result = [seen.total.opacity, seen.total.moment]
         for layer in seen.layers:
-            result += [*layer.radiance, layer.opacity, layer.depth]
+            result += [*layer.radiance, layer.opacity, layer.moment]
         return result
 
     def to_string(self) -> str:
@@ -229,8 +267,9 @@ def _film(scene: mi.Scene, sensor: Any) -> mi.Film:
     return (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
 
 
-def _over(total: March, behind: mi.Color3f) -> mi.Color3f:
-    return total.radiance + (1 - total.opacity) * behind
+def _over(total: March, behind: Any, wavelengths: Any) -> Any:
+    radiance = spectrum.emission(total.radiance, wavelengths)
+    return radiance + (1 - total.opacity) * behind
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

@@ -63,22 +63,6 @@ def read_quantity(props: mi.Properties) -> str:
     return quantity
 
 
-def refuse_spectral(plugin: str) -> None:
-    """Raise InputError in spectral variants, which have no RGB radiance."""
-    if mi.is_spectral:
-        raise InputError(
-            f"{plugin}: variant {mi.variant()} is spectral; fields hold RGB radiance, "
-            "use llvm_ad_rgb or cuda_ad_rgb"
-        )
-
-
-def to_spectrum(colour: mi.Color3f) -> Any:
-    """Turn linear RGB into the variant's spectrum (luminance where it is mono)."""
-    if mi.is_monochromatic:
-        return mi.Color1f(mi.luminance(colour))
-    return mi.Spectrum(colour)
-
-
 class AbstractFieldVolume(mi.Volume):
     """Field of one kind as a Mitsuba volume.
 

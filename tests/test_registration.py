@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
+
+# isort: split
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 
 from mi_nerfattack import llvm
@@ -53,7 +57,7 @@ use()
     "there and back": """
 import mi_nerfattack
 import mitsuba as mi
-for name in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+for name in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_rgb"):
     mi.set_variant(name)
     use()
 """,
@@ -65,6 +69,13 @@ for name in ("scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
     if name != "scalar_rgb":
         use()
 """,
+    "through polarised variants": """
+import mi_nerfattack
+import mitsuba as mi
+for name in ("scalar_spectral_polarized", "llvm_ad_mono_polarized", "llvm_ad_rgb"):
+    mi.set_variant(name)
+use()
+""",
     "imported again": """
 import mi_nerfattack
 import mitsuba as mi
@@ -75,9 +86,23 @@ use()
 """,
 }
 RGB, MONO = "llvm_ad_rgb 10", "llvm_ad_mono 8"
+SPECTRAL = "llvm_ad_spectral 10"
 PRINTED = {
-    "there and back": [RGB, MONO, RGB],
+    "there and back": [RGB, MONO, SPECTRAL, RGB],
     "through a variant without derivatives": [RGB, RGB],
+}
+
+REFUSED = [
+    name
+    for name in mi.variants()
+    if "_ad_" not in name or name.endswith("_polarized")
+    if not name.startswith("cuda")
+]
+PLUGINS = {
+    "volume": ("grid_field", "ngp_field"),
+    "emitter": ("field_emitter",),
+    "integrator": ("field_integrator",),
+    "sensor": ("opencv_camera",),
 }
 
 
@@ -107,3 +132,19 @@ def test_plugins_are_there_in_any_order(field: Path, order: str) -> None:
     printed = re.findall(r"llvm_ad_\w+ \d+$", done.stdout, re.MULTILINE)
     assert printed == PRINTED.get(order, [RGB])
     assert "not registered" not in done.stderr
+
+
+@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.usefixtures("no_variant_left")
+def test_other_variants_say_which_to_use(name: str) -> None:
+    mi.set_variant(name)
+    for kind, plugins in PLUGINS.items():
+        if name == "scalar_rgb" and kind == "volume":
+            continue  # cannot be registered there
+        for plugin in plugins:
+            message = f"{plugin}: variant {name} .* llvm_ad_rgb, .*llvm_ad_spectral"
+            text = f'<{kind} version="3.0.0" type="{plugin}"/>'
+            with pytest.raises(RuntimeError, match=message):
+                mi.load_string(text, parallel=False)
+            with pytest.raises(RuntimeError, match=message):
+                mi.load_dict({"type": plugin}, parallel=False)
