@@ -127,7 +127,7 @@ class FrameRenderer:
         if not 0 <= seed < _MAX_SEED:
             raise InputError(f"seed: {seed}; must be in [0, 2^32)")
         pose = self._own_pose() if camera_to_world is None else camera_to_world
-        text = " ".join(f"{value:.9g}" for value in np.ravel(pose))
+        text = " ".join(f"{value + 0:.9g}" for value in np.ravel(pose))
         return {**self._fixed_metadata, "camera_to_world": text, "seed": str(seed)}
 
     def render(self, camera_to_world: np.ndarray | None = None, seed: int = 0) -> Frame:
