@@ -10,8 +10,20 @@ the part of ``[t(i), t(i + 1)]`` inside the bounding box, and takes density and
 radiance as constant on it. Lattice intervals whose sample lies in an empty cell of
 the occupancy are skipped. Beyond ``2**23`` steps from its origin a ray sees nothing.
 
-Error bounds. Termination below transmittance ``stop`` changes opacity by at most
-``stop`` and each colour by at most ``stop`` times the largest radiance behind.
+Error bounds, for a ray that runs l metres through the box and leaves it at t_far:
+
+- Termination below transmittance ``stop`` takes at most ``stop`` from opacity, ``stop``
+  times the largest radiance behind from a colour, ``stop * t_far`` from the moment,
+  and adds nothing.
+- Steps of at most h with ``jitter`` 0.5 are the midpoint rule: half the step, a quarter
+  of the error. Along the ray, let S_i and L_i bound the i-th derivative of density and
+  of a colour. Optical depth is off by at most ``e = h^2 (l S_2 / 24 + S_1 / 4)``, and
+  so is opacity; a colour by at most
+  ``e (L_0 + l L_1) + h^2 (L_1 S_0 (1 + S_0 h) / 12 + L_2 / 8)``; the moment likewise
+  with L_0 = t_far, L_1 = 1, L_2 = 0. Where density has kinks, as between the vertices
+  of a grid, opacity is off by at most ``h^2 V / 8``, V the total variation of the
+  density's slope. Other jitters are of first order.
+- Opacity and colour of homogeneous media are exact but for rounding.
 """
 
 from __future__ import annotations
