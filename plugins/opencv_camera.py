@@ -66,7 +66,7 @@ class OpencvCamera(mi.Sensor):
 
     .. code-block:: python
 
-        {"type": "opencv_camera", "fx": 250.0, "fy": 252.0, "k1": -0.1}
+        {"type": "opencv_camera", "fx": 600.0, "fy": 605.0, "k1": -0.1}
 
     Differentiable with respect to the intrinsics and ``to_world``, as far as the
     integrator is. Limits: no aperture; a distortion that cannot be inverted in the

@@ -408,6 +408,6 @@ def test_xml(variant: str) -> None:
     )
     text = str(scene.sensors()[0])
     assert "fx=250, fy=252, cx=160, cy=120, k1=-0.1" in text
-    camera = {"type": "opencv_camera", "fx": 250.0, "fy": 252.0, "k1": -0.1}
+    camera = {"type": "opencv_camera", "fx": 600.0, "fy": 605.0, "k1": -0.1}
     text = str(mi.load_dict(camera))
-    assert "fx=250, fy=252, cx=384, cy=288, k1=-0.1" in text
+    assert "fx=600, fy=605, cx=384, cy=288, k1=-0.1" in text
