@@ -91,9 +91,17 @@ def test_first_ray_is_top_left():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("principal", [(10.0, 6.0), (7.5, 8.25)])
-def test_rays_agree_with_mitsubas_sensor(principal):
-    camera = cam.Camera(20, 12, 11.0, 11.0, *principal)
+@pytest.mark.parametrize(
+    "lens",
+    [
+        (11.0, 11.0, 10.0, 6.0),
+        (11.0, 11.0, 7.5, 8.25),
+        (11.0, 12.5, 7.5, 8.25),
+        (20.0, 20.0, 10.0, 6.0, -0.2, 0.05, 3e-3, -2e-3),
+    ],
+)
+def test_rays_agree_with_mitsubas_sensor(lens):
+    camera = cam.Camera(20, 12, *lens)
     poses = random_poses(3)
     origins, directions = rays_of(camera, poses)
     row, column = np.mgrid[0:12, 0:20]
