@@ -10,11 +10,10 @@ import mitsuba as mi
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.render import spectrum
-from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
-from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.attached import attached
+from mi_nerfattack.render.composite import AbstractComposite
+from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.march import STOP, Rays
-
-COMPOSITES = {"interleaved": InterleavedComposite, "depth": DepthComposite}
 
 
 class FieldEmitter(mi.Emitter):
@@ -51,10 +50,24 @@ class FieldEmitter(mi.Emitter):
 
         {"type": "field_emitter", "object": {"type": "grid_field", "filename": "f"}}
 
-    Limits: the shape should enclose the fields, whose own boxes end the march, and
-    carry a black BSDF: it is opaque, so what lies behind it is not seen (use
-    ``field_integrator`` for that). Not differentiable: ``field_integrator`` is. RGB
-    and monochromatic variants.
+    Next-event estimation and multiple importance sampling are those of the stock
+    ``area`` emitter: points are sampled on the shape by area, so a small bright field
+    in a large shape lights surfaces without bias, but with noise.
+
+    Differentiable in forward and backward mode with respect to the fields' parameters
+    under stock integrators (``path``, ``direct``, ``prb``; Mitsuba 3.9's ``prb`` fails
+    in forward mode with any emitter in spectral variants), not with respect to rays
+    and the shape.
+
+    Excluded, so fields are missing there or too bright:
+
+    - The shape should enclose the fields, whose own boxes end the march, and carry a
+      black BSDF: it is opaque, so what lies behind it is not seen (use
+      ``field_integrator`` for that).
+    - Seen from inside, fields lie between the shape and where the ray started: the
+      camera or the last surface, be it a ``null`` one. Other surfaces inside the
+      shape are seen without the fields in front of them.
+    - Light that starts on the shape (``ptracer``, ``sample_ray``) is not sampled.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -79,9 +92,8 @@ class FieldEmitter(mi.Emitter):
         t_max = dr.select(inside, si.t, dr.inf)
         rays = Rays(origin, direction, t_max, mi.Float(0.5), mi.Bool(active))
         posed = [volume.posed for volume in self.volumes]
-        total = self.composite.render(posed, rays, self.stop).total
-        behind = background(self.volumes, direction)
-        radiance = total.radiance + (1 - total.opacity) * behind
+        radiance, opacity = attached(self.composite, posed, rays, self.stop)
+        radiance += (1 - opacity) * background(self.volumes, direction)
         return spectrum.emission(radiance, si.wavelengths) & active
 
     def sample_direction(

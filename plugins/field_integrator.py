@@ -196,10 +196,10 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         if state_in is None:  # primal mode, or forward mode, which comes without
             seen = self.composite.render(self.posed, rays, self.stop)
-            state_in = seen, self._behind(scene, sampler, ray, t_max, active)
+            state_in = seen, self._behind(scene, sampler, ray, active)
         seen, behind = state_in
         if mode == dr.ADMode.Primal:
-            radiance = _over(seen.total, behind, ray.wavelengths)
+            radiance = self._over(seen.total, rays, behind, ray.wavelengths)
             return radiance, active, self._aovs(seen), state_in
         if mode == dr.ADMode.Backward:
             self._backward(rays, seen, behind, ray.wavelengths, δL)
@@ -213,7 +213,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         with dr.resume_grad():
             total = seen.total.copy()
             dr.enable_grad(total)
-            radiance = _over(total, behind, wavelengths)
+            radiance = self._over(total, rays, behind, wavelengths)
             dr.backward_from(dr.sum(radiance * δL))
             cotangent = dr.grad(total)
         self.composite.backward(self.posed, rays, seen, cotangent, self.stop)
@@ -224,7 +224,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             total = seen.total.copy()
             dr.enable_grad(total)
             dr.set_grad(total, tangent)
-            radiance = _over(total, behind, wavelengths)
+            radiance = self._over(total, rays, behind, wavelengths)
             return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
 
     def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
@@ -234,19 +234,21 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         return dr.select(hit.is_valid(), hit.t, dr.inf)
 
     def _behind(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        t_max: mi.Float,
-        active: mi.Bool,
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
     ) -> Any:
-        """Return the spectrum of what lies behind the fields."""
+        """Return the spectrum that the nested integrator sees; None without one."""
         if self.behind is None:
-            sky = background(self.volumes, ray.d) & (t_max == dr.inf)
-            return spectrum.emission(sky, ray.wavelengths)
+            return None
         ray = mi.RayDifferential3f(ray)
         return self.behind.sample(scene, sampler, ray, active=active)[0]
+
+    def _over(self, total: March, rays: Rays, behind: Any, wavelengths: Any) -> Any:
+        """Lay the fields over what is behind, as a spectrum."""
+        passed = 1 - total.opacity
+        if behind is not None:
+            return spectrum.emission(total.radiance, wavelengths) + passed * behind
+        sky = background(self.volumes, rays.direction) & (rays.t_max == dr.inf)
+        return spectrum.emission(total.radiance + passed * sky, wavelengths)
 
     def _aovs(self, seen: Seen) -> list[mi.Float]:
         if not self._has_aovs:
@@ -265,11 +267,6 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
 
 def _film(scene: mi.Scene, sensor: Any) -> mi.Film:
     return (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
-
-
-def _over(total: March, behind: Any, wavelengths: Any) -> Any:
-    radiance = spectrum.emission(total.radiance, wavelengths)
-    return radiance + (1 - total.opacity) * behind
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

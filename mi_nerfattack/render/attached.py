@@ -1,0 +1,74 @@
+"""A composite as one differentiable operation, also inside recorded loops and calls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.render.composite import AbstractComposite
+from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.posed import PosedField
+
+
+def attached(
+    composite: AbstractComposite, posed: list[PosedField], rays: Rays, stop: float
+) -> tuple[mi.Color3f, mi.Float]:
+    """March rays through fields; differentiable by the fields' parameters.
+
+    Works where the caller is being recorded, as an emitter's ``eval`` is in the loops
+    of an integrator: the derivative replays all rays, whether they meet a field or
+    not. Not differentiable by the rays.
+
+    Args:
+        composite: rule by which the fields become one colour.
+        posed: the fields, at least one.
+        rays: n rays.
+        stop: transmittance below which a ray ends.
+
+    Returns:
+        premultiplied radiance (3, n) and opacity (n,).
+    """
+    rays = dr.detach(rays)
+    sources = [
+        array
+        for item in posed
+        for array in item.field.arrays()
+        if dr.grad_enabled(array)
+    ]
+    if not sources:
+        total = composite.render(posed, rays, stop).total
+        return total.radiance, total.opacity
+    radiance, opacity = dr.custom(_Render, composite, posed, rays, stop, sources)
+    # A recorded call asks which attached arrays were read, and knows of gathers only.
+    never = opacity < 0
+    for array in sources:
+        opacity += mi.Float(dr.gather(type(array), array, mi.UInt32(0), never))
+    return radiance, opacity
+
+
+class _Render(dr.CustomOp):
+    """Derivatives go straight to the parameters, which Dr.Jit only has to know of."""
+
+    def eval(
+        self,
+        composite: AbstractComposite,
+        posed: list[PosedField],
+        rays: Rays,
+        stop: float,
+        sources: list[Any],
+    ) -> tuple[mi.Color3f, mi.Float]:
+        del sources
+        self.composite, self.fixed, self.stop = composite, (posed, rays), stop
+        self.seen = composite.render(posed, rays, stop)
+        return self.seen.total.radiance, self.seen.total.opacity
+
+    def forward(self) -> None:
+        tangent = self.composite.forward(*self.fixed, self.seen, self.stop)
+        self.set_grad_out((tangent.radiance, tangent.opacity))
+
+    def backward(self) -> None:
+        radiance, opacity = self.grad_out()
+        cotangent = March(radiance, opacity, mi.Float(0))
+        self.composite.backward_rays(*self.fixed, self.seen, cotangent, self.stop)
