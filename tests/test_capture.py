@@ -208,6 +208,18 @@ class TestViews:
         slope = np.array([1, (20 - 15.5) / 20, (10 - 10.5) / 20])
         assert depth[0, 10, 15] == pytest.approx(4 * np.linalg.norm(slope), rel=1e-5)
 
+    def test_lens_bends_colour_and_depth_alike(self):
+        lens = Camera(40, 20, 20.0, 23.0, 18.0, 11.0, k1=-0.06, p1=0.01)
+        straight = Camera(40, 20, 20.0, 23.0, 18.0, 11.0)
+        pose = look_at([0, 0.2, 1.0], [1, 0.2, 1.1])[None]
+        scene = wall_scene()
+        _, alpha, depth = views.render_views(scene, lens, pose, 16, 0)
+        sure = (alpha == 0) | (alpha == 1)
+        assert 20 < alpha.sum() < 0.5 * alpha.size and sure.mean() > 0.8
+        np.testing.assert_array_equal(np.isfinite(depth)[sure], alpha[sure] == 1)
+        other = views.render_views(scene, straight, pose, 16, 0)[1]
+        assert np.abs(other - alpha).sum() > 5
+
     def test_no_kernel_after_the_first_view(self):
         camera = from_fov(13, 7, 70.0)
         renderer = views.ViewRenderer(wall_scene(), camera)
