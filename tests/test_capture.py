@@ -211,7 +211,7 @@ class TestViews:
     def test_lens_bends_colour_and_depth_alike(self):
         lens = Camera(40, 20, 20.0, 23.0, 18.0, 11.0, k1=-0.06, p1=0.01)
         straight = Camera(40, 20, 20.0, 23.0, 18.0, 11.0)
-        pose = look_at([0, 0.2, 1.0], [1, 0.2, 1.1])[None]
+        pose = look_at([2.2, 0.2, 1.0], [4, 0.2, 1.1])[None]
         scene = wall_scene()
         _, alpha, depth = views.render_views(scene, lens, pose, 16, 0)
         sure = (alpha == 0) | (alpha == 1)
