@@ -73,7 +73,7 @@ class FrameRenderer:
     differentiable.
 
     Cost: one render a frame; samples beyond 2^24 rays are split into passes whose
-    mean is taken, so that memory does not grow with `spp`.
+    mean is taken, so that the device's memory does not grow with `spp`.
 
     Args:
         path: scene file.
@@ -145,12 +145,10 @@ class FrameRenderer:
         metadata = self.metadata(camera_to_world, seed)
         if camera_to_world is not None:
             self._move(camera_to_world)
-        total: Any = 0.0
-        for pass_seed in _pass_seeds(seed, self._passes):
-            total = total + self._render_pass(pass_seed)
-        pixels = (total / self._passes).astype(np.float32)
+        passes = [self._render_pass(s) for s in _pass_seeds(seed, self._passes)]
         if self._names is None:
-            self._names = self._channel_names(pixels.shape[2])
+            self._names = self._channel_names(passes[0].shape[2])
+        pixels = _mean(passes, self._names) if len(passes) > 1 else passes[0]
         planes = np.moveaxis(pixels, 2, 0)
         return Frame(dict(zip(self._names, planes, strict=True)), metadata)
 
@@ -159,7 +157,7 @@ class FrameRenderer:
             image = mi.render(
                 self.scene, sensor=self.sensor, spp=self._spp, seed=mi.UInt32(seed)
             )
-            return np.array(image, np.float64)
+            return np.array(image)
         except RuntimeError as error:
             cause: BaseException | None = error
             while cause is not None:  # Dr.Jit wraps what is raised inside loops
@@ -194,25 +192,43 @@ class FrameRenderer:
         return mitsuba_to_opencv(matrix.reshape(4, 4))
 
     def _channel_names(self, count: int) -> list[str]:
-        """Name the channels of the tensor that the film develops."""
+        """Name the channels of the tensor that `mi.render` gives."""
         aovs = list(self.scene.integrator().aov_names())
         bitmap: Any = self.sensor.film().bitmap()
-        base = [field.name for field in bitmap.struct_()][: count - len(aovs)]
+        stored = [field.name for field in bitmap.struct_()]
+        base = stored[: len(stored) - len(aovs)]
         if base[:3] == ["X", "Y", "Z"]:
             raise InputError(
                 f"{self.path}: the film's pixel_format is xyz; take rgb, rgba, "
                 "luminance or luminance_alpha"
             )
         if set(aovs) >= set(_TOTALS):
-            aovs = [
-                _TOTALS[name] if name in _TOTALS and _TOTALS[name] not in base else name
-                for name in aovs
-            ]
+            usual = {n: t for n, t in _TOTALS.items() if t not in base}
+            aovs = [usual.get(name, name) for name in aovs]
         names = base + aovs
+        if len(names) != count:
+            names = _names_of_aov_integrator(base, aovs)
         twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError(f"{self.path}: channels {twice} twice; rename AOVs or ids")
+        if len(names) != count or twice:
+            raise InputError(
+                f"{self.path}: {count} channels, names {names}; every AOV and every "
+                "nested integrator needs a name of its own"
+            )
         return names
+
+
+def _names_of_aov_integrator(base: list[str], aovs: list[str]) -> list[str]:
+    """Name the tensor of the stock `aov`: an image a nested integrator, then AOVs.
+
+    The film, and the integrator's own list, have the first image twice and an alpha
+    for each, whatever the film's format.
+    """
+    names: list[str] = []
+    while [name.rpartition(".")[2] for name in aovs[:4]] == list("RGBA"):
+        prefix = aovs[0][:-1] if names else ""
+        names += [prefix + name for name in base]
+        aovs = aovs[4:]
+    return names + aovs
 
 
 def write_frame(path: str | Path, frame: Frame, precision: Precision) -> None:
@@ -279,6 +295,23 @@ def _describe_camera(sensor: Any) -> str:
     if list(film.crop_size()) != list(film.size()):
         values["crop"] = [*film.crop_offset(), *film.crop_size()]
     return json.dumps(values)
+
+
+def _mean(passes: list[np.ndarray], names: list[str]) -> np.ndarray:
+    """Average images; depths are weighted by the opacities beside them."""
+    stack = np.stack(passes).astype(np.float64)
+    result = stack.mean(axis=0)
+    for i, name in enumerate(names):
+        opacity = name[:-1] + "A"
+        if name.rpartition(".")[2] != "Z" or opacity not in names:
+            continue
+        weight = stack[..., names.index(opacity)]
+        hit = weight > 0
+        moment = np.where(hit, stack[..., i], 0) * weight
+        total = np.where(hit, weight, 0).sum(axis=0)
+        depth = moment.sum(axis=0) / np.where(total > 0, total, 1)
+        result[..., i] = np.where(total > 0, depth, np.inf)
+    return result.astype(np.float32)
 
 
 def _pass_seeds(seed: int, passes: int) -> list[int]:
