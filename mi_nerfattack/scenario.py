@@ -37,6 +37,7 @@ class SceneSection(_Section):
     deployment: str  # Mitsuba scene XML: the deployment environment
     routes: str  # JSON of routes
     route: str  # name of the route that is driven
+    composite: Literal["depth", "interleaved"] = "depth"  # of fields, in the surrogate
 
 
 class ObjectSection(_Section):
@@ -95,6 +96,7 @@ class AttackSection(_Section):
     learning_rate: Positive = 0.3
     poses: Count = 1  # initial poses of an iteration; the first is nominal
     attached: bool = False
+    keep_frames: bool = False
     jitter: bool = False
     checkpoint_every: Count = 10
 

@@ -201,3 +201,58 @@ def test_horizon_below_one_and_bad_states_are_refused(toy):
         simulate(loop, to_state(INITIAL), 0)
     with pytest.raises(ValueError, match="states"):
         to_state(np.array([[0.0, np.nan, 0.0]]))
+
+
+def test_kept_frames_give_the_same_gradient(toy, single_thread):
+    from mi_nerfattack.rollout.adjoint import replay_gradient
+    from mi_nerfattack.rollout.loop import simulate, to_state
+
+    loop, _ = toy.make_loop()
+    start = to_state(INITIAL)
+    kept = simulate(loop, start, 3, keep=True)
+    assert len(kept.observations) == 3
+    before = loop.sensor.renders
+    found = replay_gradient(loop, kept, toy.square_error)
+    assert loop.sensor.renders == before  # nothing was rendered again
+    again = replay_gradient(loop, simulate(loop, start, 3), toy.square_error)
+    expected = again.textures[0].numpy()
+    assert np.abs(expected).max() > 0
+    np.testing.assert_array_equal(found.textures[0].numpy(), expected)
+
+
+def test_attached_gradient_through_the_interleaved_composite(toy):
+    from dataclasses import replace
+
+    from mi_nerfattack.render.interleaved import InterleavedComposite
+    from mi_nerfattack.rollout.sensor import FieldSensor
+
+    loop, item = toy.make_loop()
+    old = loop.sensor
+    sensor = FieldSensor(
+        old.scene, old.objects, old.camera, old.mount, composite=InterleavedComposite()
+    )
+    loop = replace(loop, sensor=sensor)
+    found = gradient(toy, loop, INITIAL, 3, True).textures[0].numpy().copy()
+    base = toy.texture_of(item)
+    direction = _unit(found).astype(np.float32)
+    values = []
+    for sign in (1, -1):
+        item.set_parameter("texture", base + np.float32(sign * 0.3) * direction)
+        values.append(objective(toy, loop, INITIAL, 3))
+    expected = float((found.astype(float) * direction).sum())
+    assert (values[0] - values[1]) / 0.6 == pytest.approx(expected, rel=1e-2)
+
+
+def test_sensors_die_safely_while_others_record(toy):
+    """Dr.Jit aborts when a recording is destroyed while another is made."""
+    import gc
+
+    before = gc.get_threshold()
+    gc.set_threshold(1)
+    try:
+        for _ in range(4):
+            loop, _ = toy.make_loop()
+            loop.sensor.cycle = loop.sensor  # only the collector can free it
+            gradient(toy, loop, INITIAL, 1, False)
+    finally:
+        gc.set_threshold(*before)

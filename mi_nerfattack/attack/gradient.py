@@ -52,6 +52,8 @@ class GradientAttack:
         horizon: steps of the drive.
         learning_rate: Adam's, in units of the raw colours.
         attached: keep the derivative of the observation by the state.
+        keep_frames: keep all frames of a drive, so that they are rendered once, not
+            twice; see :func:`simulate` for the memory.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class GradientAttack:
         horizon: int,
         learning_rate: float,
         attached: bool = False,
+        keep_frames: bool = False,
     ) -> None:
         self.loop = loop
         self.fields = fields
@@ -72,6 +75,7 @@ class GradientAttack:
         self.initial = initial
         self.horizon = horizon
         self.attached = attached
+        self.keep_frames = keep_frames
         self.history: list[IterationRecord] = []
         self.best_mean_m = -1.0
         self.best = [field.texture.numpy().copy() for field in fields]
@@ -95,7 +99,9 @@ class GradientAttack:
             InputError: the gradient is not finite; nothing is updated.
         """
         self._install()
-        drive = simulate(self.loop, self.initial, self.horizon, on_step)
+        drive = simulate(
+            self.loop, self.initial, self.horizon, on_step, self.keep_frames
+        )
         record = self._record(drive)
         gradient = replay_gradient(self.loop, drive, self.cost, self.attached, on_step)
         for i, value in enumerate(gradient.textures):

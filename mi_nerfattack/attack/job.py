@@ -199,6 +199,7 @@ class Job:
             self.scenario.drive.horizon,
             section.learning_rate,
             section.attached,
+            section.keep_frames,
         )
         path = self.output / CHECKPOINT
         if resume:

@@ -13,6 +13,7 @@ import numpy as np
 from mi_nerfattack.deploy.mitsuba import PathTracedSensor
 from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
+from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.posed import Pose, PosedField
 from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -95,7 +96,14 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
         scenario,
         route,
         fields,
-        FieldSensor(scene, posed, camera, mount, jitter),
+        FieldSensor(
+            scene,
+            posed,
+            camera,
+            mount,
+            jitter,
+            composite=COMPOSITES[scenario.scene.composite](),
+        ),
         PathTracedSensor(
             xml, posed, camera, mount, scenario.deployment.spp, scenario.seed
         ),

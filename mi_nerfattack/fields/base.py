@@ -72,6 +72,10 @@ class AbstractField(ABC):
     def density_bound(self) -> float:
         """Return an upper bound of the density, 1/metre, for delta tracking."""
 
+    def arrays(self) -> list[Any]:
+        """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""
+        return [*self.parameters().values(), self.occupancy.distance]
+
     @property
     def has_gradients(self) -> bool:
         """Whether derivatives with respect to a parameter are asked for."""

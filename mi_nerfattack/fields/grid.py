@@ -188,6 +188,10 @@ class GridField(AbstractField):
             total += values
         return self.density_scale * float(np.exp(min(total.max(), 15.0)))
 
+    def arrays(self) -> list[Any]:
+        """Return `packed` and the occupancy."""
+        return [self.packed, self.occupancy.distance]
+
     @property
     def has_gradients(self) -> bool:
         """Whether derivatives with respect to `packed` are asked for."""

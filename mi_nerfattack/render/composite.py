@@ -26,6 +26,23 @@ class Seen:
     layers: list[March] = field(default_factory=list)
 
 
+@dataclass
+class Task:
+    """A part of a backward pass.
+
+    Attributes:
+        rays: m of the rays.
+        primal: what they gave.
+        cotangent: derivative of the objective by `primal`.
+        fields: indices of the fields to march.
+    """
+
+    rays: Rays = field(default_factory=Rays)
+    primal: March = field(default_factory=March)
+    cotangent: March = field(default_factory=March)
+    fields: tuple[int, ...] = ()
+
+
 class AbstractComposite(ABC):
     """Rule by which several fields along a ray become one colour.
 
@@ -49,7 +66,6 @@ class AbstractComposite(ABC):
     ) -> March:
         """Return the tangent of the total, from those of the fields' parameters."""
 
-    @abstractmethod
     def backward(
         self,
         posed: list[PosedField],
@@ -60,8 +76,6 @@ class AbstractComposite(ABC):
     ) -> None:
         """Accumulate gradients of the parameters of the fields that ask for them.
 
-        Only rays that meet such a field are marched again.
-
         Args:
             posed: as given to :meth:`render`.
             rays: likewise.
@@ -69,6 +83,22 @@ class AbstractComposite(ABC):
             cotangent: derivative of the objective by the total, per ray.
             stop: as given to :meth:`render`.
         """
+        for task in self.tasks(posed, rays, seen, cotangent):
+            self.accumulate([posed[k] for k in task.fields], task, stop)
+
+    @abstractmethod
+    def tasks(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+    ) -> list[Task]:
+        """Say what :meth:`backward` has to march again.
+
+        These are the rays that meet a field which asks for gradients, no others. How
+        many there are is known after this, so that :meth:`accumulate` can be frozen.
+        """
+
+    @abstractmethod
+    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+        """Do one task of :meth:`backward`; `posed` are the fields that it names."""
 
     @abstractmethod
     def backward_rays(
@@ -115,23 +145,25 @@ class DepthComposite(AbstractComposite):
             total = depth_composite(leaves)
             return dr.forward_to(total, flags=dr.ADFlag.ClearEdges)
 
-    def backward(
-        self,
-        posed: list[PosedField],
-        rays: Rays,
-        seen: Seen,
-        cotangent: March,
-        stop: float,
-    ) -> None:
-        """See :meth:`AbstractComposite.backward`."""
+    def tasks(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+    ) -> list[Task]:
+        """See :meth:`AbstractComposite.tasks`; one for each field."""
         parts = self._cotangents(seen, cotangent)
-        for item, layer, part in zip(posed, seen.layers, parts, strict=True):
-            if not item.field.has_gradients:
-                continue
-            index = dr.compress(layer.opacity > 0)
-            if dr.width(index):
-                some, layer, part = (pick(x, index) for x in (rays, layer, part))
-                march_derivative(dr.ADMode.Backward, item, *some, layer, part, stop)
+        dr.eval(parts)
+        return [
+            task
+            for k, item in enumerate(posed)
+            if item.field.has_gradients
+            for task in select(
+                seen.layers[k].opacity > 0, rays, seen.layers[k], parts[k], (k,)
+            )
+        ]
+
+    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+        """See :meth:`AbstractComposite.accumulate`."""
+        mode = dr.ADMode.Backward
+        march_derivative(mode, posed[0], *task.rays, task.primal, task.cotangent, stop)
 
     def backward_rays(
         self,
@@ -163,19 +195,26 @@ class DepthComposite(AbstractComposite):
                 + total.opacity * cotangent.opacity
                 + total.moment * cotangent.moment
             )
-            parts = [dr.grad(leaf) for leaf in leaves]
-        dr.eval(parts)
-        return parts
+            return [dr.grad(leaf) for leaf in leaves]
 
 
-def pick(value: Any, index: mi.UInt32) -> Any:
-    """Gather some rays of a :class:`Rays` or :class:`March`; one for all stays so."""
-    chosen = {}
-    for item in fields(value):
-        array = getattr(value, item.name)
-        one = dr.width(array) == 1
-        chosen[item.name] = array if one else dr.gather(type(array), array, index)
-    return type(value)(**chosen)
+def select(
+    wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
+) -> list[Task]:
+    """Return the task of marching the wanted rays again; none without such rays."""
+    index = dr.compress(wanted)
+    if not dr.width(index):
+        return []
+
+    def pick(value: Any) -> Any:
+        chosen = {}
+        for item in fields(value):
+            array = getattr(value, item.name)
+            one = dr.width(array) == 1  # for all rays
+            chosen[item.name] = array if one else dr.gather(type(array), array, index)
+        return type(value)(**chosen)
+
+    return [Task(pick(rays), pick(primal), pick(cotangent), which)]
 
 
 def depth_composite(layers: list[March]) -> March:

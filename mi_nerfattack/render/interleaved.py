@@ -15,8 +15,20 @@ from functools import reduce
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.composite import AbstractComposite, Seen, pick
-from mi_nerfattack.render.march import March, Rays, absorption, seek
+from mi_nerfattack.render.composite import (
+    AbstractComposite,
+    DepthComposite,
+    Seen,
+    Task,
+    select,
+)
+from mi_nerfattack.render.march import (
+    March,
+    Rays,
+    absorption,
+    private_gradients,
+    seek,
+)
 from mi_nerfattack.render.posed import PosedField
 
 
@@ -45,28 +57,25 @@ class InterleavedComposite(AbstractComposite):
                 dr.ADMode.Forward, posed, rays, seen.total, March(), stop, False
             )[0]
 
-    def backward(
-        self,
-        posed: list[PosedField],
-        rays: Rays,
-        seen: Seen,
-        cotangent: March,
-        stop: float,
-    ) -> None:
-        """See :meth:`AbstractComposite.backward`."""
+    def tasks(
+        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+    ) -> list[Task]:
+        """See :meth:`AbstractComposite.tasks`; one, which needs all fields."""
         met = [
             layer.opacity > 0
             for item, layer in zip(posed, seen.layers, strict=True)
             if item.field.has_gradients
         ]
         if not met:
-            return
-        index = dr.compress(reduce(operator.or_, met))
-        if not dr.width(index):
-            return
-        rays, total, cotangent = (pick(x, index) for x in (rays, seen.total, cotangent))
-        with dr.suspend_grad():
-            _derivative(dr.ADMode.Backward, posed, rays, total, cotangent, stop, False)
+            return []
+        wanted = reduce(operator.or_, met)
+        return select(wanted, rays, seen.total, cotangent, tuple(range(len(posed))))
+
+    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+        """See :meth:`AbstractComposite.accumulate`."""
+        mode, rays = dr.ADMode.Backward, task.rays
+        with dr.suspend_grad(), private_gradients():
+            _derivative(mode, posed, rays, task.primal, task.cotangent, stop, False)
 
     def backward_rays(
         self,
@@ -77,11 +86,17 @@ class InterleavedComposite(AbstractComposite):
         stop: float,
     ) -> tuple[mi.Vector3f, mi.Vector3f]:
         """See :meth:`AbstractComposite.backward_rays`."""
-        with dr.suspend_grad():
+        with dr.suspend_grad(), private_gradients():
             _, d_origin, d_direction = _derivative(
                 dr.ADMode.Backward, posed, rays, seen.total, cotangent, stop, True
             )
         return d_origin, d_direction
+
+
+COMPOSITES: dict[str, type[AbstractComposite]] = {
+    "interleaved": InterleavedComposite,
+    "depth": DepthComposite,
+}
 
 
 @dataclass

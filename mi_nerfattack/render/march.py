@@ -29,6 +29,7 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -39,6 +40,7 @@ from mi_nerfattack.render.posed import PosedField
 
 MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
 STOP = 1e-3
+PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
 
 
 @dataclass
@@ -95,6 +97,23 @@ class March:
         """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
         hit = self.opacity > 0
         return dr.select(hit, self.moment / dr.select(hit, self.opacity, 1), dr.inf)
+
+
+@contextmanager
+def private_gradients() -> Iterator[None]:
+    """Let derivatives recorded inside accumulate into one copy of a buffer a thread.
+
+    Without write conflicts there is no need for atomic operations, which takes four
+    fifths off the time of a grid's derivative. Costs memory, so it holds for buffers
+    whose copies fit in `PRIVATE_BYTES`. LLVM only; without effect on CUDA.
+    """
+    before = dr.expand_threshold()
+    copies = max(1, PRIVATE_BYTES // (4 * max(1, dr.thread_count())))
+    dr.set_expand_threshold(max(before, copies))
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(before)
 
 
 @dr.syntax
@@ -217,7 +236,7 @@ def march_derivative(  # noqa: D417  one entry describes seven
         the tangent of the march (forward mode; zeros otherwise), and the objective's
         derivative by origin and direction (3, n) (backward mode).
     """
-    with dr.suspend_grad():
+    with dr.suspend_grad(), private_gradients():
         return _march_derivative(
             mode,
             posed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -86,6 +87,12 @@ class PosedField:
         dr.make_opaque(
             self._columns, self._origin, self._inverse_scale, self._step, self._cone
         )
+
+    def state(self) -> list[Any]:
+        """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
+        numbers = [self._columns, self._origin, self._inverse_scale]
+        shape = self.field.occupancy.shape
+        return [self, shape, *numbers, self._step, self._cone, *self.field.arrays()]
 
     def to_local(
         self, origin: mi.Point3f, direction: mi.Vector3f

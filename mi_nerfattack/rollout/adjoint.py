@@ -4,8 +4,9 @@ For an objective ``J = mean_n sum_t C(x_t)`` under ``G_t(x_{t-1}, x_t, theta) = 
 ``(dG_t/dx_t)^T l_t = -(dC/dx_t)^T - (dG_{t+1}/dx_t)^T l_{t+1}`` is solved backwards
 from ``l_{T+1} = 0``, and ``dJ/dtheta = sum_t l_t^T dG_t/dtheta``. Each step renders
 its frame again, so that between steps only states, controls and one gradient buffer
-exist. Cost: one more observation, one product with the policy's derivative and one
-march derivative a step. Source: appendix A.9 to A.12.
+exist. Cost of a step: one more observation (none where the trajectory kept them), one
+product with the policy's derivative and one march derivative. Source: appendix A.9 to
+A.12.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ def replay_gradient(
         d_before, d_control = _residual_vjp(
             loop, before, after, trajectory.controls[step], costate
         )
-        seen = sensor.observe(before, step)
+        kept = trajectory.observations
+        seen = kept[step] if kept else sensor.observe(before, step)
         row = dr.array_t(seen.image)
         _, d_image = loop.policy.vjp(seen.image, loop.goal, row(d_control))
         d_state = sensor.vjp(seen, before, d_image, attached)

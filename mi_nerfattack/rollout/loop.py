@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
 
@@ -41,15 +41,17 @@ class ClosedLoop:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States and controls of a batch of drives; all that the forward pass keeps.
+    """States and controls of a batch of drives.
 
     Attributes:
         states: horizon + 1 arrays (3, n), metres and radians, evaluated.
         controls: horizon rows (n,), the policy's raw outputs, evaluated.
+        observations: what was seen in each step, where it was asked to be kept.
     """
 
     states: tuple[Any, ...]
     controls: tuple[Any, ...]
+    observations: tuple[Observation, ...] = ()
 
     @property
     def horizon(self) -> int:
@@ -81,19 +83,26 @@ def to_state(states: np.ndarray) -> Any:
 
 
 def simulate(
-    loop: ClosedLoop, initial: Any, horizon: int, on_step: OnStep | None = None
+    loop: ClosedLoop,
+    initial: Any,
+    horizon: int,
+    on_step: OnStep | None = None,
+    keep: bool = False,
 ) -> Trajectory:
-    """Drive a batch of vehicles; nothing but states and controls is kept.
+    """Drive a batch of vehicles.
 
     Args:
         loop: the closed loop.
         initial: (3, n) from :func:`to_state`.
         horizon: number of steps, at least 1.
         on_step: called after each step with its index.
+        keep: keep all observations, so that a gradient need not render them again;
+            about 80 + 20 k bytes a pixel and step for k fields. Otherwise nothing but
+            states and controls is kept.
     """
     if horizon < 1:
         raise ValueError(f"horizon: {horizon}; at least 1")
-    states, controls = [initial], []
+    states, controls, observations = [initial], [], []
     for step in range(horizon):
         seen = loop.sensor.observe(states[-1], step)
         control = dr.value_t(state_type())(loop.policy.control(seen.image, loop.goal))
@@ -102,6 +111,8 @@ def simulate(
         dr.eval(state, control)
         states.append(state)
         controls.append(control)
+        if keep:
+            observations.append(seen)
         if on_step is not None:
             on_step(step)
-    return Trajectory(tuple(states), tuple(controls))
+    return Trajectory(tuple(states), tuple(controls), tuple(observations))

@@ -12,9 +12,15 @@ import mitsuba as mi
 from mi_nerfattack.colour import linear_to_srgb
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
-from mi_nerfattack.render.composite import AbstractComposite, DepthComposite, Seen
+from mi_nerfattack.render.composite import (
+    AbstractComposite,
+    DepthComposite,
+    Seen,
+    Task,
+)
 from mi_nerfattack.render.march import STOP, March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.frozen import freeze_method
 
 
 @dataclass(frozen=True)
@@ -115,19 +121,29 @@ class FieldSensor(AbstractDifferentiableSensor):
         self.stop = stop
         self.composite = composite or DepthComposite()
         self.renders = 0
+        # Tracing these in Python takes longer than running them.
+        self._frozen_render = freeze_method(self._render, self._state)
+        self._frozen_cotangent = freeze_method(self._cotangent, self._state)
+        self._frozen_accumulate = freeze_method(self._accumulate, self._state)
+        self._frozen_rays = freeze_method(self._backward_rays, self._state)
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render the composite; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)
-        origin, direction = self._rays(dr.detach(state))
-        jitter = self._jitter(step, dr.width(direction))
-        far, active = dr.opaque(mi.Float, dr.inf), mi.Bool(True)
-        rays = Rays(origin, direction, far, jitter, active)
-        seen = self.composite.render(self._fields, rays, self.stop)
-        pixels = self._develop(seen.total, direction)
-        dr.eval(seen, pixels, origin, direction)
+        key = dr.opaque(mi.UInt32, step)
+        pixels, seen, rays = self._frozen_render(dr.detach(state), key, count)
         self.renders += count
         return Observation(self._tensor(pixels, count), seen, rays)
+
+    def _render(
+        self, state: Any, step: mi.UInt32, count: int
+    ) -> tuple[mi.Color3f, Seen, Rays]:
+        origin, direction = self._rays(state, count)
+        jitter = self._jitter(step, dr.width(direction))
+        far, active = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Bool, True)
+        rays = Rays(origin, direction, far, jitter, active)
+        seen = self.composite.render(self._fields, rays, self.stop)
+        return self._develop(seen.total, direction), seen, rays
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -135,22 +151,44 @@ class FieldSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.vjp`."""
         rays, seen = observation.rays, observation.seen
         assert rays is not None and seen is not None
-        total, direction = seen.total.copy(), mi.Vector3f(rays.direction)
-        dr.enable_grad(total)
+        cotangent, d_direction = self._frozen_cotangent(
+            seen.total, rays.direction, d_image.array
+        )
         if attached:
-            dr.enable_grad(direction)
-        pixels = self._develop(total, direction)
-        index = 3 * dr.arange(mi.UInt32, dr.width(pixels))
-        weights = [dr.gather(mi.Float, d_image.array, index + c) for c in range(3)]
-        dr.backward_from(dr.dot(pixels, mi.Color3f(*weights)))
-        cotangent = dr.grad(total)
-        if attached:
-            by_direction = dr.grad(direction)
-            return self._attached(observation, state, cotangent, by_direction)
-        dr.eval(cotangent)
-        self.composite.backward(self._fields, rays, seen, cotangent, self.stop)
+            return self._attached(observation, state, cotangent, d_direction)
+        for task in self.composite.tasks(self._fields, rays, seen, cotangent):
+            self._frozen_accumulate(task)
         dr.eval([dr.grad(posed.field.packed) for posed in self.objects])
         return None
+
+    def _cotangent(
+        self, total: March, direction: mi.Vector3f, d_image: mi.Float
+    ) -> tuple[March, mi.Vector3f]:
+        """Differentiate by the composite and, for the sky, by the direction."""
+        total, direction = total.copy(), mi.Vector3f(direction)
+        dr.enable_grad(total, direction)
+        pixels = self._develop(total, direction)
+        index = 3 * dr.arange(mi.UInt32, dr.width(pixels))
+        weights = [dr.gather(mi.Float, d_image, index + c) for c in range(3)]
+        dr.backward_from(dr.dot(pixels, mi.Color3f(*weights)))
+        return dr.grad(total), dr.grad(direction)
+
+    def _accumulate(self, task: Task) -> None:
+        posed = [self._fields[k] for k in task.fields]
+        self.composite.accumulate(posed, task, self.stop)
+
+    def _backward_rays(
+        self, rays: Rays, seen: Seen, cotangent: March
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        fields = self._fields
+        return self.composite.backward_rays(fields, rays, seen, cotangent, self.stop)
+
+    def _state(self, *arguments: Any) -> list[Any]:
+        """Return what frozen functions read or depend on beside their arguments."""
+        # Recordings hold literals of one image's size; a task has none.
+        sizes = [dr.width(x) for x in arguments if not isinstance(x, Task)]
+        state = [posed.state() for posed in self._fields]
+        return [self.composite, self.stop, sizes, state]
 
     def start_gradient(self) -> None:
         """Make every object's packed grid a fresh leaf with gradient zero."""
@@ -167,7 +205,7 @@ class FieldSensor(AbstractDifferentiableSensor):
             for posed in self.objects
         ]
 
-    def _rays(self, state: Any) -> tuple[mi.Point3f, mi.Vector3f]:
+    def _rays(self, state: Any, count: int) -> tuple[mi.Point3f, mi.Vector3f]:
         mount = self.mount
         origin, columns = mount_pose(
             (mi.Float(state[0]), mi.Float(state[1]), mi.Float(state[2])),
@@ -176,13 +214,13 @@ class FieldSensor(AbstractDifferentiableSensor):
             mount.pitch_deg,
         )
         dr.eval(origin, columns)
-        return generate_rays(self.camera, origin, columns, dr.width(state))
+        return generate_rays(self.camera, origin, columns, count)
 
-    def _jitter(self, step: int, count: int) -> mi.Float:
+    def _jitter(self, step: mi.UInt32, count: int) -> mi.Float:
         if self.jitter_seed is None:
             return dr.opaque(mi.Float, 0.5)
         seed = dr.opaque(mi.UInt32, self.jitter_seed)
-        key = mi.sample_tea_32(seed, dr.opaque(mi.UInt32, step))[0]
+        key = mi.sample_tea_32(seed, step)[0]
         return mi.sample_tea_float32(key, dr.arange(mi.UInt32, count))
 
     @property
@@ -201,14 +239,12 @@ class FieldSensor(AbstractDifferentiableSensor):
         self, seen: Observation, state: Any, cotangent: March, d_direction: Any
     ) -> Any:
         """Differentiate all marches, then the rays by the state."""
-        d_origin, by_direction = self.composite.backward_rays(
-            self._fields, seen.rays, seen.seen, cotangent, self.stop
-        )
+        d_origin, by_direction = self._frozen_rays(seen.rays, seen.seen, cotangent)
         d_direction += by_direction
         dr.eval(d_origin, d_direction)
         leaf = type(state)(dr.detach(state))
         dr.enable_grad(leaf)
-        origin, direction = self._rays(leaf)
+        origin, direction = self._rays(leaf, dr.width(leaf))
         dr.backward_from(dr.dot(origin, d_origin) + dr.dot(direction, d_direction))
         result = dr.grad(leaf)
         dr.eval(result, [dr.grad(posed.field.packed) for posed in self.objects])
