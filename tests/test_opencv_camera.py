@@ -1,11 +1,10 @@
-"""The sensor `opencv_camera` against the stock sensor and OpenCV's projection."""
+"""The sensor `opencv_camera` against OpenCV's projection, and as a scene's sensor."""
 
 from __future__ import annotations
 
 import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
 
 # isort: split
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,100 +13,21 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import small_fields as small
+from camera_scenes import (
+    CROP,
+    EYE,
+    INTEGRATORS,
+    LENS,
+    WIDTH,
+    film,
+    grid_of_pixels,
+    load,
+    rays,
+    sensor,
+    world,
+)
 
 from mi_nerfattack.fields import save_field
-
-WIDTH, HEIGHT, FOCAL = 48, 32, 30.0
-CROP = {"crop_width": 20, "crop_height": 16, "crop_offset_x": 15, "crop_offset_y": 7}
-LENS = {
-    "fx": 30.0,
-    "fy": 36.0,
-    "cx": 22.5,
-    "cy": 18.0,
-    "k1": -0.08,
-    "k2": 0.02,
-    "p1": 2e-3,
-    "p2": -3e-3,
-}
-PINHOLE = {"type": "opencv_camera", "fx": FOCAL, "cx": 20.0, "cy": 18.0}
-STOCK = {
-    "type": "perspective",
-    "fov": float(np.degrees(2 * np.arctan(0.5 * WIDTH / FOCAL))),
-    "fov_axis": "x",
-    "principal_point_offset_x": 0.5 - 20 / WIDTH,
-    "principal_point_offset_y": 0.5 - 18 / HEIGHT,
-}
-EYE = [1.0, 2.0, -3.0]
-INTEGRATORS = {
-    "path": {"type": "path", "max_depth": 3},
-    "direct": {"type": "direct"},
-    "prb": {"type": "prb", "max_depth": 3},
-    "aov": {
-        "type": "aov",
-        "aovs": "d:depth,x:position,u:duv_dx,v:duv_dy",
-        "inner": {"type": "direct"},
-    },
-}
-
-
-@pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
-def each_variant(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = mi.variant()
-    mi.set_variant(request.param)
-    yield request.param
-    if before is not None and before != request.param:
-        mi.set_variant(before)
-
-
-def film(**more: Any) -> dict[str, Any]:
-    pixels = "luminance" if mi.is_monochromatic else "rgb"
-    base = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
-    return {**base, "pixel_format": pixels, "component_format": "float32", **more}
-
-
-def sensor(description: dict[str, Any], **film_more: Any) -> dict[str, Any]:
-    to_world = mi.ScalarTransform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
-    return {**description, "to_world": to_world, "film": film(**film_more)}
-
-
-def load(description: dict[str, Any]) -> mi.Sensor:
-    return mi.load_dict(description, parallel=False)
-
-
-def world(camera: dict[str, Any], integrator: dict[str, Any], **more: Any) -> mi.Scene:
-    """Load a chequered ball under a sky, with the camera as `eye`."""
-    chequers = {
-        "type": "checkerboard",
-        "color0": {"type": "rgb", "value": [0.8, 0.3, 0.1]},
-        "to_uv": mi.ScalarTransform4f().scale([8, 8, 1]),
-    }
-    ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": chequers}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": integrator,
-            "eye": camera,
-            "ball": ball,
-            "sky": {"type": "constant"},
-            **more,
-        },
-        parallel=False,
-    )
-
-
-def rays(camera: mi.Sensor, pixel: np.ndarray) -> tuple[mi.RayDifferential3f, Any]:
-    """Sample the rays of pixels (n, 2), counted in the full film."""
-    crop = np.array(camera.film().crop_size())
-    place = (pixel - np.array(camera.film().crop_offset())) / crop
-    sample = mi.Point2f(np.ascontiguousarray(place.T, np.float32))
-    return camera.sample_ray_differential(
-        mi.Float(0), mi.Float(0.3), sample, mi.Point2f(0)
-    )
-
-
-def grid_of_pixels(step: float = 4.0) -> np.ndarray:
-    u, v = np.meshgrid(np.arange(0, WIDTH + 1, step), np.arange(0, HEIGHT + 1, step))
-    return np.stack([u.ravel(), v.ravel()], 1)
 
 
 def opencv_pixels(points: np.ndarray) -> np.ndarray:
@@ -126,62 +46,6 @@ def opencv_pixels(points: np.ndarray) -> np.ndarray:
     axes = points * [-1.0, -1.0, 1.0]
     projected = cv2.projectPoints(axes, np.zeros(3), np.zeros(3), matrix, lens)[0]
     return projected[:, 0] + 0.5
-
-
-# Against the stock sensor
-
-
-@pytest.mark.parametrize("kind", INTEGRATORS)
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"rfilter": {"type": "box"}},
-        {"rfilter": {"type": "gaussian"}, "sample_border": True, **CROP},
-        {"rfilter": {"type": "lanczos"}},
-    ],
-    ids=["box", "gaussian crop", "lanczos"],
-)
-def test_image_of_the_stock_sensor(each_variant: str, kind: str, more: Any) -> None:
-    images = [
-        np.array(mi.render(world(sensor(d, **more), INTEGRATORS[kind]), spp=4, seed=3))
-        for d in (PINHOLE, STOCK)
-    ]
-    assert np.nanmax(images[1]) > 0.5
-    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
-def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
-    ours, theirs = (load(sensor(d, **more)) for d in (PINHOLE, STOCK))
-    (a, weight_a), (b, weight_b) = (rays(s, grid_of_pixels()) for s in (ours, theirs))
-    for name in ("o", "d", "maxt", "d_x", "d_y", "o_x", "wavelengths"):
-        x, y = (np.array(getattr(ray, name)) for ray in (a, b))
-        np.testing.assert_allclose(x, y, rtol=2e-6, atol=1e-6, err_msg=name)
-    np.testing.assert_allclose(np.array(weight_a), np.array(weight_b), rtol=1e-6)
-
-
-@pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
-def test_directions_of_the_stock_sensor(each_variant: str, more: Any) -> None:
-    # Centred: the stock sensor leaves out a strip where the principal point is not.
-    centred = {"cx": 0.5 * WIDTH, "cy": 0.5 * HEIGHT}
-    shifted = ("principal_point_offset_x", "principal_point_offset_y")
-    stock = {key: value for key, value in STOCK.items() if key not in shifted}
-    ours = load(sensor({**PINHOLE, **centred}, **more))
-    theirs = load(sensor(stock, **more))
-    spread = np.random.default_rng(0).normal(size=(3, 500)) * 1.5
-    it = dr.zeros(mi.Interaction3f, 500)
-    it.p = mi.Point3f(spread.astype(np.float32))
-    (a, a_weight), (b, b_weight) = (
-        s.sample_direction(it, mi.Point2f(0)) for s in (ours, theirs)
-    )
-    seen = np.array(b.pdf) > 0
-    np.testing.assert_array_equal(np.array(a.pdf) > 0, seen)
-    assert 0.05 < seen.mean() < 0.95
-    for name in ("uv", "d", "dist"):
-        x, y = (np.array(getattr(ds, name))[..., seen] for ds in (a, b))
-        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
-    x, y = (np.array(mi.Spectrum(w)[0])[seen] for w in (a_weight, b_weight))
-    np.testing.assert_allclose(x, y, rtol=1e-5)
 
 
 # Against OpenCV
@@ -352,6 +216,10 @@ def test_field_integrator_with_a_lens(variant: str, tmp_path: Path) -> None:
 # Properties
 
 
+# At fx 30, k1 -0.155 holds an image of 48 x 32 pixels, but not its filter's border.
+BORDER = {"type": "hdrfilm", "width": 48, "height": 32, "sample_border": True}
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -359,6 +227,7 @@ def test_field_integrator_with_a_lens(variant: str, tmp_path: Path) -> None:
         ({"fy": 0.0}, "camera.fy: 0.0; must be positive"),
         ({"cx": float("nan")}, "camera.cx: nan; must be finite"),
         ({"k1": -5.0}, "folds the image over itself"),
+        ({"k1": -0.155, "film": BORDER}, "folds the image over itself"),
         ({"near_clip": 0.0}, "near_clip, far_clip: 0, .*expected 0 < near < far"),
         ({"near_clip": 2.0, "far_clip": 1.0}, "near_clip, far_clip: 2, 1"),
         ({"k3": 0.1}, 'unreferenced property.*\n.*"k3"'),
@@ -368,6 +237,10 @@ def test_field_integrator_with_a_lens(variant: str, tmp_path: Path) -> None:
 def test_wrong_properties(variant: str, more: Any, message: str) -> None:
     with pytest.raises(RuntimeError, match=message):
         load({"type": "opencv_camera", "fx": 30.0, "film": film(), **more})
+
+
+def test_border_counts_only_where_it_is_sampled(variant: str) -> None:
+    load({"type": "opencv_camera", "fx": 30.0, "k1": -0.155, "film": film()})
 
 
 def test_focal_length_is_required(variant: str) -> None:
