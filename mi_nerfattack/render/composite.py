@@ -135,6 +135,8 @@ class DepthComposite(AbstractComposite):
         mode, none = dr.ADMode.Forward, March()
         tangents = [
             march_derivative(mode, item, *rays, layer, none, stop)[0]
+            if item.field.has_gradients
+            else none
             for item, layer in zip(posed, seen.layers, strict=True)
         ]
         with dr.resume_grad():
