@@ -78,7 +78,7 @@ class AbstractField(ABC):
 
     @property
     def has_gradients(self) -> bool:
-        """Whether derivatives with respect to a parameter are asked for."""
+        """Whether derivatives with respect to what :meth:`eval` reads are asked for."""
         with dr.resume_grad():
             return any(dr.grad_enabled(value) for value in self.parameters().values())
 

@@ -225,6 +225,12 @@ class NGPField(AbstractField):
             "sky": self.sky,
         }
 
+    @property
+    def has_gradients(self) -> bool:
+        """Whether derivatives with respect to what :meth:`eval` reads are asked for."""
+        values = self.parameters()
+        return any(dr.grad_enabled(values[name]) for name in values if name != "sky")
+
     def set_parameter(self, name: str, value: Any) -> None:
         """Replace one of :meth:`parameters`, keeping its derivative graph."""
         if name not in self.parameters():

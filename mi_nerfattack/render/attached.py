@@ -34,6 +34,7 @@ def attached(
     sources = [
         array
         for item in posed
+        if item.field.has_gradients
         for array in item.field.arrays()
         if dr.grad_enabled(array)
     ]

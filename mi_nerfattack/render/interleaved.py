@@ -52,6 +52,8 @@ class InterleavedComposite(AbstractComposite):
         self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
     ) -> March:
         """See :meth:`AbstractComposite.forward`."""
+        if not any(item.field.has_gradients for item in posed):
+            return March()
         with dr.suspend_grad():
             return _derivative(
                 dr.ADMode.Forward, posed, rays, seen.total, March(), stop, False
