@@ -133,6 +133,11 @@ class Render:
                 "the name of a folder"
             )
         if is_path:
+            if suffix not in ("", ".mp4") and not self.output.is_dir():
+                raise InputError(
+                    f"{self.output}: unknown suffix {suffix!r}; give .mp4, or the name "
+                    "of a folder"
+                )
             return
         if suffix not in (".exr", ".png"):
             raise InputError(

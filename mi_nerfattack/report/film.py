@@ -204,7 +204,7 @@ class FrameRenderer:
             )
         if set(aovs) >= set(_TOTALS):
             usual = {n: t for n, t in _TOTALS.items() if t not in base}
-            aovs = [usual.get(name, name) for name in aovs]
+            aovs = [str(usual.get(name, name)) for name in aovs]
         names = base + aovs
         if len(names) != count:
             names = _names_of_aov_integrator(base, aovs)
