@@ -79,7 +79,7 @@ class AbstractField(ABC):
     @property
     def has_gradients(self) -> bool:
         """Whether derivatives with respect to what :meth:`eval` reads are asked for."""
-        with dr.resume_grad():
+        with dr.resume_grad():  # derivative passes ask while gradients are suspended
             return any(dr.grad_enabled(value) for value in self.parameters().values())
 
     def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:

@@ -229,7 +229,8 @@ class NGPField(AbstractField):
     def has_gradients(self) -> bool:
         """Whether derivatives with respect to what :meth:`eval` reads are asked for."""
         values = self.parameters()
-        return any(dr.grad_enabled(values[name]) for name in values if name != "sky")
+        with dr.resume_grad():  # derivative passes ask while gradients are suspended
+            return any(dr.grad_enabled(values[k]) for k in values if k != "sky")
 
     def set_parameter(self, name: str, value: Any) -> None:
         """Replace one of :meth:`parameters`, keeping its derivative graph."""
