@@ -57,6 +57,14 @@ def write_balls(folder: Path, integrator: str = PATH, film: str = BOX) -> Path:
     return write_scene(folder, integrator + sensor(film) + BALLS)
 
 
+def write_lens(folder: Path) -> Path:
+    """Write the balls before a camera with distortion, which moves as well."""
+    fov = '<float name="fov" value="40"/>'
+    lens = '<float name="fx" value="20"/><float name="k1" value="-0.1"/>'
+    camera = sensor().replace("perspective", "opencv_camera").replace(fov, lens)
+    return write_scene(folder, PATH + camera + BALLS)
+
+
 def write_slab(folder: Path, film: str = BOX, fov: float = 5) -> Path:
     """Write a homogeneous box [-1, 1]^3 in front of the camera."""
     save_field(folder / "box.safetensors", small.homogeneous(DENSITY, RAW_COLOUR))

@@ -172,6 +172,13 @@ def test_metadata_tell_camera_pose_and_origin(tmp_path):
     np.testing.assert_allclose(pose, expected, atol=1e-6)
 
 
+def test_metadata_tell_the_distortion(tmp_path):
+    metadata = FrameRenderer(scenes.write_lens(tmp_path)).render().metadata
+    camera = json.loads(metadata["camera"])
+    assert camera["fx"] == camera["fy"] == 20
+    assert camera["k1"] == pytest.approx(-0.1)
+
+
 def test_mitsuba_reads_our_files(tmp_path):
     frame = FrameRenderer(scenes.write_slab(tmp_path)).render()
     for precision in ("half", "float"):
@@ -186,7 +193,9 @@ def test_mitsuba_reads_our_files(tmp_path):
             np.testing.assert_allclose(pixels[..., i], expected, rtol=2**-11)
 
 
-@pytest.mark.parametrize("write", [scenes.write_slab, scenes.write_balls])
+@pytest.mark.parametrize(
+    "write", [scenes.write_slab, scenes.write_balls, scenes.write_lens]
+)
 def test_poses_and_seeds_compile_nothing_after_the_first_frame(tmp_path, write):
     renderer = FrameRenderer(write(tmp_path), spp=2)
     poses = read_path(scenes.write_path(tmp_path, 4))
