@@ -17,12 +17,13 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "mi_nerfattack"
 FOLDERS = {
     PACKAGE: ROOT / PACKAGE,
+    f"{PACKAGE}.bench": ROOT / "bench",
     f"{PACKAGE}.plugins": ROOT / "plugins",
     f"{PACKAGE}.scenes": ROOT / "scenes",
 }
 # An earlier part of a chain never imports a later one.
 CHAINS = [
-    ("errors", "files", "fields", "render", "plugins", "commands", "cli"),
+    ("errors", "files", "fields", "render", "plugins", "bench", "commands", "cli"),
     ("errors", "vehicle", "rollout", "attack", "scale", "commands", "cli"),
 ]
 FORBIDDEN = [
@@ -31,7 +32,7 @@ FORBIDDEN = [
     ("robot", "attack"),
     ("vehicle", "render"),
 ]
-TORCH_PARTS = {"policy", "bridge"}
+TORCH_PARTS = {"policy", "bridge", "bench"}  # bench: the peer is in torch
 
 
 def modules() -> Iterator[tuple[str, Path]]:
@@ -118,7 +119,7 @@ def test_no_two_modules_import_each_other():
         pytest.fail(f"modules import each other: {err.args[1]}")
 
 
-def test_only_policy_imports_torch():
+def test_only_policy_and_bench_import_torch():
     for name in SOURCES:
         roots = {item.split(".")[0] for item in imported(name)}
         if part(name) not in TORCH_PARTS:
@@ -149,7 +150,7 @@ def test_every_folder_is_packaged():
     assert present == set(table["packages"])
 
 
-@pytest.mark.parametrize("name", ["plugins", "scenes"])
+@pytest.mark.parametrize("name", ["bench", "plugins", "scenes"])
 def test_outer_folders_import_under_the_package(name):
     if not (ROOT / name / "__init__.py").is_file():
         pytest.skip(f"{name} is no package")

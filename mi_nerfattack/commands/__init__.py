@@ -11,6 +11,7 @@ from typing import Protocol
 
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.attack import Attack
+from mi_nerfattack.commands.bench import Bench
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
@@ -36,6 +37,7 @@ COMMANDS: dict[str, type[Command]] = {
     "asset": Asset,
     "train": Train,
     "attack": Attack,
+    "bench": Bench,
 }
 
 __all__ = ["COMMANDS", "Command"]

@@ -1,0 +1,1 @@
+"""Performance figures, measured side by side with the peers they are compared to."""

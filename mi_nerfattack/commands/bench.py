@@ -1,0 +1,133 @@
+"""``mi-nerfattack bench``: measure speed and memory beside a peer."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+
+
+@dataclass(frozen=True)
+class BenchRender:
+    """Measure rendering and its derivative against the same field in PyTorch.
+
+    Both sides run in turns, in processes of their own, on all cores; medians count.
+    Keep the machine otherwise idle. Takes some minutes.
+    """
+
+    sizes: tuple[str, ...] = ("200x66", "366x188")
+    """Widths and heights of the image, pixels."""
+    repeats: int = 5
+    """Repetitions of each measurement."""
+    quick: bool = False
+    """Take the bundled field as it is, and the given sizes for all images: to see that
+    it works, not for figures."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date: a .json file, or a folder
+    in which it is named by date and machine."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """Measure, print and write."""
+        import json
+
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            render,
+            results,
+        )
+
+        sizes = _read_sizes(self.sizes)
+        _check_repeats(self.repeats)
+        if self.quick:
+            settings = render.Settings.quick(sizes, self.repeats)
+        else:
+            settings = render.Settings(sizes, sizes[-1], repeats=self.repeats)
+        document = self._measure(settings)
+        document = results.stamp(document, self._command())
+        if self.output is not None:
+            path = results.write(self.output, "render", document)
+            print(f"written to {path}", file=sys.stderr)
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            _print(document)
+        return 0
+
+    def _command(self) -> list[str]:
+        command = ["mi-nerfattack", "bench", "render", "--sizes", *self.sizes]
+        command += ["--repeats", str(self.repeats)]
+        return [*command, "--quick"] if self.quick else command
+
+    def _measure(self, settings: Any) -> dict[str, Any]:
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            render,
+        )
+        from mi_nerfattack.commands.bars import StageBars
+
+        with StageBars() as bars:
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            return render.run(settings, show)
+
+
+# A choice needs two members; the second is never offered.
+_Chosen = tyro.conf.OmitArgPrefixes[
+    tyro.conf.OmitSubcommandPrefixes[
+        Union[  # noqa: UP007  the members are no plain types
+            Annotated[BenchRender, tyro.conf.subcommand("render")],
+            Annotated[None, tyro.conf.Suppress],
+        ]
+    ]
+]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed and memory beside a peer."""
+
+    command: _Chosen
+
+    def run(self) -> int:
+        """Run the chosen benchmark."""
+        assert self.command is not None  # the choice is required
+        return self.command.run()
+
+
+def _read_sizes(texts: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    from mi_nerfattack.errors import InputError
+
+    sizes = []
+    for text in texts:
+        width, cross, height = text.partition("x")
+        if not (cross and width.isdecimal() and height.isdecimal()):
+            raise InputError(f"--sizes: {text!r}; expected WIDTHxHEIGHT as in 200x66")
+        if not (8 <= int(width) <= 4096 and 8 <= int(height) <= 4096):
+            raise InputError(f"--sizes: {text!r}; allowed are 8 to 4096 pixels")
+        sizes.append((int(width), int(height)))
+    if not sizes:
+        raise InputError("--sizes: none given; expected WIDTHxHEIGHT as in 200x66")
+    return tuple(sizes)
+
+
+def _check_repeats(repeats: int) -> None:
+    from mi_nerfattack.errors import InputError
+
+    if not 1 <= repeats <= 1000:
+        raise InputError(f"--repeats: {repeats}; allowed are 1 to 1000")
+
+
+def _print(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from mi_nerfattack.bench import table  # pyright: ignore[reportMissingImports]
+
+    console = Console()
+    console.print(table.render_table(document))
+    for line in table.remarks(document):
+        console.print(line, highlight=False, soft_wrap=True)
