@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import drjit as dr
 import mitsuba as mi
@@ -67,7 +67,7 @@ class FieldEmitter(mi.Emitter):
     - Seen from inside, fields lie between the shape and where the ray started: the
       camera or the last surface, be it a ``null`` one. Other surfaces inside the
       shape are seen without the fields in front of them.
-    - Light that starts on the shape (``ptracer``, ``sample_ray``) is not sampled.
+    - Light tracing from the shape (``ptracer``) is refused.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -95,6 +95,13 @@ class FieldEmitter(mi.Emitter):
         radiance, opacity = attached(self.composite, posed, rays, self.stop)
         radiance += (1 - opacity) * background(self.volumes, direction)
         return spectrum.emission(radiance, si.wavelengths) & active
+
+    def sample_ray(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuse to trace light from the shape."""
+        raise NotImplementedError(
+            "field_emitter: cannot trace light from it as ptracer does; use path, "
+            "direct, prb or volpath"
+        )
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True

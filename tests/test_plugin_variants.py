@@ -247,7 +247,7 @@ def test_field_emitter_of_an_ngp(ngp: str, rng, name: str) -> None:
 def test_opacity_one(tmp_path: Path, rng) -> None:
     name = write(tmp_path / "box.safetensors", small.homogeneous(1e4))
     loaded = scene(integrator(object=volume(name)))
-    assert np.array(mi.render(loaded, spp=1))[..., -2].max() == 1
+    assert np.array(mi.render(loaded, spp=1))[..., -2].max() > 1 - 1e-6
     found = problem(loaded, "texture")
     found.check(directions(rng, field_of(loaded), found.base.shape))
     opaque = problem(loaded, "density")
