@@ -47,6 +47,10 @@ class Derivatives:
         self.params[self.key] = kind(values.astype(self.base.dtype))
         return self.params[self.key]
 
+    def _reset(self) -> None:
+        self._set(self.base)
+        self.params.update()
+
     def value(self, direction: np.ndarray, s: float) -> float:
         """Return the projection after a step along a direction."""
         self._set(self.base + s * direction.reshape(self.base.shape))
@@ -55,7 +59,9 @@ class Derivatives:
 
     def difference(self, direction: np.ndarray, step: float) -> float:
         """Return the directional derivative by central differences."""
-        return central_difference(lambda s: self.value(direction, s), step)
+        result = central_difference(lambda s: self.value(direction, s), step)
+        self._reset()
+        return result
 
     def gradient(self) -> np.ndarray:
         """Return the gradient, flat, in backward mode."""
@@ -65,8 +71,7 @@ class Derivatives:
         weight = type(found)(self.weight.reshape(found.numpy().shape))
         dr.backward(dr.sum(found * weight, axis=None))
         result = dr.grad(self.params[self.key]).numpy().astype(float).ravel()
-        self._set(self.base)
-        self.params.update()
+        self._reset()
         return result
 
     def tangent(self, direction: np.ndarray) -> float:
@@ -80,8 +85,7 @@ class Derivatives:
         found = self.output()
         dr.forward_to(found)
         result = total(dr.grad(found), self.weight)
-        self._set(self.base)
-        self.params.update()
+        self._reset()
         return result
 
     def check(

@@ -68,7 +68,7 @@ def volume(name: str, kind: str = "grid_field", **more: Any) -> dict[str, Any]:
 
 def integrator(**more: Any) -> dict[str, Any]:
     """Describe a field_integrator; stop 0 makes it smooth."""
-    return {"type": "field_integrator", "stop": 0.0, "jitter": True, **more}
+    return {"type": "field_integrator", "stop": 0.0, "jitter": True} | more
 
 
 def scene(seeing: dict, eye=(3.0, 1.0, 0.5), target=(0, 0, 0), **more) -> mi.Scene:
@@ -208,6 +208,18 @@ def test_field_integrator_over_a_nested_integrator(grid: str, rng) -> None:
 
 
 # The emitter
+
+
+@pytest.mark.parametrize("eye", [(3, 2, 1), (0.4, 0.2, 0)], ids=["outside", "inside"])
+def test_path_shows_what_the_integrator_shows(grid: str, eye) -> None:
+    loaded = scene(integrator(object=volume(grid), jitter=False), eye)
+    expected = images(loaded, {})().numpy()
+    stock = scene({"type": "path"}, eye, cube=emitter(object=volume(grid))["cube"])
+    found = images(stock, {})().numpy()
+    assert expected.std() > 0.01
+    # Outside, the steps count from the cube instead of the camera.
+    atol = 1e-4 if eye[0] < 1 else 1e-3
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=atol)
 
 
 @pytest.mark.parametrize("seeing", ["path", "direct", "prb"])
