@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import sys
 from abc import ABC, abstractmethod
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack import files
 from mi_nerfattack.render.camera import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route import Route
@@ -39,9 +41,19 @@ class AbstractSide(ABC):
 
     def memory(self) -> dict[str, float]:
         """Return the largest resident size of the process so far, in MB."""
-        unit = 1 if sys.platform == "darwin" else 1024
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-        return {"peak_memory_mb": peak / 1e6}
+        return {"peak_memory_mb": peak_memory_mb()}
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident size of this process so far, in MB.
+
+    Not from `getrusage` on Linux: there a new process starts with its parent's peak.
+    """
+    if sys.platform == "linux":
+        status = files.read_text("/proc/self/status")
+        return float(re.findall(r"VmHWM:\s*(\d+) kB", status)[0]) * 1024 / 1e6
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def route_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +17,7 @@ from small_fields import small_ngp
 from mi_nerfattack import cli
 from mi_nerfattack.bench.full_ngp import NGPData, enlarge, level_sizes
 from mi_nerfattack.bench.render import Worker
+from mi_nerfattack.bench.sides import peak_memory_mb
 from mi_nerfattack.bench.table import ROWS, render_table
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
 from mi_nerfattack.bench.torch_ngp import (
@@ -209,6 +212,17 @@ def test_bad_arguments_are_refused(capsys, argument, value):
     message = capsys.readouterr().err
     assert argument in message
     assert value in message
+
+
+def test_a_process_does_not_inherit_the_peak_of_its_parent():
+    """A child that only imports the package, of a parent that holds 800 MB more."""
+    ballast = np.ones(100_000_000)
+    code = (
+        "from mi_nerfattack.bench.sides import peak_memory_mb; print(peak_memory_mb())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert 20 < float(run.stdout) < 700
+    assert peak_memory_mb() > ballast.nbytes / 1e6
 
 
 def test_a_worker_that_fails_names_itself():
