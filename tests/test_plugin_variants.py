@@ -211,7 +211,8 @@ def test_field_integrator_over_a_nested_integrator(grid: str, rng) -> None:
 
 
 @pytest.mark.parametrize("eye", [(3, 2, 1), (0.4, 0.2, 0)], ids=["outside", "inside"])
-def test_path_shows_what_the_integrator_shows(grid: str, eye) -> None:
+def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
+    grid = write(tmp_path / "fine.safetensors", small.blob(rng, step_m=0.03))
     loaded = scene(integrator(object=volume(grid), jitter=False), eye)
     expected = images(loaded, {})().numpy()
     stock = scene({"type": "path"}, eye, cube=emitter(object=volume(grid))["cube"])
