@@ -37,7 +37,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.render.march import march, march_derivative
+from mi_nerfattack.render.batched import march_gradient
+from mi_nerfattack.render.march import STOP, Rays, march
 from mi_nerfattack.render.posed import PosedField
 
 _REPORT_EVERY = 25
@@ -248,16 +249,16 @@ class _Fit:
         else:
             background = mi.Color3f(*shade)
         far = self._ends(batch.depth)
-        rays = (batch.origin, batch.direction, far, jitter, mi.Bool(True))
+        rays = Rays(batch.origin, batch.direction, far, jitter, mi.Bool(True))
         with dr.suspend_grad():
-            primal = march(self.posed, *rays)
+            primal = march(self.posed, *rays, STOP)
         dr.eval(batch, jitter, shade, primal, self.random)
         loss, square, cotangent = loss_and_cotangent(
             primal, background, batch, self.options.loss
         )
         # rays of a packet rarely meet in a vertex: adding them up first is no gain
         with dr.scoped_set_flag(dr.JitFlag.ScatterReduceLocal, False):
-            march_derivative(dr.ADMode.Backward, self.posed, *rays, primal, cotangent)
+            march_gradient(self.posed, rays, primal, cotangent, STOP)
         return dr.mean(loss), dr.mean(square)
 
     def _batch(self) -> RayBatch:

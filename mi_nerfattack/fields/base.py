@@ -12,6 +12,53 @@ import numpy as np
 from mi_nerfattack.fields.occupancy import Occupancy
 
 
+class AbstractPoints(ABC):
+    """Points of a field, collected in a kernel to be differentiated together.
+
+    Attributes:
+        capacity: number of points that fit.
+    """
+
+    capacity: int
+
+    @abstractmethod
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f, Any]:
+        """Evaluate as :meth:`AbstractField.eval`; also return what `append` needs."""
+
+    @abstractmethod
+    def append(
+        self,
+        place: Any,
+        d_density: mi.Float,
+        d_radiance: mi.Color3f,
+        ray: mi.UInt32,
+        active: mi.Bool,
+    ) -> None:
+        """Collect points; those beyond the capacity are only counted.
+
+        Args:
+            place: from :meth:`eval`.
+            d_density: (n,) derivative of an objective by the density.
+            d_radiance: (3, n) its derivative by the radiance.
+            ray: (n,) index of the ray that the point lies on.
+            active: (n,) mask.
+        """
+
+    @abstractmethod
+    def count(self) -> int:
+        """Evaluate, and return the number of points, also of those that did not fit."""
+
+    @abstractmethod
+    def accumulate(self, heading: mi.Vector3f) -> None:
+        """Add to the gradients of the field's parameters that ask for them.
+
+        Args:
+            heading: (3, rays), unit vectors in the field's frame.
+        """
+
+
 class AbstractField(ABC):
     """Radiance field in its own frame: density and linear radiance at a point.
 
@@ -71,6 +118,15 @@ class AbstractField(ABC):
     @abstractmethod
     def density_bound(self) -> float:
         """Return an upper bound of the density, 1/metre, for delta tracking."""
+
+    def points(self, capacity: int) -> AbstractPoints | None:
+        """Return a collection where that is faster than differentiating :meth:`eval`.
+
+        Args:
+            capacity: number of points that fit.
+        """
+        del capacity
+        return None
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""

@@ -21,6 +21,7 @@ from mi_nerfattack.fields.grid import (
     flat_parameter,
     level_growth,
 )
+from mi_nerfattack.fields.ngp_points import NGPPoints
 from mi_nerfattack.fields.occupancy import Occupancy
 
 GEOMETRY_FEATURES = 16
@@ -94,6 +95,7 @@ class NGPField(AbstractField):
     """
 
     kind = "ngp_field"
+    sh_order = SH_ORDER
 
     def __init__(
         self,
@@ -165,17 +167,38 @@ class NGPField(AbstractField):
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
         """Evaluate density and radiance; see :meth:`AbstractField.eval`."""
-        geometry = self._geometry(point, active)
+        features = self.encoding(self.clipped(point), active)
+        density, radiance = self.decode(features, direction)
+        return density & active, radiance & active
+
+    def clipped(self, point: mi.Point3f) -> mi.Point3f:
+        """Map a point of the field's frame to where the encoding is looked up."""
+        return dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
+
+    def decode(
+        self, features: list[mi.Float], direction: mi.Vector3f
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Run the networks, from features (n,) each to density and radiance."""
+        geometry = [mi.Float(x) for x in self.density_net(self._coop(features))]
         harmonics = dr.sh_eval(mi.Vector3f(direction), SH_ORDER)
-        vector = self._coop(geometry, harmonics)
-        raw = [mi.Float(x) for x in self.colour_net(vector)]
-        density = self.density_scale * dr.exp(dr.minimum(geometry[0], 15.0))
-        return density & active, _activate(raw) & active
+        raw = [mi.Float(x) for x in self.colour_net(self._coop(geometry, harmonics))]
+        return self.activate(geometry[0], raw)
+
+    def activate(
+        self, geometry: mi.Float, raw: list[mi.Float]
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Turn the networks' raw density (n,) and colours 3 x (n,) into quantities."""
+        return self.density_scale * dr.exp(dr.minimum(geometry, 15.0)), _activate(raw)
 
     def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Evaluate density alone, (n,), 1/metre."""
         raw = self._geometry(point, active)[0]
         return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
+
+    def points(self, capacity: int) -> NGPPoints | None:
+        """Return a collection on a CPU, where networks are products of matrices."""
+        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        return NGPPoints(self, capacity) if on_cpu else None
 
     def density_bound(self) -> float:
         """Estimate a bound: twice the largest density at a million random points.
@@ -190,8 +213,7 @@ class NGPField(AbstractField):
         return 2 * float(dr.max(self.density(world, mi.Bool(True)))[0])
 
     def _geometry(self, point: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
-        features = self.encoding(unit, active)
+        features = self.encoding(self.clipped(point), active)
         return [mi.Float(x) for x in self.density_net(self._coop(features))]
 
     def _coop(self, *values: Any) -> nn.CoopVec:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.march import March, Rays, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 
@@ -31,7 +32,7 @@ class Task:
     """A part of a backward pass.
 
     Attributes:
-        rays: m of the rays.
+        rays: m of the rays, with the gains of the fields to march.
         primal: what they gave.
         cotangent: derivative of the objective by `primal`.
         fields: indices of the fields to march.
@@ -125,7 +126,7 @@ class DepthComposite(AbstractComposite):
 
     def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`; a layer is the field alone."""
-        layers = [march(item, *rays, stop) for item in posed]
+        layers = [march(item, *rays, stop) for item in rays.light(posed)]
         return Seen(depth_composite(layers), layers)
 
     def forward(
@@ -137,7 +138,7 @@ class DepthComposite(AbstractComposite):
             march_derivative(mode, item, *rays, layer, none, stop)[0]
             if item.field.has_gradients
             else none
-            for item, layer in zip(posed, seen.layers, strict=True)
+            for item, layer in zip(rays.light(posed), seen.layers, strict=True)
         ]
         with dr.resume_grad():
             leaves = [layer.copy() for layer in seen.layers]
@@ -164,8 +165,8 @@ class DepthComposite(AbstractComposite):
 
     def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
-        mode = dr.ADMode.Backward
-        march_derivative(mode, posed[0], *task.rays, task.primal, task.cotangent, stop)
+        (item,) = task.rays.light(posed)
+        march_gradient(item, task.rays, task.primal, task.cotangent, stop)
 
     def backward_rays(
         self,
@@ -178,7 +179,8 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.backward_rays`."""
         d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
         parts = self._cotangents(seen, cotangent)
-        for item, layer, part in zip(posed, seen.layers, parts, strict=True):
+        lit = rays.light(posed)
+        for item, layer, part in zip(lit, seen.layers, parts, strict=True):
             _, by_origin, by_direction = march_derivative(
                 dr.ADMode.Backward, item, *rays, layer, part, stop
             )
@@ -209,13 +211,16 @@ def select(
         return []
 
     def pick(value: Any) -> Any:
-        chosen = {}
-        for item in fields(value):
-            array = getattr(value, item.name)
-            one = dr.width(array) == 1  # for all rays
-            chosen[item.name] = array if one else dr.gather(type(array), array, index)
-        return type(value)(**chosen)
+        if isinstance(value, list):
+            return [pick(item) for item in value]
+        if is_dataclass(value):
+            names = [item.name for item in fields(value)]
+            return type(value)(**{name: pick(getattr(value, name)) for name in names})
+        one = dr.width(value) == 1  # for all rays
+        return value if one else dr.gather(type(value), value, index)
 
+    gains = [rays.gains[k] for k in which] if rays.gains else []
+    rays = replace(rays, gains=gains)
     return [Task(pick(rays), pick(primal), pick(cotangent), which)]
 
 

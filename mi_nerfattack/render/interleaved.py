@@ -15,6 +15,7 @@ from functools import reduce
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
@@ -26,6 +27,7 @@ from mi_nerfattack.render.march import (
     March,
     Rays,
     absorption,
+    march,
     private_gradients,
     seek,
 )
@@ -44,8 +46,12 @@ class InterleavedComposite(AbstractComposite):
 
     def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`."""
+        lit = rays.light(posed)
+        if len(lit) == 1:  # nothing to merge
+            share = march(lit[0], *rays, stop)
+            return Seen(share, [share])
         with dr.suspend_grad():
-            shares = _march(posed, rays, stop)
+            shares = _march(lit, rays, stop)
         return Seen(_total(shares), shares)
 
     def forward(
@@ -76,6 +82,10 @@ class InterleavedComposite(AbstractComposite):
     def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
         mode, rays = dr.ADMode.Backward, task.rays
+        if len(posed) == 1:
+            (item,) = rays.light(posed)
+            march_gradient(item, rays, task.primal, task.cotangent, stop)
+            return
         with dr.suspend_grad(), private_gradients():
             _derivative(mode, posed, rays, task.primal, task.cotangent, stop, False)
 
@@ -226,12 +236,12 @@ def _derivative(
     stop: float,
     with_rays: bool,
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
+    posed = rays.light(posed)
     paths, cursors = _enter_all(posed, rays)
     slopes = [_RayGradient() for _ in posed]
     tangent = March()
     active = mi.Bool(rays.active)
-    t = mi.Float(0)
-    tau = mi.Float(0)
+    t, tau = mi.Float(0), mi.Float(0)
     rest = primal.copy()  # what is still to come; opacity stays that of the ray
     while active:
         cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)

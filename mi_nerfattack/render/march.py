@@ -53,6 +53,8 @@ class Rays:
         t_max: (n,), metres; where the ray ends.
         jitter: (n,) in [0, 1), position of the sample in its interval.
         active: (n,) mask.
+        gains: factors of the radiance of each field, (3, n) each; none for 1. They
+            are constants of every derivative.
     """
 
     origin: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
@@ -60,10 +62,18 @@ class Rays:
     t_max: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
     jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
     active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    gains: list[mi.Color3f] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[Any]:
-        """Yield the attributes in the order that :func:`march` takes them."""
+        """Yield what :func:`march` takes after the field, in its order."""
         yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
+
+    def light(self, posed: list[PosedField]) -> list[PosedField]:
+        """Return the fields with the rays' gains, one each unless there are none."""
+        if not self.gains:
+            return posed
+        pairs = zip(posed, self.gains, strict=True)
+        return [item.with_gain(gain) for item, gain in pairs]
 
 
 @dataclass

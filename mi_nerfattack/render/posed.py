@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +88,26 @@ class PosedField:
         dr.make_opaque(
             self._columns, self._origin, self._inverse_scale, self._step, self._cone
         )
+        self._gain: mi.Color3f | None = None
+
+    def with_gain(self, gain: mi.Color3f) -> PosedField:
+        """Return this field with its radiance multiplied, ray by ray.
+
+        Args:
+            gain: (3, n) for the n rays of a march; a constant of its derivatives.
+        """
+        twin = copy.copy(self)
+        twin._gain = dr.detach(gain)
+        return twin
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether the radiance is multiplied ray by ray."""
+        return self._gain is not None
+
+    def in_world(self, density: mi.Float) -> mi.Float:
+        """Turn a density per metre of the field's frame into one per world metre."""
+        return density * self._inverse_scale
 
     def state(self) -> list[Any]:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
@@ -147,4 +168,6 @@ class PosedField:
     ) -> tuple[mi.Float, mi.Color3f]:
         """Evaluate at a local point: density in 1/(world metre), and radiance."""
         density, radiance = self.field.eval(point, direction, active)
-        return density * self._inverse_scale, radiance
+        if self._gain is not None:
+            radiance *= self._gain
+        return self.in_world(density), radiance
