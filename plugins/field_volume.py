@@ -55,6 +55,14 @@ def place_unit_cube(
     return copy
 
 
+def read_limit(props: mi.Properties) -> float:
+    """Read `density_limit`, 1/metre."""
+    limit = float(props.get("density_limit", float("inf")))
+    if not limit > 0:
+        raise InputError(f"density_limit: {limit}; must be positive, 1/metre")
+    return limit
+
+
 def read_quantity(props: mi.Properties) -> str:
     """Read `quantity`: what the volume evaluates to in a medium."""
     quantity = props.get("quantity", "density")
@@ -75,9 +83,11 @@ class AbstractFieldVolume(mi.Volume):
     def __init__(self, props: mi.Properties) -> None:
         spectrum.prepare()
         quantity, pose = read_quantity(props), read_pose(props)
+        limit = read_limit(props)
         field = read_field(props, self.kind)
         super().__init__(place_unit_cube(props, field, pose))
-        self.quantity, self.field = quantity, field
+        self.quantity, self.limit, self.field = quantity, limit, field
+        self.relit = bool(props.get("relit", False))
         self.posed = PosedField(field, pose)
         self.values = self.field.parameters()
 
@@ -110,7 +120,9 @@ class AbstractFieldVolume(mi.Volume):
     def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
         """Evaluate density (n,), 1/metre, or the luminance of the radiance."""
         density, colour = self._evaluate(it, active)
-        return density if self.quantity == "density" else mi.luminance(colour)
+        if self.quantity == "radiance":
+            return mi.luminance(colour)
+        return dr.minimum(density, self.limit) if self.limit < dr.inf else density
 
     def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
         """Evaluate radiance (3, n), linear RGB, seen along the field's +z."""
@@ -130,7 +142,7 @@ class AbstractFieldVolume(mi.Volume):
         """
         if self.quantity == "radiance":
             return 1.0
-        return self.field.density_bound() / self.posed.pose.scale
+        return min(self.field.density_bound() / self.posed.pose.scale, self.limit)
 
     def max_per_channel(self) -> list[float]:
         """Return :meth:`max` for each channel."""

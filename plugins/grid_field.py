@@ -16,15 +16,16 @@ class GridFieldVolume(AbstractFieldVolume):
     ``sigma_t`` (quantity ``density``) or ``albedo`` (quantity ``radiance``); inside
     ``field_emitter`` and ``field_integrator`` both are used.
 
-    ============  =========  =======  ========  =====================================
-    name          type       unit     default   meaning
-    ============  =========  =======  ========  =====================================
-    filename      string                        field file of ``mi-nerfattack asset``
-    to_world      transform  metre    identity  rotation, translation, uniform scale
-    quantity      string              density   ``density`` or ``radiance``
-    texture       tensor                        (n, 3) raw colours; differentiable
-    density       array                         (n,) raw densities; differentiable
-    ============  =========  =======  ========  =====================================
+    =============  =========  =======  ========  ====================================
+    name           type       unit     default   meaning
+    =============  =========  =======  ========  ====================================
+    filename       string                        file of ``mi-nerfattack asset``
+    to_world       transform  metre    identity  rotation, translation, uniform scale
+    quantity       string              density   ``density`` or ``radiance``
+    density_limit  float      1/metre  infinite  cuts the density, in media alone
+    texture        tensor                        (n, 3) raw colours; differentiable
+    density        array                         (n,) raw densities; differentiable
+    =============  =========  =======  ========  ====================================
 
     .. code-block:: xml
 
@@ -36,6 +37,10 @@ class GridFieldVolume(AbstractFieldVolume):
     .. code-block:: python
 
         {"type": "grid_field", "filename": "hydrant.safetensors"}
+
+    Media step by the largest density: where an object is as opaque as fitted ones are
+    (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass
+    more than a centimetre (0.7 %).
 
     Not differentiable: the pose. After a change of ``density`` the march skips no
     empty space, since what the file calls empty may have been filled.

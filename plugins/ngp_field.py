@@ -15,15 +15,16 @@ class NGPFieldVolume(AbstractFieldVolume):
     serves as ``sigma_t``; inside ``field_emitter`` and ``field_integrator`` density
     and radiance are used.
 
-    ==============  =========  =======  ========  ===================================
-    name            type       unit     default   meaning
-    ==============  =========  =======  ========  ===================================
-    filename        string                        field file of ``mi-nerfattack fit``
-    to_world        transform  metre    identity  rotation, translation, unif. scale
-    quantity        string              density   ``density`` or ``radiance`` (seen
-                                                  along the field's +z)
-    table, ...      array                         parameters; differentiable
-    ==============  =========  =======  ========  ===================================
+    =============  =========  =======  ========  ====================================
+    name           type       unit     default   meaning
+    =============  =========  =======  ========  ====================================
+    filename       string                        file of ``mi-nerfattack fit``
+    to_world       transform  metre    identity  rotation, translation, uniform scale
+    quantity       string              density   ``density`` or ``radiance`` (seen
+                                                 along the field's +z)
+    density_limit  float      1/metre  infinite  cuts the density, in media alone
+    table, ...     array                         parameters; differentiable
+    =============  =========  =======  ========  ====================================
 
     .. code-block:: xml
 
@@ -35,8 +36,8 @@ class NGPFieldVolume(AbstractFieldVolume):
 
         {"type": "ngp_field", "filename": "field.safetensors"}
 
-    Not differentiable: the pose. The majorant of the density is an estimate, see
-    ``NGPField.density_bound``.
+    Not differentiable: the pose. Media step by the largest density, an estimate (see
+    ``NGPField.density_bound``): ``density_limit`` makes it sharp and small.
     """
 
     kind = "ngp_field"

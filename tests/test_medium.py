@@ -133,6 +133,19 @@ def test_a_changed_density_reaches_the_medium(path: Path) -> None:
     np.testing.assert_allclose(a, b, atol=1e-5)
 
 
+def test_a_limit_cuts_density_and_majorant(path: Path, rng) -> None:
+    whole = mi.load_dict(own(path))
+    cut = mi.load_dict({**own(path), "density_limit": 1.0})
+    it = dr.zeros(mi.Interaction3f, 1000)
+    it.p = mi.Point3f(rng.uniform(-1, 1, (3, 1000)).astype(np.float32))
+    expected = np.minimum(whole.eval_1(it).numpy(), 1)
+    assert 0.1 < (expected == 1).mean() < 0.9
+    np.testing.assert_array_equal(cut.eval_1(it).numpy(), expected)
+    assert cut.max() == 1 < whole.max()
+    with pytest.raises(RuntimeError, match="density_limit: 0.0; must be positive"):
+        mi.load_dict({**own(path), "density_limit": 0.0})
+
+
 def gradients(loaded: mi.Scene, suffixes: tuple[str, ...]) -> list[np.ndarray]:
     """Differentiate a fixed random projection of an image."""
     params = mi.traverse(loaded)

@@ -70,6 +70,7 @@ class _Render(dr.CustomOp):
         self.set_grad_out((tangent.radiance, tangent.opacity))
 
     def backward(self) -> None:
-        radiance, opacity = self.grad_out()
+        total: Any = self.grad_out()
+        radiance, opacity = total
         cotangent = March(radiance, opacity, mi.Float(0))
         self.composite.backward_rays(*self.fixed, self.seen, cotangent, self.stop)
