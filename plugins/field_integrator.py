@@ -19,6 +19,7 @@ from mi_nerfattack.plugins.field_emitter import (
 from mi_nerfattack.render import spectrum
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.relight import LIGHT_SAMPLES, Relighting
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
@@ -37,16 +38,18 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     a pixel is the mean of its samples weighted by their opacity, infinite where none
     is above 0; ``mi.render`` returns it, the film alone holds depth times opacity.
 
-    ===========  ==========  ====  =======  =========================================
-    name         type        unit  default  meaning
-    ===========  ==========  ====  =======  =========================================
-    (nested)     volume                     ``grid_field``, ``ngp_field``; 1 or more
-    (nested)     integrator         none    renders surfaces and lights behind
-    composite    string             inter-  ``interleaved`` or ``depth``
-                                    leaved
-    stop         float              1e-3    transmittance at which a ray ends
-    jitter       bool               false   random instead of middle sample positions
-    ===========  ==========  ====  =======  =========================================
+    =============  ==========  =======  =============================================
+    name           type        default  meaning
+    =============  ==========  =======  =============================================
+    (nested)       volume               ``grid_field``, ``ngp_field``; 1 or more
+    (nested)       integrator  none     renders surfaces and lights behind
+    composite      string      inter-   ``interleaved`` or ``depth``
+                               leaved
+    stop           float       1e-3     transmittance at which a ray ends
+    jitter         bool        false    random instead of middle sample positions
+    relit_samples  integer     16       light samples a ray, for each field and for
+                                        what lies behind; only if a field is ``relit``
+    =============  ==========  =======  =============================================
 
     .. code-block:: xml
 
@@ -63,8 +66,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
 
         {"type": "field_integrator", "object": {"type": "grid_field", "filename": "f"}}
 
+    Volumes with ``relit`` true are inserted objects, lit by the scene's emitters: their
+    radiance counts as the reflectance of a diffuse surface, ``L = radiance E / pi``, at
+    their expected depth; all else, fields and surfaces, is darkened where they shadow
+    it. See ``render.relight`` for what this leaves out. Costs several marches a field.
+
     Differentiable in primal, forward and backward mode with respect to the fields'
-    parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces.
+    parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces, and
+    the light on relit objects, which is a constant.
     Monochromatic variants show luminance; spectral ones the linear spectrum of
     ``render.spectrum``; AOVs are RGB everywhere.
     """
@@ -84,6 +93,10 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         )
         self.posed = [volume.posed for volume in self.volumes]
         self.behind = others[0] if is_first else None
+        samples = int(props.get("relit_samples", LIGHT_SAMPLES))
+        relit = tuple(volume.relit for volume in self.volumes)
+        relighting = Relighting(relit, samples, self.stop)
+        self.relighting = relighting if any(relit) else None
         self._has_aovs = True
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -195,9 +208,11 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         t_max = self._surface(scene, ray, active)
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         if state_in is None:  # primal mode, or forward mode, which comes without
+            rays.gains, shadow = self._relight(scene, sampler, ray, rays)
             seen = self.composite.render(self.posed, rays, self.stop)
-            state_in = seen, self._behind(scene, sampler, ray, active)
-        seen, behind = state_in
+            behind = self._behind(scene, sampler, ray, active)
+            state_in = seen, self._darken(behind, shadow, ray), rays.gains
+        seen, behind, rays.gains = state_in
         if mode == dr.ADMode.Primal:
             radiance = self._over(seen.total, rays, behind, ray.wavelengths)
             return radiance, active, self._aovs(seen), state_in
@@ -241,6 +256,23 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             return None
         ray = mi.RayDifferential3f(ray)
         return self.behind.sample(scene, sampler, ray, active=active)[0]
+
+    def _relight(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
+    ) -> tuple[list[mi.Color3f], mi.Color3f | None]:
+        """Return the fields' gains, and that of what lies behind; none if not relit."""
+        if self.relighting is None:
+            return [], None
+        gains = self.relighting.gains(scene, sampler, self.posed, rays)
+        if self.behind is None:
+            return gains, None
+        shadow = self.relighting.behind(scene, sampler, self.posed, ray, rays.active)
+        return gains, shadow
+
+    def _darken(self, behind: Any, shadow: mi.Color3f | None, ray: mi.Ray3f) -> Any:
+        if shadow is None:
+            return behind
+        return behind * spectrum.reflectance(shadow, ray.wavelengths)
 
     def _over(self, total: March, rays: Rays, behind: Any, wavelengths: Any) -> Any:
         """Lay the fields over what is behind, as a spectrum."""

@@ -23,6 +23,8 @@ class GridFieldVolume(AbstractFieldVolume):
     to_world       transform  metre    identity  rotation, translation, uniform scale
     quantity       string              density   ``density`` or ``radiance``
     density_limit  float      1/metre  infinite  cuts the density, in media alone
+    relit          boolean             false     lit by the scene's emitters, in
+                                                 ``field_integrator`` alone
     texture        tensor                        (n, 3) raw colours; differentiable
     density        array                         (n,) raw densities; differentiable
     =============  =========  =======  ========  ====================================

@@ -1,0 +1,139 @@
+"""Where rays meet the surface of a field, as far as it has one, and its normal there.
+
+The point lies at the expected depth z (A.3). Moving a ray sideways changes z: on a
+surface ``dz/do = -n / (n . d)``, so the derivative of the expected depth by the ray's
+origin is a multiple of the normal. It is the replay of the march
+(:func:`march_derivative`) plus the part that the march leaves out, the face of the
+bounding box where the field begins at once: ``sigma (z - t_near) / a dt_near/do``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render.march import March, Rays, march, march_derivative
+from mi_nerfattack.render.posed import PosedField
+
+FAINT = 1e-2  # opacity below which there is no surface to speak of
+
+
+@dataclass
+class Surface:
+    """Points of surfaces, one a ray.
+
+    Attributes:
+        point: (3, n), metres in the world.
+        normal: (3, n), unit vectors on the side that rays come from.
+        active: (n,) mask; whether the ray meets anything.
+    """
+
+    point: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    normal: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0, 0, 1))
+    active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+
+
+class Geometry(AbstractField):
+    """The density of another field: black, and a constant of every derivative.
+
+    Args:
+        source: the field.
+    """
+
+    kind = "geometry"
+
+    def __init__(self, source: AbstractField) -> None:
+        self.source = source
+        self.lower, self.upper = source.lower, source.upper
+        self.step_m, self.cone = source.step_m, source.cone
+        self.occupancy: Occupancy = source.occupancy
+
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate the density; differentiable by `point` alone."""
+        del direction
+        with dr.suspend_grad(*self.source.arrays()):
+            return self.source.density(point, active), mi.Color3f(0)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return nothing: there is nothing to differentiate."""
+        return {}
+
+    def set_parameter(self, name: str, value: Any) -> NoReturn:
+        """Refuse; set it in the source."""
+        raise KeyError(f"{name}: a geometry has no parameters")
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return what the source's file stores."""
+        return self.source.tensors()
+
+    def metadata(self) -> dict[str, str]:
+        """Return what the source's header stores."""
+        return self.source.metadata()
+
+    def density_bound(self) -> float:
+        """Return the source's bound."""
+        return self.source.density_bound()
+
+
+def geometry(posed: PosedField) -> PosedField:
+    """Return the density of a posed field; see :class:`Geometry`."""
+    return PosedField(Geometry(posed.field), posed.pose)
+
+
+def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
+    """Find points at the expected depth of a field alone, and normals.
+
+    Where the opacity is below `FAINT`, or the field does not change along any
+    direction, the normal faces the ray. Not differentiable.
+
+    Args:
+        shape: a :func:`geometry`.
+        rays: n rays.
+        stop: transmittance below which a ray ends.
+
+    Source: appendix A.3 for the depth.
+    """
+    with dr.suspend_grad():
+        primal = march(shape, *rays, stop)
+        active = rays.active & (primal.opacity > 0)
+        rate = dr.select(active, 1 / primal.opacity, 0)
+        depth = dr.select(active, primal.moment * rate, 0)
+        by_depth = March(mi.Color3f(0), -depth * rate, rate)
+        mode = dr.ADMode.Backward
+        slope = march_derivative(mode, shape, *rays, primal, by_depth, stop)[1]
+        slope += rate * _entry_slope(shape, rays, depth, active)
+        length = dr.norm(slope)
+        clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)
+        normal = dr.select(clear, slope / length, -rays.direction)
+        away = dr.dot(normal, rays.direction) > 0
+        normal = dr.select(away, -normal, normal)
+        return Surface(rays.origin + depth * rays.direction, normal, active)
+
+
+def _entry_slope(
+    shape: PosedField, rays: Rays, depth: mi.Float, active: mi.Bool
+) -> mi.Vector3f:
+    """Differentiate by the origin what the depth owes to the face of the box."""
+    o, d = shape.to_local(rays.origin, rays.direction)
+    near, far = shape.interval(o, d, rays.t_max)
+    entered = active & (near > 0) & (near < far)
+    inner = o + dr.fma(1e-3, far - near, near) * d
+    distance, _ = shape.field.occupancy.query(shape.field.unit(inner), entered)
+    density, _ = shape.eval(inner, d, entered & (distance == 0))
+    # The face that is entered last: its plane fixes near by one coordinate alone.
+    to_face = mi.Vector3f(o + near * d)
+    lower = mi.Vector3f(*map(float, shape.field.lower))
+    upper = mi.Vector3f(*map(float, shape.field.upper))
+    gap = dr.abs(to_face - dr.select(d > 0, lower, upper)) / (upper - lower)
+    is_face = gap == dr.min(gap)
+    slope = dr.select(is_face, -1 / dr.select(is_face, d, 1), 0)
+    in_world = shape.to_world_gradient(mi.Vector3f(slope), mi.Vector3f(0))[0]
+    return dr.select(entered, density * (depth - near), 0) * in_world
