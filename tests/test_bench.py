@@ -14,7 +14,7 @@ import pytest
 import torch
 from small_fields import small_ngp
 
-from mi_nerfattack import cli
+from mi_nerfattack import cli, files
 from mi_nerfattack.bench.full_ngp import NGPData, enlarge, level_sizes
 from mi_nerfattack.bench.render import Worker
 from mi_nerfattack.bench.sides import peak_memory_mb
@@ -241,3 +241,14 @@ def test_the_table_has_a_ratio_for_each_speed():
     columns = [list(column.cells) for column in render_table(document).columns]
     assert columns[5][:3] == ["4.00"] * 3
     assert columns[7][:3] == ["2.00"] * 3
+
+
+def test_bench_composite_writes_figure_and_numbers(tmp_path, capsys, variant):
+    path = tmp_path / "composite.png"
+    arguments = ["bench", "composite", "--size", "48x24", "--json", "-o", str(path)]
+    assert cli.main(arguments) == 0
+    document = json.loads(capsys.readouterr().out)
+    by_height = {row["height_m"]: row for row in document["heights"]}
+    assert by_height[0.8]["largest"] < 1 / 255  # apart, both composites are exact
+    assert by_height[-0.75]["largest"] > by_height[0.8]["largest"]
+    assert files.read_image(path).shape[2] in (3, 4)

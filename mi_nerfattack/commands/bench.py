@@ -1,4 +1,4 @@
-"""``mi-nerfattack bench``: measure speed and memory beside a peer."""
+"""``mi-nerfattack bench``: measure speed and memory beside a peer, and accuracy."""
 
 from __future__ import annotations
 
@@ -76,12 +76,52 @@ class BenchRender:
             return render.run(settings, show)
 
 
-# A choice needs two members; the second is never offered.
+@dataclass(frozen=True)
+class BenchComposite:
+    """Tell how far the `depth` composite is from the exact, interleaved one.
+
+    Renders the bundled intersection with the hydrant above, on and in the road.
+    """
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("composite.png")
+    """Figure to write (.png)."""
+    size: str = "366x188"
+    """Width and height of the image, pixels."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """Render, print and draw."""
+        import json
+
+        from mi_nerfattack import files, variant
+
+        (size,) = _read_sizes((self.size,))
+        files.check_writable(self.output)
+        variant.ensure()
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            composite,
+        )
+        from mi_nerfattack.commands.bars import StageBars
+
+        with StageBars() as bars:
+            results, pictures = composite.run(
+                size, lambda done, total: bars.show("heights", done, total, f"{done}/{total}")
+            )
+        composite.write_figure(self.output, results, pictures)
+        if self.json:
+            print(json.dumps(composite.to_document(results, size), allow_nan=False))
+        else:
+            _print_composite(results)
+            print(f"figure written to {self.output}", file=sys.stderr)
+        return 0
+
+
 _Chosen = tyro.conf.OmitArgPrefixes[
     tyro.conf.OmitSubcommandPrefixes[
         Union[  # noqa: UP007  the members are no plain types
             Annotated[BenchRender, tyro.conf.subcommand("render")],
-            Annotated[None, tyro.conf.Suppress],
+            Annotated[BenchComposite, tyro.conf.subcommand("composite")],
         ]
     ]
 ]
@@ -89,13 +129,12 @@ _Chosen = tyro.conf.OmitArgPrefixes[
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure speed and memory beside a peer."""
+    """Measure speed, memory and accuracy."""
 
     command: _Chosen
 
     def run(self) -> int:
         """Run the chosen benchmark."""
-        assert self.command is not None  # the choice is required
         return self.command.run()
 
 
@@ -131,3 +170,31 @@ def _print(document: dict[str, Any]) -> None:
     console.print(table.render_table(document))
     for line in table.remarks(document):
         console.print(line, highlight=False, soft_wrap=True)
+
+
+def _print_composite(results: list[Any]) -> None:
+    import rich.box
+    import rich.table
+    from rich.console import Console
+
+    table = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD,
+        title="depth composite against interleaved, in the object's pixels",
+    )
+    for name in (
+        "foot above the road, m",
+        "mean, sRGB / 255",
+        "largest, sRGB / 255",
+        "pixels off by more than 1/255",
+        "mean of depth, m",
+    ):
+        table.add_column(name, justify="right")
+    for result in results:
+        table.add_row(
+            f"{result.height_m:+.2f}",
+            f"{255 * result.mean:.3f}",
+            f"{255 * result.largest:.1f}",
+            f"{100 * result.above_1_255:.1f} %",
+            f"{result.depth_mean_m:.4f}",
+        )
+    Console().print(table)
