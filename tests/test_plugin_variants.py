@@ -139,6 +139,8 @@ def interactions(rng: np.random.Generator) -> mi.Interaction3f:
 
 def evaluated(loaded: mi.Volume, method: str, it: mi.Interaction3f) -> Any:
     """Return a function that evaluates a volume as a flat array."""
+    if method == "eval_1":
+        return lambda: loaded.eval_1(it)
     return lambda: dr.ravel(getattr(loaded, method)(it))
 
 
@@ -150,10 +152,7 @@ def test_grid_field(grid: str, rng, method: str, name: str) -> None:
         pytest.skip("radiance does not depend on density")
     loaded = mi.load_dict(volume(grid, quantity=quantity))
     params, it = mi.traverse(loaded), interactions(rng)
-    output = evaluated(loaded, method, it)
-    if method == "eval_1":
-        output = lambda: loaded.eval_1(it)  # noqa: E731
-    found = Derivatives(params, name, output)
+    found = Derivatives(params, name, evaluated(loaded, method, it))
     field = loaded.field
     found.check(directions(rng, field, found.base.shape))
 
@@ -289,6 +288,30 @@ def test_objects_out_of_view(grid: str, rng, eye, target) -> None:
     for parameter in ("texture", "density"):
         found = problem(loaded, parameter)
         found.check_zero(rng.normal(0, 1, found.base.shape))
+
+
+@pytest.mark.parametrize("density", [-200.0, 9.0], ids=["opacity 0", "opacity 1"])
+def test_emitter_at_the_ends_of_opacity(tmp_path: Path, rng, density: float) -> None:
+    field = small.blob(rng, step_m=0.1)
+    raw = np.full(field.n_vertices, density / field.layout.levels)
+    field.set_parameter("density", raw.astype(np.float32))
+    name = write(tmp_path / "box.safetensors", field)
+    found = problem(scene(DIRECT, (3, 2, 1), **emitter(object=volume(name))), "texture")
+    direction = rng.normal(0, 1, found.base.shape)
+    if density > 0:
+        found.check([direction])
+    else:
+        found.check_zero(direction)
+
+
+@pytest.mark.parametrize("method", ["eval", "eval_1", "eval_3"])
+def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
+    loaded = mi.load_dict(volume(grid, quantity="radiance"))
+    it = interactions(rng)
+    it.p += mi.Vector3f(2, 0, 0)
+    output = evaluated(loaded, method, it)
+    found = Derivatives(mi.traverse(loaded), "texture", output)
+    found.check_zero(rng.normal(0, 1, found.base.shape))
 
 
 @pytest.mark.parametrize("composite", ["interleaved", "depth"])
