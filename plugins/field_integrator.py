@@ -220,7 +220,9 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             self._backward(rays, seen, behind, ray.wavelengths, δL)
             return δL, active, [], None
         tangent = self._forward(rays, seen, behind, ray.wavelengths)
-        return tangent, active, [], None
+        # Mitsuba writes this into the tangent of alpha, which is zero.
+        valid = mi.Bool(False)
+        return tangent, valid, [], None
 
     def _backward(
         self, rays: Rays, seen: Seen, behind: Any, wavelengths: Any, δL: Any
