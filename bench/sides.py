@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
-import resource
 import sys
 from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 
-from mi_nerfattack import files
+from mi_nerfattack.memory import peak_memory_mb
 from mi_nerfattack.render.camera import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route import Route
@@ -42,18 +40,6 @@ class AbstractSide(ABC):
     def memory(self) -> dict[str, float]:
         """Return the largest resident size of the process so far, in MB."""
         return {"peak_memory_mb": peak_memory_mb()}
-
-
-def peak_memory_mb() -> float:
-    """Return the largest resident size of this process so far, in MB.
-
-    Not from `getrusage` on Linux: there a new process starts with its parent's peak.
-    """
-    if sys.platform == "linux":
-        status = files.read_text("/proc/self/status")
-        return float(re.findall(r"VmHWM:\s*(\d+) kB", status)[0]) * 1024 / 1e6
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def route_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,6 @@ from small_fields import small_ngp
 from mi_nerfattack import cli, files
 from mi_nerfattack.bench.full_ngp import NGPData, enlarge, level_sizes
 from mi_nerfattack.bench.render import Worker
-from mi_nerfattack.bench.sides import peak_memory_mb
 from mi_nerfattack.bench.table import ROWS, render_table
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
 from mi_nerfattack.bench.torch_ngp import (
@@ -28,6 +27,7 @@ from mi_nerfattack.bench.torch_ngp import (
 )
 from mi_nerfattack.errors import InputError, NerfAttackError
 from mi_nerfattack.fields import NGPLayout, Occupancy
+from mi_nerfattack.memory import peak_memory_mb
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
@@ -217,9 +217,7 @@ def test_bad_arguments_are_refused(capsys, argument, value):
 def test_a_process_does_not_inherit_the_peak_of_its_parent():
     """A child that only imports the package, of a parent that holds 800 MB more."""
     ballast = np.ones(100_000_000)
-    code = (
-        "from mi_nerfattack.bench.sides import peak_memory_mb; print(peak_memory_mb())"
-    )
+    code = "from mi_nerfattack.memory import peak_memory_mb; print(peak_memory_mb())"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert 20 < float(run.stdout) < 700
     assert peak_memory_mb() > ballast.nbytes / 1e6

@@ -24,9 +24,9 @@ from mi_nerfattack.attack.world import (
     World,
     build_world,
     initial_states,
-    peak_memory_mb,
 )
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.memory import peak_memory_mb
 from mi_nerfattack.report.metrics import Drive, departure_limit
 from mi_nerfattack.rollout.loop import simulate, to_state
 from mi_nerfattack.rollout.sensor import AbstractSensor

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -180,9 +178,3 @@ def object_footprints(world: World) -> list[np.ndarray]:
         world_corners = posed.pose.scale * corners @ posed.pose.rotation.T
         outlines.append((world_corners + posed.pose.translation)[:, :2])
     return outlines
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak * (1e-6 if sys.platform == "darwin" else 1.024e-3)

@@ -106,7 +106,10 @@ class BenchComposite:
 
         with StageBars() as bars:
             results, pictures = composite.run(
-                size, lambda done, total: bars.show("heights", done, total, f"{done}/{total}")
+                size,
+                lambda done, total: bars.show(
+                    "heights", done, total, f"{done}/{total}"
+                ),
             )
         composite.write_figure(self.output, results, pictures)
         if self.json:

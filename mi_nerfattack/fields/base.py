@@ -119,14 +119,18 @@ class AbstractField(ABC):
     def density_bound(self) -> float:
         """Return an upper bound of the density, 1/metre, for delta tracking."""
 
-    def points(self, capacity: int) -> AbstractPoints | None:
-        """Return a collection where that is faster than differentiating :meth:`eval`.
+    @property
+    def collects_points(self) -> bool:
+        """Whether :meth:`points` is faster than the derivative of :meth:`eval`."""
+        return False
+
+    def points(self, capacity: int) -> AbstractPoints:
+        """Return an empty collection, where `collects_points` is true.
 
         Args:
             capacity: number of points that fit.
         """
-        del capacity
-        return None
+        raise NotImplementedError(f"{self.kind} with room for {capacity} points")
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""

@@ -195,10 +195,14 @@ class NGPField(AbstractField):
         raw = self._geometry(point, active)[0]
         return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
 
-    def points(self, capacity: int) -> NGPPoints | None:
-        """Return a collection on a CPU, where networks are products of matrices."""
-        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        return NGPPoints(self, capacity) if on_cpu else None
+    @property
+    def collects_points(self) -> bool:
+        """True on a CPU, where networks are products of matrices."""
+        return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+
+    def points(self, capacity: int) -> NGPPoints:
+        """Return an empty collection."""
+        return NGPPoints(self, capacity)
 
     def density_bound(self) -> float:
         """Estimate a bound: twice the largest density at a million random points.

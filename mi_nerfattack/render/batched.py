@@ -41,26 +41,26 @@ def march_gradient(
         cotangent: derivative of the objective by `primal`.
         stop: as given to :func:`march`.
     """
-    points = None if posed.has_gain else posed.field.points(CAPACITY)
-    if points is None:
+    if posed.has_gain or not posed.field.collects_points:
         mode = dr.ADMode.Backward
         march_derivative(mode, posed, *rays, primal, cotangent, stop)
         return
     start, width, total = 0, FIRST_RAYS, dr.width(rays.direction)
+    capacity = CAPACITY
     while start < total:
         width = min(width, total - start)
         index = dr.opaque(mi.UInt32, start) + dr.arange(mi.UInt32, width)
         part = [_pick(value, index) for value in (rays, primal, cotangent)]
+        points = posed.field.points(capacity)
         with dr.suspend_grad():
             heading = _collect(points, posed, *part, stop)
         count = points.count()
-        if count <= points.capacity:
+        if count <= capacity:
             with dr.resume_grad(), private_gradients():
                 points.accumulate(heading)
             start += width
         capacity = max(CAPACITY, count if width == 1 else 0)
         width = max(1, int(0.85 * width * CAPACITY / max(count, 1)))
-        points = posed.field.points(capacity)
 
 
 def _pick(value: Any, index: mi.UInt32) -> Any:

@@ -146,7 +146,8 @@ class DepthComposite(AbstractComposite):
             for leaf, tangent in zip(leaves, tangents, strict=True):
                 dr.set_grad(leaf, tangent)
             total = depth_composite(leaves)
-            return dr.forward_to(total, flags=dr.ADFlag.ClearEdges)
+            tangent: Any = dr.forward_to(total, flags=dr.ADFlag.ClearEdges)
+        return tangent
 
     def tasks(
         self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
