@@ -5,11 +5,15 @@ from __future__ import annotations
 import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
 
 # isort: split
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import small_fields as small
 
+from mi_nerfattack.fields import save_field
 from mi_nerfattack.render import spectrum
 
 COLOURS = [*np.eye(3), np.ones(3), np.array([0.2, 0.5, 0.9]), np.array([7.0, 0.1, 0])]
@@ -52,6 +56,24 @@ def test_basis_is_a_partition_into_reflectances() -> None:
 def test_every_colour_comes_back_from_its_spectrum(values: np.ndarray) -> None:
     spectrum.prepare()
     np.testing.assert_allclose(seen(values), values, atol=1e-3 * values.max())
+
+
+@pytest.mark.usefixtures("spectral")
+def test_an_opaque_field_shows_its_colour_on_film(tmp_path: Path) -> None:
+    field = small.homogeneous(1e4)
+    raw = np.array([0.9, -0.2, -1.0])
+    texture = np.tile(raw / 2, (field.n_vertices, 1))
+    field.set_parameter("texture", texture.astype(np.float32))
+    save_field(tmp_path / "box.safetensors", field)
+    volume = {"type": "grid_field", "filename": str(tmp_path / "box.safetensors")}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at([3, 0, 0], [0, 0, 0], [0, 0, 1])
+    sensor = {"type": "perspective", "fov": 20, "to_world": view, "film": film}
+    fields = {"type": "field_integrator", "object": volume}
+    scene = {"type": "scene", "fields": fields, "sensor": sensor}
+    image = np.array(mi.render(mi.load_dict(scene, parallel=False), spp=8192))
+    found = image[..., :3].mean((0, 1))
+    np.testing.assert_allclose(found, small.sigmoid_to_linear(raw), atol=1e-3)
 
 
 @pytest.mark.usefixtures("spectral")
