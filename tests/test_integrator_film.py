@@ -126,7 +126,8 @@ def test_every_sensor_of_a_scene(grid, rng) -> None:
         alone = np.array(mi.render(fields(view, object=grid), spp=2, seed=1))
         for sensor in (index, loaded.sensors()[index]):
             image = np.array(mi.render(loaded, sensor=sensor, spp=2, seed=1))
-            np.testing.assert_array_equal(image[..., :4], alone[..., :4])
+            # filters splat in the order of the threads
+            np.testing.assert_allclose(image[..., :4], alone[..., :4], atol=1e-6)
         found = derivatives(loaded, 3, 2, sensor=index)
         found.check([rng.normal(0, 1, found.base.shape)])
 

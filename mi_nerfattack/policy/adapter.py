@@ -131,17 +131,22 @@ def to_torch(array: Any) -> torch.Tensor:
     values = dr.detach(array)
     dr.eval(values)
     dr.sync_thread()
-    return values.torch()
+    if dr.backend_v(values) == dr.JitBackend.CUDA:
+        return values.torch()
+    # DLPack runs Python inside of C++ that drops a Ctrl-C; NumPy's memory does not
+    return torch.from_numpy(values.numpy())
 
 
 def to_tensor(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit tensor of the type of `like`; evaluated, never a literal."""
-    return type(like)(_settled(value, like))
+    settled = _settled(value, like)
+    return type(like)(settled if settled.is_cuda else settled.numpy())
 
 
 def to_row(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
-    return dr.array_t(like)(_settled(value, like))
+    settled = _settled(value, like)
+    return dr.array_t(like)(settled if settled.is_cuda else settled.numpy())
 
 
 def _settled(value: torch.Tensor, like: Any) -> torch.Tensor:
