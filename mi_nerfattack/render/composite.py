@@ -195,11 +195,7 @@ class DepthComposite(AbstractComposite):
             leaves = [layer.copy() for layer in seen.layers]
             dr.enable_grad(leaves)
             total = depth_composite(leaves)
-            dr.backward_from(
-                dr.dot(total.radiance, cotangent.radiance)
-                + total.opacity * cotangent.opacity
-                + total.moment * cotangent.moment
-            )
+            dr.backward_from(total.pair(cotangent))
             return [dr.grad(leaf) for leaf in leaves]
 
 

@@ -195,14 +195,7 @@ def _segment(
 
 
 def _total(shares: list[March]) -> March:
-    total = shares[0]
-    for share in shares[1:]:
-        total = March(
-            total.radiance + share.radiance,
-            total.opacity + share.opacity,
-            total.moment + share.moment,
-        )
-    return total
+    return reduce(lambda a, b: _masked_sum(a, b, mi.Bool(True)), shares)
 
 
 @dr.syntax
@@ -251,7 +244,7 @@ def _derivative(
             values, places = _evaluate(posed, paths, here, with_rays)
             rest, change = _change(values, here, tau, rest)
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                dr.backward_from(dr.select(active, _pair(cotangent, change), 0))
+                dr.backward_from(dr.select(active, cotangent.pair(change), 0))
                 slopes = _collect(slopes, places, here.t, active, with_rays)
             else:
                 tangent = _masked_sum(tangent, dr.forward_to(change), active)
@@ -353,14 +346,6 @@ def _evaluate(
         values.append(item.eval(point, heading, inside))
         places.append((point, heading))
     return values, places
-
-
-def _pair(cotangent: March, change: March) -> mi.Float:
-    return (
-        dr.dot(cotangent.radiance, change.radiance)
-        + cotangent.opacity * change.opacity
-        + cotangent.moment * change.moment
-    )
 
 
 def _masked_sum(total: March, change: March, active: mi.Bool) -> March:

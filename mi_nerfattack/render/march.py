@@ -102,6 +102,14 @@ class March:
         opacity, moment = dr.detach(self.opacity), dr.detach(self.moment)
         return March(colour, mi.Float(opacity), mi.Float(moment))
 
+    def pair(self, other: March) -> mi.Float:
+        """Return the inner product with another march, ray by ray (n,)."""
+        return (
+            dr.dot(self.radiance, other.radiance)
+            + self.opacity * other.opacity
+            + self.moment * other.moment
+        )
+
     @property
     def depth(self) -> mi.Float:
         """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
