@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -15,6 +12,7 @@ from mi_nerfattack.render.march import (
     Rays,
     absorption,
     march_derivative,
+    pick_rays,
     private_gradients,
     seek,
 )
@@ -50,7 +48,7 @@ def march_gradient(
     while start < total:
         width = min(width, total - start)
         index = dr.opaque(mi.UInt32, start) + dr.arange(mi.UInt32, width)
-        part = [_pick(value, index) for value in (rays, primal, cotangent)]
+        part = [pick_rays(value, index) for value in (rays, primal, cotangent)]
         points = posed.field.points(capacity)
         with dr.suspend_grad():
             heading = _collect(points, posed, *part, stop)
@@ -61,16 +59,6 @@ def march_gradient(
             start += width
         capacity = max(CAPACITY, count if width == 1 else 0)
         width = max(1, int(0.85 * width * CAPACITY / max(count, 1)))
-
-
-def _pick(value: Any, index: mi.UInt32) -> Any:
-    """Gather rays of a dataclass of arrays; one entry for all rays stays so."""
-    chosen = {}
-    for item in fields(value):
-        array = getattr(value, item.name)
-        many = isinstance(array, dr.ArrayBase) and dr.width(array) > 1
-        chosen[item.name] = dr.gather(type(array), array, index) if many else array
-    return type(value)(**chosen)
 
 
 @dr.syntax

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.render.batched import march_gradient
-from mi_nerfattack.render.march import March, Rays, march, march_derivative
+from mi_nerfattack.render.march import (
+    March,
+    Rays,
+    march,
+    march_derivative,
+    pick_rays,
+)
 from mi_nerfattack.render.posed import PosedField
 
 
@@ -207,18 +213,9 @@ def select(
     if not dr.width(index):
         return []
 
-    def pick(value: Any) -> Any:
-        if isinstance(value, list):
-            return [pick(item) for item in value]
-        if is_dataclass(value):
-            names = [item.name for item in fields(value)]
-            return type(value)(**{name: pick(getattr(value, name)) for name in names})
-        one = dr.width(value) == 1  # for all rays
-        return value if one else dr.gather(type(value), value, index)
-
     gains = [rays.gains[k] for k in which] if rays.gains else []
     rays = replace(rays, gains=gains)
-    return [Task(pick(rays), pick(primal), pick(cotangent), which)]
+    return [Task(*(pick_rays(x, index) for x in (rays, primal, cotangent)), which)]
 
 
 def depth_composite(layers: list[March]) -> March:

@@ -195,7 +195,7 @@ def _segment(
 
 
 def _total(shares: list[March]) -> March:
-    return reduce(lambda a, b: _masked_sum(a, b, mi.Bool(True)), shares)
+    return reduce(lambda a, b: a.plus(b, mi.Bool(True)), shares)
 
 
 @dr.syntax
@@ -247,7 +247,7 @@ def _derivative(
                 dr.backward_from(dr.select(active, cotangent.pair(change), 0))
                 slopes = _collect(slopes, places, here.t, active, with_rays)
             else:
-                tangent = _masked_sum(tangent, dr.forward_to(change), active)
+                tangent = tangent.plus(dr.forward_to(change), active)
         depth = dr.detach(_density(values)) * here.width
         tau += dr.select(active, depth, 0)
         t = dr.select(active, here.end, t)
@@ -346,14 +346,6 @@ def _evaluate(
         values.append(item.eval(point, heading, inside))
         places.append((point, heading))
     return values, places
-
-
-def _masked_sum(total: March, change: March, active: mi.Bool) -> March:
-    return March(
-        total.radiance + dr.select(active, change.radiance, 0),
-        total.opacity + dr.select(active, change.opacity, 0),
-        total.moment + dr.select(active, change.moment, 0),
-    )
 
 
 def _collect(

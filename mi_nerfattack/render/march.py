@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import drjit as dr
@@ -102,6 +102,14 @@ class March:
         opacity, moment = dr.detach(self.opacity), dr.detach(self.moment)
         return March(colour, mi.Float(opacity), mi.Float(moment))
 
+    def plus(self, other: March, active: mi.Bool) -> March:
+        """Add another march on the rays of a mask (n,)."""
+        return March(
+            self.radiance + dr.select(active, other.radiance, 0),
+            self.opacity + dr.select(active, other.opacity, 0),
+            self.moment + dr.select(active, other.moment, 0),
+        )
+
     def pair(self, other: March) -> mi.Float:
         """Return the inner product with another march, ray by ray (n,)."""
         return (
@@ -171,6 +179,16 @@ def seek(
         jump = dr.maximum(index + 1, dr.floor(posed.lattice_index(t_exit)))
         index = dr.select(searching, jump, index)
     return index, t, dr.maximum(width, 0), found
+
+
+def pick_rays(value: Any, index: mi.UInt32) -> Any:
+    """Gather rays of dataclasses and lists of arrays; one entry for all stays so."""
+    if isinstance(value, list):
+        return [pick_rays(item, index) for item in value]
+    if is_dataclass(value):
+        parts = {item.name: getattr(value, item.name) for item in fields(value)}
+        return type(value)(**{k: pick_rays(v, index) for k, v in parts.items()})
+    return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
 def absorption(x: mi.Float) -> tuple[mi.Float, mi.Float]:
@@ -324,9 +342,8 @@ def _march_derivative(
     tau = mi.Float(0)
     rest = mi.Color3f(primal.radiance)  # premultiplied radiance still to come
     rest_moment = mi.Float(primal.moment)
-    d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)  # along the ray so far
-    d_heading = mi.Vector3f(0)
-    out_radiance, out_opacity, out_moment = mi.Color3f(0), mi.Float(0), mi.Float(0)
+    d_origin, d_direction, d_heading = (mi.Vector3f(0) for _ in range(3))
+    tangent = March()
     while active:
         index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         point = mi.Point3f(o + t * d)
@@ -343,28 +360,23 @@ def _march_derivative(
             rest_moment -= weight * t
             by_density = dr.select(active, width, 0)
             shift = by_density * density
-            f_radiance = weight * colour + shift * (behind * value - rest)
-            f_opacity = shift * (1 - primal.opacity)
-            f_moment = shift * (behind * t - rest_moment)
+            change = March(
+                weight * colour + shift * (behind * value - rest),
+                shift * (1 - primal.opacity),
+                shift * (behind * t - rest_moment),
+            )
             if dr.hint(backward, mode="scalar"):
-                dr.backward_from(
-                    dr.dot(cotangent.radiance, f_radiance)
-                    + cotangent.opacity * f_opacity
-                    + cotangent.moment * f_moment
-                )
+                dr.backward_from(cotangent.pair(change))
                 d_point = dr.select(active, mi.Vector3f(dr.grad(point)), 0)
                 d_origin += d_point
                 d_direction += t * d_point
                 d_heading += dr.select(active, dr.grad(towards), 0)
             else:
-                tangent = dr.forward_to(f_radiance, f_opacity, f_moment)
-                out_radiance += dr.select(active, tangent[0], 0)
-                out_opacity += dr.select(active, tangent[1], 0)
-                out_moment += dr.select(active, tangent[2], 0)
+                tangent = tangent.plus(dr.forward_to(change), active)
         tau += x
         index += 1
         active &= (behind > stop) & (index < MAX_INTERVALS)
     unit = d_heading - heading * dr.dot(heading, d_heading)
     d_direction += unit * dr.rcp(dr.norm(d))
     d_origin, d_direction = posed.to_world_gradient(d_origin, d_direction)
-    return March(out_radiance, out_opacity, out_moment), d_origin, d_direction
+    return tangent, d_origin, d_direction
