@@ -118,7 +118,7 @@ def images(
     count = 1 if mi.is_monochromatic else 3
 
     def output() -> mi.TensorXf:
-        if any(dr.grad_enabled(params[key]) for key in params.keys()):  # noqa: SIM118
+        if any(dr.grad_enabled(params[key]) for key in params.keys()):
             image = mi.render(scene, params, spp=spp, seed=seed + 4, seed_grad=seed)
         else:
             image = mi.render(scene, spp=spp, seed=seed)

@@ -107,6 +107,7 @@ class Relighting:
             si = scene.ray_intersect(ray, active)
             facing = dr.dot(si.n, ray.d) < 0
             normal = dr.select(facing, mi.Vector3f(si.n), -mi.Vector3f(si.n))
+            # `==` compares the pointer of each lane, which `is` would not
             shadowed = si.is_valid() & (si.emitter(scene, active) == None)  # noqa: E711
             surface = Surface(si.p, normal, active & shadowed)
             lit, unshadowed = self._irradiance(scene, sampler, surface, objects)
