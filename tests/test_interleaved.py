@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import small_fields as small
+from derivatives import central_difference
 
 from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
@@ -39,12 +40,6 @@ def pair(rng: np.random.Generator) -> list[PosedField]:
 def as_rows(seen: March) -> np.ndarray:
     rows = [*seen.radiance, seen.opacity, seen.moment]
     return np.stack([np.array(row) for row in rows])
-
-
-def difference(function, h: float) -> float:
-    coarse = (function(h) - function(-h)) / (2 * h)
-    fine = (function(h / 2) - function(-h / 2)) / h
-    return (4 * fine - coarse) / 3
 
 
 def test_absorption_against_float64() -> None:
@@ -155,7 +150,7 @@ def test_parameters_against_differences(rng, which: int) -> None:
         item.packed = mi.Float((base + s * tangent).astype(np.float32))
         return small.pairing(composite.render(fields, rays, 0.0).total, cotangent)
 
-    expected = difference(shifted, 2e-2)
+    expected = central_difference(shifted, 2e-2)
     item.packed = mi.Float(base)
     seen = composite.render(fields, rays, 0.0)
 
@@ -193,4 +188,4 @@ def test_rays_against_differences(rng: np.random.Generator) -> None:
 
         found = float((slope.numpy().astype(float) * tangent).sum())
         # Samples that cross the faces of cells, kinks of the field, cost accuracy.
-        assert found == pytest.approx(difference(shifted, 1e-3), rel=2e-2)
+        assert found == pytest.approx(central_difference(shifted, 1e-3), rel=2e-2)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import small_fields as small
+from derivatives import central_difference
 
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.march import March, march, march_derivative
@@ -54,13 +55,6 @@ class Setting:
         return result
 
 
-def difference(function: Callable[[float], float], h: float) -> float:
-    """Return the central difference of a function at 0, with Richardson's step."""
-    coarse = (function(h) - function(-h)) / (2 * h)
-    fine = (function(h / 2) - function(-h / 2)) / h
-    return (4 * fine - coarse) / 3
-
-
 @pytest.fixture
 def blob(rng: np.random.Generator) -> Setting:
     return Setting(rng, small.blob(rng))
@@ -87,7 +81,7 @@ def check_parameter(
         write(kind((base + s * tangent).astype(base.dtype)))
         return setting.objective()
 
-    expected = difference(shifted, h)
+    expected = central_difference(shifted, h)
     leaf = kind(base)
     dr.enable_grad(leaf)
     write(leaf)
@@ -170,7 +164,7 @@ def check_rays(setting: Setting, rng, h: float, tolerance: float) -> None:
 
     for function, gradient in ((by_origin, d_origin), (by_direction, d_direction)):
         found = float((gradient.numpy().astype(float) * tangent).sum())
-        expected = difference(function, h)
+        expected = central_difference(function, h)
         assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
 
 
