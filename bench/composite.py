@@ -145,7 +145,7 @@ def _render(
     """Return sRGB (n, 3), depth (n,), and where the object is (n,)."""
     seen = composite.render(fields, rays, 1e-4)
     total = seen.total
-    behind = fields[0].field.background(rays.direction)
+    behind = fields[0].background(rays.direction)
     linear = total.radiance + (1 - total.opacity) * behind
     dr.eval(linear, total, seen.layers[1].opacity)
     present = seen.layers[1].opacity.numpy() > _PRESENT

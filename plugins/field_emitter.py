@@ -193,8 +193,7 @@ def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
     """
     for volume in volumes:
         if volume.field.kind == "ngp_field":
-            _, heading = volume.posed.to_local(mi.Point3f(0), direction)
-            return volume.field.background(dr.normalize(heading))
+            return volume.posed.background(direction)
     return mi.Color3f(0)
 
 

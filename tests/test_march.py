@@ -322,3 +322,13 @@ def test_other_poses_and_textures_compile_nothing(rng: np.random.Generator) -> N
         look(-0.7, 1.0, 0.9)
         kernels = dr.kernel_history([dr.KernelType.JIT])
     assert kernels and all(kernel["cache_hit"] for kernel in kernels)
+
+
+def test_the_sky_turns_with_its_field() -> None:
+    field = small.small_ngp()
+    turned = PosedField(field, Pose.upright((5, 1, 0), np.pi / 2, 2.0))
+    # A quarter turn to the left brings what lay at +x to +y.
+    found = turned.background(mi.Vector3f(0, 0.8, 0.6)).numpy()
+    expected = field.background(mi.Vector3f(0.8, 0, 0.6)).numpy()
+    assert np.ptp(expected) > 0.01
+    np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -169,7 +169,7 @@ def _surrogate_layers(
     observation = sensor.observe(to_state(state), step)
     seen, rays = observation.seen, observation.rays
     assert seen is not None and rays is not None
-    behind = sensor.scene.field.background(rays.direction)
+    behind = sensor.scene.background(rays.direction)
     shape = (sensor.camera.height, sensor.camera.width)
     layers = _march_layers("", seen.total, shape)
     through = (1 - seen.total.opacity) * behind

@@ -56,7 +56,7 @@ class FieldViews:
         half, far = mi.Float(0.5), mi.Float(dr.inf)
         with dr.suspend_grad():
             result = march(self._posed, o, d, far, half, mi.Bool(True))
-            behind = self._posed.field.background(d)
+            behind = self._posed.background(d)
             if self.images.images.shape[3] == 4:
                 behind = mi.Color3f(_WHITE)
             colour = result.radiance + (1 - result.opacity) * behind

@@ -139,20 +139,20 @@ def to_torch(array: Any) -> torch.Tensor:
 
 def to_tensor(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit tensor of the type of `like`; evaluated, never a literal."""
-    settled = _settled(value, like)
-    return type(like)(settled if settled.is_cuda else settled.numpy())
+    return type(like)(_settled(value, like))
 
 
 def to_row(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
-    settled = _settled(value, like)
-    return dr.array_t(like)(settled if settled.is_cuda else settled.numpy())
+    return dr.array_t(like)(_settled(value, like))
 
 
-def _settled(value: torch.Tensor, like: Any) -> torch.Tensor:
+def _settled(value: torch.Tensor, like: Any) -> Any:
     """Bring a result into the scalar type of `like` and wait for its device."""
     scalar = torch.float64 if dr.type_v(like) == dr.VarType.Float64 else torch.float32
     value = value.detach().to(scalar).contiguous()
-    if value.is_cuda:  # Dr.Jit has a stream of its own
-        torch.cuda.current_stream(value.device).synchronize()
+    if not value.is_cuda:
+        return value.numpy()  # see `to_torch`
+    # Dr.Jit has a stream of its own
+    torch.cuda.current_stream(value.device).synchronize()
     return value

@@ -126,6 +126,15 @@ class PosedField:
         ]
         return mi.Point3f(*o), mi.Vector3f(*d)
 
+    def background(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Return what lies behind the field, (3, n), linear; it turns with the field.
+
+        Args:
+            direction: (3, n), unit vectors in the world.
+        """
+        _, heading = self.to_local(mi.Point3f(0), direction)
+        return self.field.background(dr.normalize(heading))
+
     def to_world_gradient(
         self, d_origin: mi.Vector3f, d_direction: mi.Vector3f
     ) -> tuple[mi.Vector3f, mi.Vector3f]:

@@ -228,7 +228,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         return [self.scene, *self.objects]
 
     def _develop(self, total: March, direction: mi.Vector3f) -> mi.Color3f:
-        behind = self.scene.field.background(direction)
+        behind = self.scene.background(direction)
         return linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
 
     def _tensor(self, pixels: mi.Color3f, count: int) -> mi.TensorXf:
