@@ -304,3 +304,28 @@ def test_capture_scene(tmp_path):
     # the ray through the bottom row hits the ground, z = 0
     bottom = np.isfinite(depth[:, -1, 8])
     np.testing.assert_array_less(height[bottom], depth[bottom, -1, 8])
+
+
+class TestCameras:
+    def test_shared(self):
+        images, poses = some_frames(2)
+        posed = PosedImages(images, poses, CAMERA, ("a", "b"))
+        assert posed.camera_of(1) is CAMERA
+
+    def test_one_each(self):
+        images, poses = some_frames(2)
+        other = Camera(12, 8, 20.0, 21.0, 6.0, 4.0)
+        posed = PosedImages(images, poses, CAMERA, ("a", "b"), cameras=(CAMERA, other))
+        assert posed.camera_of(0) is CAMERA and posed.camera_of(1) is other
+
+    @pytest.mark.parametrize(
+        ("cameras", "message"),
+        [
+            ((CAMERA,), "cameras: 1; must be one for each of 2"),
+            ((CAMERA, Camera(9, 8, 9.0, 9.0, 4.5, 4.0)), "b: its camera has 9 x 8 px"),
+        ],
+    )
+    def test_that_do_not_fit(self, cameras, message):
+        images, poses = some_frames(2)
+        with pytest.raises(InputError, match=message):
+            PosedImages(images, poses, CAMERA, ("a", "b"), cameras=cameras)

@@ -28,14 +28,16 @@ _HELD_OUT_EVERY = 8
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """Images of one camera from known poses.
+    """Images of one size from known poses.
 
     Args:
         images: (n, height, width, 3 or 4), uint8 sRGB; alpha is not premultiplied.
         camera_to_world: (n, 4, 4), OpenCV axes, float64.
-        camera: intrinsics shared by all images, in pixels of `images`.
+        camera: intrinsics shared by all images, in pixels of `images`; where
+            `cameras` is given, those of the first.
         names: n names for messages and reports.
         missing: names of frames that were left out because they have no image.
+        cameras: n intrinsics, where they differ between the images; else empty.
 
     Raises:
         InputError: the shapes contradict each other or a pose is not rigid.
@@ -46,6 +48,7 @@ class PosedImages:
     camera: Camera
     names: tuple[str, ...]
     missing: tuple[str, ...] = ()
+    cameras: tuple[Camera, ...] = ()
 
     def __post_init__(self) -> None:
         """Check shapes and poses."""
@@ -64,6 +67,21 @@ class PosedImages:
             )
         for name, matrix in zip(self.names, self.camera_to_world, strict=True):
             check_rigid(matrix, name)
+        if self.cameras and len(self.cameras) != n:
+            raise InputError(
+                f"cameras: {len(self.cameras)}; must be one for each of {n} images, "
+                "or none where all share `camera`"
+            )
+        for name, camera in zip(self.names, self.cameras, strict=False):
+            if (camera.height, camera.width) != size:
+                raise InputError(
+                    f"{name}: its camera has {camera.width} x {camera.height} px, the "
+                    f"images have {size[1]} x {size[0]} px; all must have one size"
+                )
+
+    def camera_of(self, index: int) -> Camera:
+        """Return the intrinsics of one image, in its pixels."""
+        return self.cameras[index] if self.cameras else self.camera
 
     def __len__(self) -> int:
         """Return the number of images."""
