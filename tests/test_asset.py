@@ -10,6 +10,7 @@ from PIL import Image
 
 from mi_nerfattack.capture import asset, views
 from mi_nerfattack.capture import mesh as meshes
+from mi_nerfattack.capture.mesh_files import load_mesh
 from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import from_fov, look_at
@@ -61,7 +62,7 @@ class TestMesh:
 
     def test_gltf_is_upright_not_mirrored_and_right_in_colour(self, tmp_path):
         axes_mesh(four_colours()).export(tmp_path / "plate.glb")
-        self.assert_four_colours(meshes.load_mesh(tmp_path / "plate.glb"))
+        self.assert_four_colours(load_mesh(tmp_path / "plate.glb"))
 
     def test_obj(self, tmp_path):
         four_colours().save(tmp_path / "four.png")
@@ -70,7 +71,7 @@ class TestMesh:
             "mtllib a.mtl\nv 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\n"
             "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl A\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
         )
-        self.assert_four_colours(meshes.load_mesh(tmp_path / "a.obj"))
+        self.assert_four_colours(load_mesh(tmp_path / "a.obj"))
 
     def test_missing_texture_and_material(self, tmp_path):
         (tmp_path / "a.mtl").write_text("newmtl A\nmap_Kd none.png\n")
@@ -79,16 +80,16 @@ class TestMesh:
             "vt 0 0\nvt 1 0\nvt 1 1\nusemtl A\nf 1/1 2/2 3/3\n"
         )
         with pytest.raises(InputError, match=r"a.obj: .*none.png"):
-            meshes.load_mesh(tmp_path / "a.obj")
+            load_mesh(tmp_path / "a.obj")
         (tmp_path / "a.mtl").unlink()
         with pytest.raises(InputError, match=r"a.obj: .*a.mtl"):
-            meshes.load_mesh(tmp_path / "a.obj")
+            load_mesh(tmp_path / "a.obj")
 
     def test_ply_vertex_colours_are_srgb_and_z_up(self, tmp_path):
         box = trimesh.creation.box((1, 1, 3))
         box.visual.vertex_colors = [100, 150, 200, 255]
         box.export(tmp_path / "box.ply")
-        mesh = meshes.load_mesh(tmp_path / "box.ply")
+        mesh = load_mesh(tmp_path / "box.ply")
         np.testing.assert_allclose(np.diff(mesh.bounds, axis=0)[0], [1, 1, 3])
         rgb = linear_to_uint8(seen_from_front(mesh))[16, 16]
         np.testing.assert_allclose(rgb.astype(int), [100, 150, 200], atol=2)
@@ -101,7 +102,7 @@ class TestMesh:
         )
         plate.visual = trimesh.visual.TextureVisuals(uv=None, material=material)
         scene.export(tmp_path / "plate.glb")
-        rgb = seen_from_front(meshes.load_mesh(tmp_path / "plate.glb"))[16, 16]
+        rgb = seen_from_front(load_mesh(tmp_path / "plate.glb"))[16, 16]
         np.testing.assert_allclose(rgb, [0.2, 0.4, 0.8], atol=5e-3)
 
     def test_node_transforms(self, tmp_path):
@@ -110,7 +111,7 @@ class TestMesh:
         scene.apply_transform(turn)
         scene.apply_translation([0, 0, 5])
         scene.export(tmp_path / "plate.glb")
-        bounds = meshes.load_mesh(tmp_path / "plate.glb").bounds
+        bounds = load_mesh(tmp_path / "plate.glb").bounds
         # turned about the view axis, 2 x 1 becomes 1 x 2; z = 5 becomes y = -5
         np.testing.assert_allclose(bounds, [[-1, -5, 0], [0, -5, 2]], atol=1e-6)
 
@@ -142,11 +143,11 @@ class TestMesh:
     def test_not_a_mesh(self, tmp_path, name, content):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=name):
-            meshes.load_mesh(tmp_path / name)
+            load_mesh(tmp_path / name)
 
     def test_no_file(self, tmp_path):
         with pytest.raises(InputError, match="none.glb"):
-            meshes.load_mesh(tmp_path / "none.glb")
+            load_mesh(tmp_path / "none.glb")
 
 
 class TestAsset:
@@ -189,7 +190,7 @@ class TestAsset:
 
     @pytest.mark.parametrize("name", ["CesiumMilkTruck.glb", "Duck.glb"])
     def test_real_meshes(self, data_folder, name):
-        mesh = meshes.load_mesh(data_folder / "assets" / name)
+        mesh = load_mesh(data_folder / "assets" / name)
         mesh = meshes.normalise(mesh, height_m=2.0)
         images, _ = asset.render_asset(mesh, 2, 32)
         coverage = (images.images[..., 3] > 0).mean()

@@ -48,7 +48,8 @@ class Asset:
         from mi_nerfattack import variant
         from mi_nerfattack.capture.asset import render_asset
         from mi_nerfattack.capture.fit import FitOptions, fit_grid
-        from mi_nerfattack.capture.mesh import load_mesh, normalise
+        from mi_nerfattack.capture.mesh import normalise
+        from mi_nerfattack.capture.mesh_files import load_mesh
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.fit_report import (
             check_output,
