@@ -115,7 +115,7 @@ class TestTransforms:
 
     def test_mixed_sizes(self, folder):
         files.write_image(folder / "images/0002.png", np.zeros((8, 10, 3), np.uint8))
-        with pytest.raises(InputError, match="0002.png: 10 x 8 px"):
+        with pytest.raises(InputError, match="0002.png: 10 x 8 px, but .*0000.png has 12 x 8 px"):
             read_transforms(folder)
 
     @pytest.mark.parametrize(
@@ -127,7 +127,10 @@ class TestTransforms:
             (lambda t: t.update(k3=0.1), "k3"),
             (lambda t: t.update(camera_model="OPENCV_FISHEYE"), "camera_model"),
             (lambda t: t.update(k1=-50.0), "k1"),
-            (lambda t: t["frames"][1].update(fl_x=11.0), "fl_x: differs"),
+            (lambda t: t["frames"][1].update(fl_x=0.0), "fl_x, fl_y: 0.0"),
+            (lambda t: t["frames"][1].update(h=8.5), "h: 8.5"),
+            (lambda t: t.update(distortion_params=[0.1]), "distortion_params"),
+            (lambda t: t.update(distortion_params=[0, 0, 0.1, 0, 0, 0]), "k3"),
             (lambda t: t.update(frames=[]), "frames"),
             (lambda t: t["frames"][1].pop("file_path"), r"frames\[1\].file_path"),
             (lambda t: t["frames"][1].pop("transform_matrix"), r"\[1\].transform_m"),

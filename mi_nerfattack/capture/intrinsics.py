@@ -1,4 +1,4 @@
-"""The camera described by a `transforms.json` file."""
+"""The cameras described by a `transforms.json` file."""
 
 from __future__ import annotations
 
@@ -12,41 +12,83 @@ from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.conventions import COLMAP_MODELS
 
 _NUMBERS = "w h fl_x fl_y cx cy camera_angle_x camera_angle_y k1 k2 p1 p2 k3 k4".split()
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order, distortion_params
 
 
-def read_camera(
+def read_cameras(
     source: Path,
     table: Mapping[str, Any],
     frames: Sequence[Mapping[str, Any]],
     image_shape: tuple[int, ...],
-) -> Camera:
-    """Build the one camera of all frames.
+) -> tuple[Camera, ...]:
+    """Build the cameras of all frames.
+
+    Reads `camera_model, w, h, fl_x, fl_y, cx, cy, camera_angle_x, camera_angle_y, k1,
+    k2, p1, p2` and nerfstudio's `distortion_params`.
 
     Args:
         source: the JSON file, for messages.
-        table: its content; a key in every frame takes precedence over the top level.
+        table: its content; a key in a frame takes precedence over the top level.
         frames: the frames in use.
-        image_shape: (height, width, ...) of the first image.
+        image_shape: (height, width, ...) of the first image, for frames without size.
+
+    Returns:
+        one camera per frame, equal where their numbers are.
 
     Raises:
-        InputError: unknown lens model, differing or missing intrinsics, or a size that
-            is not the image's.
+        InputError: unknown lens model, missing or impossible intrinsics, or those of
+            the first frame are for another size than its image.
     """
-    model = table.get("camera_model", "OPENCV")
-    if model not in COLMAP_MODELS or table.get("is_fisheye"):
+    known: dict[tuple[float | None, ...], Camera] = {}
+    cameras = []
+    for frame in frames:
+        merged = {**table, **frame}
+        _check_model(source, merged)
+        values = _numbers(source, merged)
+        if not cameras:
+            _check_first_size(source, values, image_shape)
+        key = tuple(values.values())
+        if key not in known:
+            known[key] = _camera(source, values, image_shape)
+        cameras.append(known[key])
+    return tuple(cameras)
+
+
+def _check_model(source: Path, merged: Mapping[str, Any]) -> None:
+    model = merged.get("camera_model", "OPENCV")
+    if model not in COLMAP_MODELS or merged.get("is_fisheye"):
         raise InputError(
             f"{source}: camera_model: {model!r}, is_fisheye: "
-            f"{table.get('is_fisheye', False)!r}; only {', '.join(COLMAP_MODELS)} "
-            "can be read"
+            f"{merged.get('is_fisheye', False)!r}; only {', '.join(COLMAP_MODELS)} "
+            "can be read; undistort the images first"
         )
-    values = {key: _shared_number(source, key, table, frames) for key in _NUMBERS}
+
+
+def _numbers(source: Path, merged: Mapping[str, Any]) -> dict[str, float | None]:
+    values = {key: _number(source, key, merged.get(key)) for key in _NUMBERS}
+    lens = merged.get("distortion_params")
+    if lens is not None:
+        if not isinstance(lens, list) or len(lens) != len(_LENS):
+            raise InputError(
+                f"{source}: distortion_params: {lens!r}; must be six numbers, "
+                f"{', '.join(_LENS)}"
+            )
+        for key, value in zip(_LENS, lens, strict=True):
+            values[key] = _number(source, f"distortion_params, {key}", value)
     for key in ("k3", "k4"):
         if values[key]:
             raise InputError(
                 f"{source}: {key}: {values[key]}; only k1, k2, p1, p2 are supported; "
                 "calibrate with four coefficients or undistort the images"
             )
-    width, height = _size(source, values, image_shape)
+    return values
+
+
+def _camera(
+    source: Path, values: Mapping[str, float | None], image_shape: tuple[int, ...]
+) -> Camera:
+    width = _size(source, "w", values["w"], image_shape[1])
+    height = _size(source, "h", values["h"], image_shape[0])
     fl_x, fl_y = _focal_lengths(source, values, width, height)
     try:
         return Camera(
@@ -62,23 +104,28 @@ def read_camera(
         raise InputError(f"{source}: {error}") from error
 
 
+def _check_first_size(
+    source: Path, values: Mapping[str, float | None], shape: tuple[int, ...]
+) -> None:
+    size = _or(values["w"], shape[1]), _or(values["h"], shape[0])
+    if size != (shape[1], shape[0]):
+        raise InputError(
+            f"{source}: w, h: {size[0]:g} x {size[1]:g}, but the first image has "
+            f"{shape[1]} x {shape[0]} px; give the images that were calibrated, or "
+            "scale the intrinsics"
+        )
+
+
 def _or(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-def _shared_number(
-    source: Path,
-    key: str,
-    table: Mapping[str, Any],
-    frames: Sequence[Mapping[str, Any]],
-) -> float | None:
-    values = {_number(source, key, f.get(key, table.get(key))) for f in frames}
-    if len(values) > 1:
-        raise InputError(
-            f"{source}: {key}: differs between frames ({sorted(map(str, values))[:2]}, "
-            "...); all frames must share one camera"
-        )
-    return values.pop()
+def _size(source: Path, key: str, value: float | None, default: int) -> int:
+    if value is None:
+        return default
+    if value < 1 or value != int(value):
+        raise InputError(f"{source}: {key}: {value:g}; must be a whole number of px")
+    return int(value)
 
 
 def _number(source: Path, key: str, value: Any) -> float | None:
@@ -89,18 +136,6 @@ def _number(source: Path, key: str, value: Any) -> float | None:
     if not math.isfinite(value):
         raise InputError(f"{source}: {key}: {value}; must be finite")
     return float(value)
-
-
-def _size(
-    source: Path, values: Mapping[str, float | None], shape: tuple[int, ...]
-) -> tuple[int, int]:
-    size = _or(values["w"], shape[1]), _or(values["h"], shape[0])
-    if size != (shape[1], shape[0]):
-        raise InputError(
-            f"{source}: w, h: {size[0]:g} x {size[1]:g}, but the first image has "
-            f"{shape[1]} x {shape[0]} px; the intrinsics must be those of the images"
-        )
-    return shape[1], shape[0]
 
 
 def _focal_lengths(
