@@ -1,9 +1,9 @@
-"""How well a field shows given images: PSNR, SSIM, and comparison pictures."""
+"""How well a field shows given images: PSNR, SSIM, hazy rays, and what it renders."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,11 +12,33 @@ import numpy as np
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.render.camera import generate_rays, pose_arrays
-from mi_nerfattack.render.march import March, march
+from mi_nerfattack.render.camera import Camera, generate_rays, pose_arrays
+from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
 
+HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
 _WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """What a field shows from one pose, one ray through the centre of each pixel.
+
+    Attributes:
+        image: (height, width, 3), float32, sRGB in [0, 1].
+        opacity: (height, width), float32.
+        depth: (height, width), float32, expected depth along the ray, metres;
+            infinite where the opacity is 0.
+    """
+
+    image: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def hazy(self) -> float:
+        """Share of rays whose opacity lies inside `HAZY`."""
+        return float(np.mean((self.opacity > HAZY[0]) & (self.opacity < HAZY[1])))
 
 
 @dataclass(frozen=True)
@@ -28,62 +50,97 @@ class ViewScore:
         name: of the image.
         psnr_db: of sRGB values in [0, 1], infinite for equal images.
         ssim: Wang et al. 2004, Gaussian window of 1.5 px, mean over channels.
+        hazy: share of rays that are neither solid nor free; see `Rendering.hazy`.
+        rendering: what the field shows; kept for the worst views alone.
     """
 
     index: int
     name: str
     psnr_db: float
     ssim: float
+    hazy: float = 0.0
+    rendering: Rendering | None = field(default=None, repr=False, compare=False)
 
 
-class FieldViews:
-    """Renders a field with one camera; one kernel for all views.
+class FieldRenderer:
+    """Renders a field from any pose; one kernel for all views of one size.
 
     Args:
-        field: the field; its background lies behind it, or white where the images
-            have alpha.
-        images: whose camera and poses are used.
+        field: the field.
+        over_white: put white behind it in place of its own background.
     """
 
-    def __init__(self, field: AbstractField, images: PosedImages) -> None:
-        self.images = images
-        self._posed = PosedField(field)
+    def __init__(self, field: AbstractField, over_white: bool = False) -> None:
+        self._posed, self._over_white = PosedField(field), over_white
 
-    def march(self, index: int) -> tuple[March, np.ndarray]:
-        """Render view `index`: its march, and its sRGB image (h, w, 3), float32."""
-        origin, rotation = pose_arrays(self.images.camera_to_world[index])
-        o, d = generate_rays(self.images.camera, origin, rotation, 1)
+    def render(self, camera: Camera, camera_to_world: np.ndarray) -> Rendering:
+        """Render one view.
+
+        Args:
+            camera: intrinsics.
+            camera_to_world: (4, 4), OpenCV axes, metres.
+        """
+        origin, rotation = pose_arrays(camera_to_world)
+        o, d = generate_rays(camera, origin, rotation, 1)
         half, far = mi.Float(0.5), mi.Float(dr.inf)
         with dr.suspend_grad():
             result = march(self._posed, o, d, far, half, mi.Bool(True))
             behind = self._posed.background(d)
-            if self.images.images.shape[3] == 4:
+            if self._over_white:
                 behind = mi.Color3f(_WHITE)
             colour = result.radiance + (1 - result.opacity) * behind
-            dr.eval(result, colour)
-        size = (self.images.camera.height, self.images.camera.width, 3)
-        return result, linear_to_srgb_numpy(colour.numpy().T.reshape(size))
+            depth = result.depth
+            dr.eval(colour, result.opacity, depth)
+        size = (camera.height, camera.width)
+        return Rendering(
+            linear_to_srgb_numpy(colour.numpy().T.reshape(*size, 3)),
+            result.opacity.numpy().reshape(size).copy(),
+            depth.numpy().reshape(size).copy(),
+        )
 
-    def reference(self, index: int) -> np.ndarray:
-        """Return image `index` over the same background, sRGB (h, w, 3), float32."""
-        image = self.images.images[index].astype(np.float32) / 255
-        if image.shape[2] == 3:
-            return image
-        alpha = image[..., 3:]
-        linear = alpha * srgb_to_linear_numpy(image[..., :3]) + (1 - alpha) * _WHITE
-        return linear_to_srgb_numpy(linear)
+
+def reference(images: PosedImages, index: int) -> np.ndarray:
+    """Return an image, over white if it has alpha, sRGB (height, width, 3), float32."""
+    image = images.images[index].astype(np.float32) / 255
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:]
+    linear = alpha * srgb_to_linear_numpy(image[..., :3]) + (1 - alpha) * _WHITE
+    return linear_to_srgb_numpy(linear)
 
 
 def evaluate(
-    field: AbstractField, images: PosedImages, indices: Iterable[int]
+    field: AbstractField, images: PosedImages, indices: Iterable[int], keep: int = 4
 ) -> list[ViewScore]:
-    """Score a field against images; those with alpha lie over white."""
-    views = FieldViews(field, images)
-    scores = []
+    """Score a field against images; those with alpha lie over white.
+
+    Args:
+        field: the field; its background lies behind it, or white where the images
+            have alpha.
+        images: the posed images.
+        indices: of the images to score.
+        keep: number of views, those of least PSNR, whose rendering is kept.
+
+    Returns:
+        a score for each index, in order.
+    """
+    renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
+    scores: list[ViewScore] = []
     for index in map(int, indices):
-        psnr, ssim = compare(views.march(index)[1], views.reference(index))
-        scores.append(ViewScore(index, images.names[index], psnr, ssim))
+        pose = images.camera_to_world[index]
+        rendering = renderer.render(images.camera_of(index), pose)
+        psnr, ssim = compare(rendering.image, reference(images, index))
+        name, hazy = images.names[index], rendering.hazy
+        scores.append(ViewScore(index, name, psnr, ssim, hazy, rendering))
+        kept = {score.index for score in worst_views(scores, keep)}
+        scores = [s if s.index in kept else replace(s, rendering=None) for s in scores]
     return scores
+
+
+def worst_views(scores: Iterable[ViewScore], count: int) -> list[ViewScore]:
+    """Return the views of least PSNR whose rendering is kept, worst first."""
+    kept = [score for score in scores if score.rendering is not None]
+    return sorted(kept, key=lambda score: score.psnr_db)[:count]
 
 
 def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
@@ -105,23 +162,18 @@ def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 
 
 def comparison(
-    field: AbstractField, images: PosedImages, scores: Sequence[ViewScore], rows: int
+    field: AbstractField,
+    images: PosedImages,
+    scores: Iterable[ViewScore],
+    rows: int,
 ) -> np.ndarray:
-    """Lay out the worst views, worst first: image, field, four times the difference.
-
-    Args:
-        field: the field.
-        images: the posed images.
-        scores: of the views to choose from, at least one.
-        rows: number of views shown.
-
-    Returns:
-        (rows * height, 3 * width, 3), uint8 sRGB.
-    """
-    views = FieldViews(field, images)
+    """Lay out the worst views, worst first: image, field, four times the difference."""
     strips = []
+    renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
     for score in sorted(scores, key=lambda score: score.psnr_db)[:rows]:
-        shown, wanted = views.march(score.index)[1], views.reference(score.index)
+        pose = images.camera_to_world[score.index]
+        shown = renderer.render(images.camera_of(score.index), pose).image
+        wanted = reference(images, score.index)
         difference = np.clip(4 * np.abs(shown - wanted), 0, 1)
         strips.append(np.concatenate([wanted, shown, difference], axis=1))
     return np.round(255 * np.concatenate(strips)).astype(np.uint8)
