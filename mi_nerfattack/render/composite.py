@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
 from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.march import (
     March,
@@ -17,7 +19,6 @@ from mi_nerfattack.render.march import (
     march_derivative,
     pick_rays,
 )
-from mi_nerfattack.render.posed import PosedField
 
 
 @dataclass
@@ -26,7 +27,7 @@ class Seen:
 
     Attributes:
         total: of everything along a ray.
-        layers: one march a field, in the order of the fields.
+        layers: one march a layer, in their order.
     """
 
     total: March = field(default_factory=March)
@@ -51,31 +52,35 @@ class Task:
 
 
 class AbstractComposite(ABC):
-    """Rule by which several fields along a ray become one colour.
+    """Rule by which several layers along a ray, mostly fields, become one colour.
 
     None of the methods is differentiable by Dr.Jit: :meth:`forward`,
     :meth:`backward` and :meth:`backward_rays` are the derivatives of :meth:`render`.
     """
 
+    def check(self, posed: Sequence[Layer]) -> None:
+        """Raise InputError if a layer is not among those that the rule can take."""
+        del posed
+
     @abstractmethod
-    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
-        """March rays through fields.
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
+        """March rays through layers.
 
         Args:
-            posed: the fields, at least one.
+            posed: the layers, at least one.
             rays: n rays.
             stop: transmittance below which a ray ends.
         """
 
     @abstractmethod
     def forward(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
     ) -> March:
         """Return the tangent of the total, from those of the fields' parameters."""
 
     def backward(
         self,
-        posed: list[PosedField],
+        posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
         cotangent: March,
@@ -95,7 +100,7 @@ class AbstractComposite(ABC):
 
     @abstractmethod
     def tasks(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
     ) -> list[Task]:
         """Say what :meth:`backward` has to march again.
 
@@ -104,13 +109,13 @@ class AbstractComposite(ABC):
         """
 
     @abstractmethod
-    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+    def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """Do one task of :meth:`backward`; `posed` are the fields that it names."""
 
     @abstractmethod
     def backward_rays(
         self,
-        posed: list[PosedField],
+        posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
         cotangent: March,
@@ -124,25 +129,26 @@ class AbstractComposite(ABC):
 
 
 class DepthComposite(AbstractComposite):
-    """Every field by itself, then folded front to back by expected depth.
+    """Every layer by itself, then folded front to back by expected depth.
 
-    Exact where fields do not overlap along a ray; see :func:`depth_composite`.
-    Cost: one march a field. Source: appendix A.4 to A.6.
+    Exact where layers do not overlap along a ray; see :func:`depth_composite`.
+    Takes backdrops as well as fields. Cost: one march a layer. Source: appendix A.4
+    to A.6.
     """
 
-    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`; a layer is the field alone."""
-        layers = [march(item, *rays, stop) for item in rays.light(posed)]
+        layers = [_see(item, rays, stop) for item in rays.light(posed)]
         return Seen(depth_composite(layers), layers)
 
     def forward(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
     ) -> March:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
         tangents = [
             march_derivative(mode, item, *rays, layer, none, stop)[0]
-            if item.field.has_gradients
+            if item.has_gradients
             else none
             for item, layer in zip(rays.light(posed), seen.layers, strict=True)
         ]
@@ -156,7 +162,7 @@ class DepthComposite(AbstractComposite):
         return tangent
 
     def tasks(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one for each field."""
         parts = self._cotangents(seen, cotangent)
@@ -164,20 +170,20 @@ class DepthComposite(AbstractComposite):
         return [
             task
             for k, item in enumerate(posed)
-            if item.field.has_gradients
+            if item.has_gradients
             for task in select(
                 seen.layers[k].opacity > 0, rays, seen.layers[k], parts[k], (k,)
             )
         ]
 
-    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+    def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
         (item,) = task.rays.light(posed)
         march_gradient(item, task.rays, task.primal, task.cotangent, stop)
 
     def backward_rays(
         self,
-        posed: list[PosedField],
+        posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
         cotangent: March,
@@ -186,7 +192,8 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.backward_rays`."""
         d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
         parts = self._cotangents(seen, cotangent)
-        lit = rays.light(posed)
+        purpose = "a backdrop is not differentiated by rays"
+        lit = rays.light(only_fields(posed, purpose, "keep the camera detached"))
         for item, layer, part in zip(lit, seen.layers, parts, strict=True):
             _, by_origin, by_direction = march_derivative(
                 dr.ADMode.Backward, item, *rays, layer, part, stop
@@ -203,6 +210,12 @@ class DepthComposite(AbstractComposite):
             total = depth_composite(leaves)
             dr.backward_from(total.pair(cotangent))
             return [dr.grad(leaf) for leaf in leaves]
+
+
+def _see(item: Layer, rays: Rays, stop: float) -> March:
+    if isinstance(item, AbstractBackdrop):
+        return item.march(rays, stop)
+    return march(item, *rays, stop)
 
 
 def select(
@@ -227,7 +240,7 @@ def depth_composite(layers: list[March]) -> March:
     Differentiable except in the order itself.
 
     Args:
-        layers: one march a field, each of n rays; at least one.
+        layers: one march a layer, each of n rays; at least one.
 
     Returns:
         the composite; its depth is the expected depth of all that is seen.

@@ -9,12 +9,14 @@ it, adds ``T δ phi(sigma δ) E`` to the radiance, ``phi(x) = (1 - exp(-x)) / x`
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.render.backdrop import Layer, only_fields
 from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
@@ -44,9 +46,13 @@ class InterleavedComposite(AbstractComposite):
     the total is the sum of the shares.
     """
 
-    def render(self, posed: list[PosedField], rays: Rays, stop: float) -> Seen:
+    def check(self, posed: Sequence[Layer]) -> None:
+        """See :meth:`AbstractComposite.check`."""
+        _fields(posed)
+
+    def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`."""
-        lit = rays.light(posed)
+        lit = rays.light(_fields(posed))
         if len(lit) == 1:  # nothing to merge
             share = march(lit[0], *rays, stop)
             return Seen(share, [share])
@@ -55,52 +61,52 @@ class InterleavedComposite(AbstractComposite):
         return Seen(_total(shares), shares)
 
     def forward(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, stop: float
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
     ) -> March:
         """See :meth:`AbstractComposite.forward`."""
-        if not any(item.field.has_gradients for item in posed):
+        fields, mode = _fields(posed), dr.ADMode.Forward
+        if not any(item.has_gradients for item in fields):
             return March()
         with dr.suspend_grad():
-            return _derivative(
-                dr.ADMode.Forward, posed, rays, seen.total, March(), stop, False
-            )[0]
+            return _derivative(mode, fields, rays, seen.total, March(), stop, False)[0]
 
     def tasks(
-        self, posed: list[PosedField], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one, which needs all fields."""
         met = [
             layer.opacity > 0
             for item, layer in zip(posed, seen.layers, strict=True)
-            if item.field.has_gradients
+            if item.has_gradients
         ]
         if not met:
             return []
         wanted = reduce(operator.or_, met)
         return select(wanted, rays, seen.total, cotangent, tuple(range(len(posed))))
 
-    def accumulate(self, posed: list[PosedField], task: Task, stop: float) -> None:
+    def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
-        mode, rays = dr.ADMode.Backward, task.rays
+        mode, rays, fields = dr.ADMode.Backward, task.rays, _fields(posed)
         if len(posed) == 1:
             (item,) = rays.light(posed)
             march_gradient(item, rays, task.primal, task.cotangent, stop)
             return
         with dr.suspend_grad(), private_gradients():
-            _derivative(mode, posed, rays, task.primal, task.cotangent, stop, False)
+            _derivative(mode, fields, rays, task.primal, task.cotangent, stop, False)
 
     def backward_rays(
         self,
-        posed: list[PosedField],
+        posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
         cotangent: March,
         stop: float,
     ) -> tuple[mi.Vector3f, mi.Vector3f]:
         """See :meth:`AbstractComposite.backward_rays`."""
+        fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
             _, d_origin, d_direction = _derivative(
-                dr.ADMode.Backward, posed, rays, seen.total, cotangent, stop, True
+                mode, fields, rays, seen.total, cotangent, stop, True
             )
         return d_origin, d_direction
 
@@ -109,6 +115,11 @@ COMPOSITES: dict[str, type[AbstractComposite]] = {
     "interleaved": InterleavedComposite,
     "depth": DepthComposite,
 }
+
+
+def _fields(posed: Sequence[Layer]) -> list[PosedField]:
+    purpose = "the interleaved composite cannot merge what has no density"
+    return only_fields(posed, purpose, "set composite to depth")
 
 
 @dataclass

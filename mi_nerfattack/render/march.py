@@ -28,7 +28,7 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
@@ -68,10 +68,10 @@ class Rays:
         """Yield what :func:`march` takes after the field, in its order."""
         yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
 
-    def light(self, posed: list[PosedField]) -> list[PosedField]:
+    def light(self, posed: Sequence[Any]) -> list[Any]:
         """Return the fields with the rays' gains, one each unless there are none."""
         if not self.gains:
-            return posed
+            return list(posed)
         pairs = zip(posed, self.gains, strict=True)
         return [item.with_gain(gain) for item, gain in pairs]
 

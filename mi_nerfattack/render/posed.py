@@ -101,6 +101,11 @@ class PosedField:
         return twin
 
     @property
+    def has_gradients(self) -> bool:
+        """Whether derivatives by the field's parameters are asked for."""
+        return self.field.has_gradients
+
+    @property
     def has_gain(self) -> bool:
         """Whether the radiance is multiplied ray by ray."""
         return self._gain is not None

@@ -1,0 +1,62 @@
+"""Layers of a depth composite that are constants: seen, never differentiated."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.posed import PosedField
+
+
+class AbstractBackdrop(ABC):
+    """What a ray shows of a scene that is no field.
+
+    It has no parameters and no density, so it can be laid over and under fields by
+    depth, and not be merged with them.
+
+    Attributes:
+        name: for messages.
+        has_gradients: false; as of a field, whether derivatives are asked for.
+    """
+
+    name: str
+    has_gradients = False
+
+    @abstractmethod
+    def march(self, rays: Rays, stop: float) -> March:
+        """Return what rays show: premultiplied linear radiance, opacity, moment.
+
+        Args:
+            rays: n rays; their jitter and gains count for nothing.
+            stop: transmittance below which a ray ends.
+        """
+
+    @abstractmethod
+    def state(self) -> list[Any]:
+        """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
+
+    def background(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Return what lies behind it, (3, n), linear: black."""
+        return dr.zeros(mi.Color3f, dr.width(direction))
+
+
+Layer = PosedField | AbstractBackdrop
+
+
+def only_fields(layers: Sequence[Layer], purpose: str, remedy: str) -> list[PosedField]:
+    """Return the layers, all of which must be fields.
+
+    Raises:
+        InputError: one of them is a backdrop; with its name.
+    """
+    fields = [item for item in layers if isinstance(item, PosedField)]
+    for item in layers:
+        if isinstance(item, AbstractBackdrop):
+            raise InputError(f"{item.name}: {purpose}; {remedy}")
+    return fields
