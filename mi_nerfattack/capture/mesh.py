@@ -255,6 +255,9 @@ def _product(texture: dict[str, Any]) -> Any:
         def is_spatially_varying(self) -> bool:
             return True
 
+        def to_string(self) -> str:
+            return f"Product[{self.texture}, {self.colours}]"
+
     return Product()
 
 
