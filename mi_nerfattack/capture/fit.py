@@ -68,8 +68,9 @@ def fit_ngp(
         upper: opposite corner, metres.
         layout: None for a small network (10 levels of 2^17, width 32).
         options: None for the defaults.
-        depth: (n, height, width), metres along the ray, infinite in the sky; it
-            places density and keeps free space free. None fits to colour alone.
+        depth: (n, height, width), metres along the ray, infinite in the sky, NaN
+            where it is unknown; it places density and keeps free space free. None
+            fits to colour alone.
         step_m: marching step; None for a thousandth of the longest edge.
         cone: growth of the step with distance.
         progress: called every 25 steps and at the end.
@@ -194,8 +195,8 @@ class _Fit:
     def _allowed(self, fitted: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
         lower, upper = self.field.lower, self.field.upper
         shape = grid_shape(lower, upper, self.options.occupancy_resolution)
-        if depth is None:
-            return np.ones(shape, bool)
+        if depth is None or np.isnan(depth[fitted]).any():
+            return np.ones(shape, bool)  # surfaces may lie where depth is unknown
         points = depth_points(self.images, depth, fitted, self.field.step_m)
         cells = cells_near_surfaces(points, lower, upper, shape)
         if not cells.any():
@@ -270,11 +271,14 @@ class _Fit:
         return self.bank.batch(dr.gather(mi.UInt32, index, order))
 
     def _ends(self, depth: Any) -> Any:
-        """End rays a little behind known surfaces: more samples would teach nothing."""
+        """End rays a little behind known surfaces: more samples would teach nothing.
+
+        Where depth is unknown (NaN) they go to the end of the box.
+        """
         if depth is None:
             return mi.Float(dr.inf)
         step = dr.maximum(self.field.step_m, self.field.cone * depth)
-        return depth + _STEPS_BEHIND * step
+        return dr.select(dr.isnan(depth), dr.inf, depth + _STEPS_BEHIND * step)
 
     def _fraction(self, done: int) -> float:
         fraction = done / self.options.steps

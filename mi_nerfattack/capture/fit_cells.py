@@ -43,15 +43,16 @@ def depth_points(
 
     Args:
         images: the posed images.
-        depth: (n, height, width), metres along the ray.
+        depth: (n, height, width), metres along the ray; infinite or unknown (NaN)
+            depths give no point.
         indices: of the images to use.
         reach_m: also yield the points this far before and behind the surface.
     """
     for index in indices:
         origin, rotation = pose_arrays(images.camera_to_world[index])
-        direction = generate_rays(images.camera, origin, rotation, 1)[1].numpy()
-        size = (images.camera.height, images.camera.width)
-        ray = direction.reshape(3, *size).astype(np.float64)
+        camera = images.camera_of(index)
+        direction = generate_rays(camera, origin, rotation, 1)[1].numpy()
+        ray = direction.reshape(3, camera.height, camera.width).astype(np.float64)
         inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0.0)
         eye = images.camera_to_world[index, :3, 3]
         for unit, t in (*_between(ray, inverse, 1), *_between(ray, inverse, 2)):

@@ -46,8 +46,9 @@ def loss_and_cotangent(
 
     Per ray, the mean over channels of the Huber loss between sRGB values, plus, where
     the batch has depths, the Huber loss of relative error of the depth moment (for
-    rays that hit something) and of opacity. The objective is the mean over rays;
-    derivatives reach `background` through Dr.Jit's graph.
+    rays that hit something) and of opacity; neither where depth is NaN, unknown. The
+    objective is the mean over rays; derivatives reach `background` through Dr.Jit's
+    graph.
 
     Args:
         primal: of the batch's rays, detached.
@@ -81,10 +82,12 @@ def loss_and_cotangent(
 
 
 def _geometry_loss(seen: March, depth: Any, weights: LossWeights) -> Any:
+    is_known = ~dr.isnan(depth)
     is_hit = dr.isfinite(depth)
     known = dr.select(is_hit, depth, 1)
     moment_error = dr.select(is_hit, seen.moment / known - 1, 0)
     opacity_error = seen.opacity - dr.select(is_hit, mi.Float(1), 0)
-    return weights.depth * huber(moment_error, _MOMENT_DELTA) + (
+    loss = weights.depth * huber(moment_error, _MOMENT_DELTA) + (
         weights.opacity * huber(opacity_error, _OPACITY_DELTA)
     )
+    return dr.select(is_known, loss, 0)

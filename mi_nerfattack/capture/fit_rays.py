@@ -25,8 +25,8 @@ class RayBatch:
         direction: (3, n), unit vectors.
         colour: (3, n), sRGB in [0, 1], not premultiplied.
         alpha: (n,), in [0, 1]; 1 where the images have none.
-        depth: (n,), metres along the ray, infinite where nothing is hit; None where
-            the images come without depth.
+        depth: (n,), metres along the ray, infinite where nothing is hit, NaN where it
+            is unknown; None where the images come without depth.
     """
 
     origin: Any
@@ -45,7 +45,8 @@ class RayBank:
     Args:
         images: posed images.
         indices: images to draw from, e.g. all that are not held out.
-        depth: (n, height, width), metres along the ray, of all images; or None.
+        depth: (n, height, width), metres along the ray, NaN where unknown, of all
+            images; or None.
         box: lower and upper corner, metres: only pixels whose rays meet the box are
             drawn. None draws from all.
 
