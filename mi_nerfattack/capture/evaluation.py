@@ -159,21 +159,3 @@ def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
         use_sample_covariance=False,
     )
     return psnr, float(ssim)
-
-
-def comparison(
-    field: AbstractField,
-    images: PosedImages,
-    scores: Iterable[ViewScore],
-    rows: int,
-) -> np.ndarray:
-    """Lay out the worst views, worst first: image, field, four times the difference."""
-    strips = []
-    renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
-    for score in sorted(scores, key=lambda score: score.psnr_db)[:rows]:
-        pose = images.camera_to_world[score.index]
-        shown = renderer.render(images.camera_of(score.index), pose).image
-        wanted = reference(images, score.index)
-        difference = np.clip(4 * np.abs(shown - wanted), 0, 1)
-        strips.append(np.concatenate([wanted, shown, difference], axis=1))
-    return np.round(255 * np.concatenate(strips)).astype(np.uint8)

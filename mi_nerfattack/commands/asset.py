@@ -21,7 +21,7 @@ class Asset:
     mesh: tyro.conf.Positional[Path]
     """glTF (.glb, .gltf), OBJ or PLY."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Field file to write (.safetensors); FILE.png beside it shows the worst views."""
+    """Field file to write (.safetensors); FILE.report beside it says how good it is."""
     height_m: float | None = None
     """Scale to this height, metres."""
     longest_m: float | None = None
@@ -92,5 +92,5 @@ class Asset:
                 progress=partial(show_fit, bars),
             )
         provenance = {"source": self.mesh.name, "seed": str(self.seed)}
-        finish(result, images, self.output, provenance, self.json)
+        finish(result, images, self.output, provenance, self.json, depth)
         return 0

@@ -22,7 +22,7 @@ class Fit:
     folder: tyro.conf.Positional[Path]
     """Folder with transforms.json and images, or the JSON file."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Field file to write (.safetensors); FILE.png beside it shows the worst views."""
+    """Field file to write (.safetensors); FILE.report beside it says how good it is."""
     long_edge: int | None = None
     """Reduce the images to this longer edge, pixels."""
     steps: int = 3000
@@ -85,5 +85,5 @@ class Fit:
                 progress=partial(show_fit, bars),
             )
         provenance = {"source": self.folder.name, "seed": str(self.seed)}
-        finish(result, images, self.output, provenance, self.json)
+        finish(result, images, self.output, provenance, self.json, depth)
         return 0

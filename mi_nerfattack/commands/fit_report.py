@@ -1,10 +1,9 @@
-"""What the fitting commands show and write: progress, scores, pictures, the file."""
+"""What the fitting commands show and write: progress, scores, the file, a report."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +13,10 @@ from rich.table import Table
 from mi_nerfattack.commands.bars import StageBars
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from mi_nerfattack.capture.fit import FitProgress, FitResult
     from mi_nerfattack.capture.frames import PosedImages
-
-_SHOWN_VIEWS = 4
 
 
 def show_fit(bars: StageBars, at: FitProgress) -> None:
@@ -49,25 +48,31 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: is a folder; give a file")
 
 
+def report_folder(output: Path) -> Path:
+    """Return the folder of the report that belongs to a field file."""
+    return output.with_suffix(".report")
+
+
 def finish(
     result: FitResult,
     images: PosedImages,
     output: Path,
     provenance: Mapping[str, str],
     as_json: bool,
+    depth: np.ndarray | None = None,
 ) -> None:
-    """Write the field and the picture of its worst views, and print the scores.
+    """Write the field and the report of its fit, and print the scores.
 
     Args:
         result: of the fit.
         images: that were fitted to.
-        output: field file; the picture has its name and the suffix .png.
+        output: field file; the report lies beside it, see `report_folder`.
         provenance: source and settings, for the file's header.
         as_json: print one line of JSON in place of the table.
+        depth: (n, height, width), metres along the ray, or None.
     """
-    from mi_nerfattack import files
-    from mi_nerfattack.capture.evaluation import comparison
     from mi_nerfattack.fields import save_field
+    from mi_nerfattack.report.fit_page import summary, write_fit_report
 
     result.field.info.update(
         {f"fit.{key}": value for key, value in provenance.items()}
@@ -78,9 +83,8 @@ def finish(
         }
     )
     save_field(output, result.field)
-    picture = output.with_suffix(".png")
-    worst = comparison(result.field, images, result.per_view, _SHOWN_VIEWS)
-    files.write_image(picture, worst)
+    title = f"Fit of {output.name}"
+    page = write_fit_report(report_folder(output), result, images, depth, title)
     if as_json:
         print(json.dumps(summary(result)))
         return
@@ -92,19 +96,8 @@ def finish(
     console = Console()
     console.print(table)
     console.print(
-        f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {picture} "
-        "(worst views: image, field, four times the difference).",
+        f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {page} "
+        "(is it good enough, worst views, depth, training curve).",
         soft_wrap=True,
         highlight=False,
     )
-
-
-def summary(result: FitResult) -> dict[str, object]:
-    """Return the scores as they are printed with --json."""
-    return {
-        "psnr_heldout_db": result.psnr_heldout_db,
-        "ssim_heldout": result.ssim_heldout,
-        "wall_s": result.wall_s,
-        "steps": result.steps,
-        "per_view": [asdict(score) for score in result.per_view],
-    }

@@ -6,7 +6,6 @@ are drawn with different widths and dashes too. Figures are 1200 pixels wide.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,13 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.report.charts import DPI, RC, WIDTH_PX, save
 from mi_nerfattack.report.metrics import CASES, ENVIRONMENTS, Drive
-
-WIDTH_PX = 1200
-DPI = 150
 
 _STYLES: dict[str, dict[str, Any]] = {
     "random": {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
@@ -42,13 +37,6 @@ _LABELS = {
     "gradient": "attacked (gradient)",
 }
 _LANE, _CENTRE, _OBJECT, _LIMIT = "#ececec", "#9a9a9a", "#F0C000", "#000000"
-_RC: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "savefig.facecolor": "white",
-}
 
 
 def overhead(
@@ -73,7 +61,7 @@ def overhead(
     objects = [_checked_points("object_footprints", o) for o in object_footprints]
     panels = _environments(drives)
     low, high = _view(drives, objects, lane_width_m)
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(RC):
         figure, axes = _map_panels(len(panels), low, high)
         for axis, (environment, group) in zip(axes, panels.items(), strict=True):
             _draw_lane(axis, route, lane_width_m)
@@ -90,7 +78,7 @@ def overhead(
             axis.set_xlabel("x (m)")
             axis.set_ylabel("y (m)")
         _legend_below(figure, _map_handles(drives, bool(objects), limit))
-        _save(path, figure)
+        save(path, figure)
 
 
 def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
@@ -105,7 +93,7 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         limit: departure limit, metres.
     """
     panels = _environments(drives)
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(RC):
         figure = Figure((WIDTH_PX / DPI, 3.3), DPI, layout="constrained")
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)
         for axis, (environment, group) in zip(grid[0], panels.items(), strict=True):
@@ -131,7 +119,7 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         label = f"departure limit {limit:.2f} m"
         handles.append(Line2D([], [], color=_LIMIT, linestyle=":", label=label))
         _legend_below(figure, handles)
-        _save(path, figure)
+        save(path, figure)
 
 
 def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -147,7 +135,7 @@ def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> Non
         raise InputError(f"history: each iteration needs the keys {', '.join(names)}")
     iterations = np.arange(len(history))
     marker = "o" if len(history) < 60 else ""
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(RC):
         figure = Figure((WIDTH_PX / DPI, 4.2), DPI, layout="constrained")
         for axis, (name, label) in zip(
             figure.subplots(2, 1, sharex=True), names.items(), strict=True
@@ -160,7 +148,7 @@ def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> Non
         figure.axes[0].set_title("Attack, per iteration", loc="left")
         figure.axes[-1].set_xlabel("iteration")
         figure.align_ylabels()
-        _save(path, figure)
+        save(path, figure)
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
@@ -275,9 +263,3 @@ def _legend_below(figure: Figure, handles: list[Any]) -> None:
     figure.legend(
         handles=handles, loc="outside lower center", ncols=columns, frameon=False
     )
-
-
-def _save(path: str | Path, figure: Figure) -> None:
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-    files.write_bytes(path, buffer.getvalue())

@@ -1,0 +1,278 @@
+"""The report of a fit: a folder with a page, its pictures, and its numbers."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack import files
+from mi_nerfattack.capture.evaluation import (
+    ViewScore,
+    evaluate,
+    reference,
+    worst_views,
+)
+from mi_nerfattack.capture.fit_options import FitResult
+from mi_nerfattack.capture.frames import PosedImages, held_out
+from mi_nerfattack.report.elements import STYLE, figure, pairs
+from mi_nerfattack.report.fit_plots import write_curve, write_histogram
+from mi_nerfattack.report.verdict import Criterion, judge, verdict
+from mi_nerfattack.report.view_pictures import (
+    SOLID,
+    ViewPair,
+    abs_difference,
+    write_colours,
+    write_depths,
+)
+
+_SHOWN_VIEWS = 4
+_FITTED_VIEWS = 4  # scored too, to see whether the field learnt images by heart
+
+_PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>$style</style>
+</head>
+<body>
+<header>
+<h1>$title</h1>
+<p>$verdict</p>
+</header>
+<main>
+<h2>Criteria</h2>
+<div class="scroll">$criteria</div>
+<h2>Summary</h2>
+<div class="scroll">$summary</div>
+<h2>Worst held-out views</h2>
+$worst
+<h2>Depth</h2>
+<p>$depth_note</p>
+$depth
+<h2>The fit</h2>
+$curve
+<h2>All held-out views</h2>
+$histogram
+<div class="scroll">$views</div>
+<h2>Settings</h2>
+<div class="scroll">$settings</div>
+</main>
+</body>
+</html>
+""")
+
+
+def write_fit_report(
+    folder: Path,
+    result: FitResult,
+    images: PosedImages,
+    depth: np.ndarray | None,
+    title: str,
+) -> Path:
+    """Write `report.html`, `metrics.json`, `worst.png`, `depth.png`, ... of a fit.
+
+    The page holds its pictures, and needs no network. Held-out views are not rendered
+    again; four of the others are, to compare fitted with held-out ones.
+
+    Args:
+        folder: made if needed; files of these names are replaced.
+        result: of the fit.
+        images: that were fitted to.
+        depth: (n, height, width), metres along the ray, infinite where nothing is
+            known; None if there is none.
+        title: of the page.
+
+    Returns:
+        Path of the page, which is written last.
+    """
+    root = files.make_folder(folder)
+    fitted = _fitted_scores(result, images)
+    fitted_db = float(np.mean([score.psnr_db for score in fitted]))
+    criteria = judge(result.per_view, fitted_db)
+    worst = worst_views(result.per_view, _SHOWN_VIEWS)
+    shown = [_pair(score, images, depth) for score in worst]
+    depth_m = _depth_error(shown)
+    write_colours(root / "worst.png", shown, "image")
+    write_depths(root / "depth.png", shown)
+    write_curve(root / "curve.png", result.history, result.psnr_heldout_db)
+    write_histogram(root / "views.png", result.per_view)
+    document = summary(result) | {
+        "fitted_views": [view_entry(score) for score in fitted],
+        "depth_error_median_m": depth_m,
+        "criteria": [_entry(item) for item in criteria],
+        "good_enough": all(item.met for item in criteria),
+        "settings": result.field.metadata(),
+    }
+    files.write_json(root / "metrics.json", _finite(document))
+    facts = _facts(result, fitted_db, depth_m)
+    page = _page(root, title, result, criteria, facts, depth is not None)
+    files.write_text(root / "report.html", page)
+    return root / "report.html"
+
+
+def _page(
+    root: Path,
+    title: str,
+    result: FitResult,
+    criteria: Sequence[Criterion],
+    facts: Mapping[str, Any],
+    known: bool,
+) -> str:
+    return _PAGE.substitute(
+        title=html.escape(title),
+        style=STYLE,
+        verdict=html.escape(verdict(criteria)),
+        criteria=_criteria_table(criteria),
+        summary=pairs(facts),
+        worst=figure("image, field, and their difference", root / "worst.png"),
+        depth_note=_DEPTH_NOTES[known],
+        depth=figure(_DEPTH_TITLES[known], root / "depth.png"),
+        curve=figure("loss and PSNR, single and averaged", root / "curve.png"),
+        histogram=figure("held-out views by PSNR", root / "views.png"),
+        views=_views_table(result.per_view),
+        settings=pairs(result.field.metadata()),
+    )
+
+
+_DEPTH_TITLES = {
+    True: "depth of the field, depth that was given, and their difference",
+    False: "depth of the field",
+}
+_DEPTH_NOTES = {
+    True: "Of the worst views. Grey: the field stops less than half of the light, or "
+    "no depth is known.",
+    False: "Of the worst views; there is no depth to compare with. Grey: the field "
+    "stops less than half of the light.",
+}
+
+
+def summary(result: FitResult) -> dict[str, Any]:
+    """Return the scores of a fit as JSON has them; infinite PSNR becomes null."""
+    document = {
+        "psnr_heldout_db": result.psnr_heldout_db,
+        "ssim_heldout": result.ssim_heldout,
+        "wall_s": result.wall_s,
+        "steps": result.steps,
+        "per_view": [view_entry(score) for score in result.per_view],
+    }
+    return _finite(document)
+
+
+def view_entry(score: ViewScore) -> dict[str, Any]:
+    """Return the score of one view without its pictures."""
+    names = ("index", "name", "psnr_db", "ssim", "hazy")
+    return {name: getattr(score, name) for name in names}
+
+
+def _fitted_scores(result: FitResult, images: PosedImages) -> list[ViewScore]:
+    others = np.setdiff1d(np.arange(len(images)), held_out(len(images)))
+    count = min(_FITTED_VIEWS, len(others))
+    chosen = others[np.linspace(0, len(others) - 1, count).round().astype(int)]
+    return evaluate(result.field, images, chosen, keep=0)
+
+
+def _pair(score: ViewScore, images: PosedImages, depth: np.ndarray | None) -> ViewPair:
+    rendering = score.rendering
+    assert rendering is not None
+    title = f"{score.name}: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}"
+    known = None if depth is None else depth[score.index]
+    return ViewPair(
+        title,
+        reference(images, score.index),
+        rendering.image,
+        rendering.opacity,
+        rendering.depth,
+        known,
+    )
+
+
+def _depth_error(views: Sequence[ViewPair]) -> float | None:
+    """Return the median error over rays that both stop; None if there are none."""
+    errors = []
+    for view in views:
+        if view.known_depth is not None:
+            solid = np.where(view.opacity >= SOLID, view.depth, np.inf)
+            error = abs_difference(solid, view.known_depth)
+            errors.append(error[np.isfinite(error)])
+    if not any(error.size for error in errors):
+        return None
+    return float(np.median(np.concatenate(errors)))
+
+
+def _facts(
+    result: FitResult, fitted_db: float, depth_m: float | None
+) -> dict[str, Any]:
+    field = result.field
+    low, high = (
+        ", ".join(f"{v:.2f}" for v in corner) for corner in (field.lower, field.upper)
+    )
+    facts = {
+        "mean PSNR, held-out views": f"{result.psnr_heldout_db:.2f} dB",
+        "mean SSIM, held-out views": f"{result.ssim_heldout:.4f}",
+        "mean PSNR, fitted views (a sample)": f"{fitted_db:.2f} dB",
+        "held-out views": str(len(result.per_view)),
+        "steps": f"{result.steps:,}",
+        "wall time of fit and scores": _duration(result.wall_s),
+        "box": f"({low}) to ({high}) m",
+        "frame": "that of the poses, metres; z up where the poses have z up",
+        "source": field.info.get("fit.source", "unknown"),
+    }
+    if depth_m is not None:
+        facts["median depth error, worst views"] = f"{depth_m:.3f} m"
+    return facts
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+
+
+def _criteria_table(criteria: Sequence[Criterion]) -> str:
+    rows = "\n".join(
+        f"<tr><td>{html.escape(item.name)}</td>"
+        f'<td class="number{"" if item.met else " bad"}">{item.value:.3g}</td>'
+        f'<td class="number">{"at least" if item.at_least else "at most"} '
+        f"{item.limit:g}</td><td>{'met' if item.met else 'not met'}</td></tr>"
+        for item in criteria
+    )
+    head = '<th>measured</th><th class="number">value</th>'
+    head += '<th class="number">limit</th><th></th>'
+    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+
+
+def _views_table(scores: Sequence[ViewScore]) -> str:
+    rows = "\n".join(
+        f"<tr><td>{html.escape(score.name)}</td>"
+        f'<td class="number">{score.psnr_db:.2f}</td>'
+        f'<td class="number">{score.ssim:.4f}</td>'
+        f'<td class="number">{100 * score.hazy:.1f} %</td></tr>'
+        for score in sorted(scores, key=lambda score: score.psnr_db)
+    )
+    head = "<th>view, worst first</th>" + "".join(
+        f'<th class="number">{name}</th>' for name in ("PSNR (dB)", "SSIM", "hazy rays")
+    )
+    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+
+
+def _entry(item: Criterion) -> dict[str, Any]:
+    names = ("name", "value", "limit", "at_least", "met")
+    return {name: getattr(item, name) for name in names}
+
+
+def _finite(value: Any) -> Any:
+    """Replace infinite and undefined numbers, which JSON has not, by null."""
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
