@@ -11,12 +11,13 @@ from __future__ import annotations
 import errno
 import io
 import json
+import math
 import os
 import secrets
 import stat
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,11 @@ def read_json(path: str | Path) -> Any:
             f"{path}: line {err.lineno}, column {err.colno}: {err.msg}; "
             "the file must be valid JSON"
         ) from err
+    except _ConstantError as err:
+        raise InputError(
+            f"{path}: {_place_of_constant(text)}: {err} is not a JSON number; write a "
+            "finite number"
+        ) from err
     except (ValueError, RecursionError) as err:
         raise InputError(f"{path}: {err}; the file must be valid JSON") from err
 
@@ -109,33 +115,25 @@ def read_image(path: str | Path) -> np.ndarray:
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
     """
-    raw = read_bytes(path, MAX_IMAGE_BYTES)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(raw), formats=("PNG", "JPEG", "WEBP"))
-        if image.width * image.height > MAX_IMAGE_PIXELS:
-            raise InputError(
-                f"{path}: {image.width} x {image.height} pixels; "
-                f"at most {MAX_IMAGE_PIXELS} pixels are read"
-            )
-        image.load()
-    except Image.UnidentifiedImageError as err:
-        raise InputError(
-            f"{path}: not an image that can be read; use PNG, JPEG or WebP"
-        ) from err
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:
-        if isinstance(err, InputError):
-            raise
-        raise InputError(
-            f"{path}: damaged image ({err}); write or copy it again"
-        ) from err
+    image = _open_image(path, ("PNG", "JPEG", "WEBP"))
     if image.mode not in ("1", "L", "P", "RGB", "LA", "PA", "RGBA"):
         raise InputError(
             f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
         )
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.array(image.convert(mode), dtype=np.uint8)
+
+
+def read_image16(path: str | Path) -> np.ndarray:
+    """Read a grey PNG of 16 bits, as depth cameras write them.
+
+    Returns:
+        values as they are stored, uint16, (height, width).
+    """
+    image = _open_image(path, ("PNG",))
+    if image.mode not in ("I;16", "I;16B", "I"):
+        raise InputError(f"{path}: pixel type {image.mode}; must be grey, 16 bits")
+    return np.array(image).astype(np.uint16)
 
 
 def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -279,6 +277,31 @@ def _reported(path: str | Path) -> Iterator[None]:
         raise InputError(f"{str(path)!r}: {err}; check the path") from err
 
 
+def _open_image(path: str | Path, formats: tuple[str, ...]) -> Image.Image:
+    """Decode an image of at most `MAX_IMAGE_PIXELS` pixels."""
+    names = " or ".join(formats)
+    raw = read_bytes(path, MAX_IMAGE_BYTES)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(raw), formats=formats)
+        if image.width * image.height > MAX_IMAGE_PIXELS:
+            raise InputError(
+                f"{path}: {image.width} x {image.height} pixels; "
+                f"at most {MAX_IMAGE_PIXELS} pixels are read"
+            )
+        image.load()
+    except Image.UnidentifiedImageError as err:
+        raise InputError(f"{path}: not an image that can be read; use {names}") from err
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:
+        if isinstance(err, InputError):
+            raise
+        raise InputError(
+            f"{path}: damaged image ({err}); write or copy it again"
+        ) from err
+    return image
+
+
 def _check_file(path: str | Path, limit: int) -> int:
     with _reported(path):
         status = os.stat(path)
@@ -340,5 +363,28 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
+class _ConstantError(ValueError):
+    """NaN or infinity in JSON."""
+
+
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a JSON number")
+    raise _ConstantError(name)
+
+
+def _place_of_constant(text: str) -> str:
+    """Return where NaN or infinity is, as `frames[1].transform_matrix[0][3]`."""
+
+    def find(value: Any, place: str) -> str:
+        if isinstance(value, float) and not math.isfinite(value):
+            return place
+        items: Iterable[tuple[str, Any]] = ()
+        if isinstance(value, dict):
+            items = ((f"{place}.{key}", item) for key, item in value.items())
+        elif isinstance(value, list):
+            items = ((f"{place}[{i}]", item) for i, item in enumerate(value))
+        return next(filter(None, (find(item, at) for at, item in items)), "")
+
+    try:
+        return find(json.loads(text), "").lstrip(".") or "a value"
+    except (ValueError, RecursionError):
+        return "a value"  # what follows is damaged too

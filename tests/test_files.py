@@ -191,7 +191,10 @@ def test_json_round_trip(tmp_path, value):
     ("text", "reason"),
     [
         ('{"a": 1, "a": 2}', "'a' twice"),
-        ('{"a": NaN}', "NaN"),
+        ('{"a": NaN}', "a: NaN is not a JSON number"),
+        ('{"a": [1, {"b": [0, -Infinity]}]}', r"a\[1\].b\[1\]: -Infinity"),
+        ("NaN", "a value: NaN"),
+        ('{"a": NaN', "a value: NaN"),
         ("[1, 2", "line 1, column"),
         ("[" * 100_000, "valid JSON"),
         ("1" * 5000, "valid JSON"),
@@ -260,6 +263,21 @@ def test_sixteen_bit_image_is_refused(tmp_path):
     Image.fromarray(np.full((3, 4), 60_000, np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(InputError, match="8 bits"):
         files.read_image(tmp_path / "deep.png")
+
+
+def test_sixteen_bit_png_round_trip(tmp_path):
+    values = np.array([[0, 1, 255], [256, 40000, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / "depth.png")
+    found = files.read_image16(tmp_path / "depth.png")
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, values)
+
+
+@pytest.mark.parametrize("name", ["grey.png", "photo.jpg"])
+def test_sixteen_bit_reader_refuses_others(tmp_path, name):
+    files.write_image(tmp_path / name, np.zeros((2, 3), np.uint8))
+    with pytest.raises(InputError, match=name):
+        files.read_image16(tmp_path / name)
 
 
 def test_image_bomb_is_refused_before_it_is_decoded(tmp_path, monkeypatch):

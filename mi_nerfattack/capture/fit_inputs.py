@@ -4,58 +4,129 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.fit_cells import depth_points
-from mi_nerfattack.capture.frames import PosedImages
+from mi_nerfattack.capture.frames import FILE_NAMES, find_transforms, read_table
+from mi_nerfattack.capture.posed import PosedImages
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.distortion import undistort
 
 _CUBE = 2.0  # half edge of the cube, in distances of the farthest camera
 _MARGIN = 0.01  # around the box of all depth points, of its longest edge
 _MIN_MARGIN_M = 0.05
+_MILLIMETRE = 1e-3
+_POINTS_PERCENT = 2.0  # of the points on either side of each axis are outliers
+_POINTS_MARGIN = 0.1  # around the box of points and cameras, of its longest edge
 
 
 def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
-    """Read the depth maps that ``depth_file`` in a folder's transforms.json names.
+    """Read the depth maps that the transforms.json of a folder names.
+
+    Either ``depth_file``, our own: a safetensors file with the tensor ``depth``, a map
+    for each frame, metres along the ray; or nerfstudio's ``depth_file_path`` of each
+    frame: a PNG of 16 bits, millimetres along the optical axis, 0 where unknown. A map
+    may be larger or smaller than its image; the nearest value is taken.
 
     Args:
-        folder: the folder of `transforms.json`, or the JSON file.
-        images: as read from there; depth is picked at their pixels' centres.
+        folder: the folder of `transforms.json`, or the JSON file; any other folder has
+            no depth.
+        images: as read from there.
 
     Returns:
         (n, height, width), float32, metres along the ray, infinite where nothing is
-        hit; None if the folder has no depth file.
+        hit and NaN where it is unknown; None if no depth is named.
 
     Raises:
-        InputError: the file lacks the tensor ``depth``, its shape contradicts the
-            images, or a depth is not positive.
+        InputError: a file is missing or cannot be read, there is not a map for each
+            frame, or a depth is not positive.
     """
     path = Path(folder)
-    source = path / "transforms.json" if path.is_dir() else path
-    if not source.is_file():
+    if path.is_dir() and not any((path / name).is_file() for name in FILE_NAMES):
         return None
-    name = files.read_json(source).get("depth_file")
-    if name is None:
-        return None
-    if not isinstance(name, str):
-        raise InputError(f"{source}: depth_file: {name!r}; needs a path")
-    where = source.parent / name
+    source = find_transforms(path)
+    table, frames = read_table(source)
+    used = _frames_of(source, frames, images)
+    if table.get("depth_file") is not None:
+        return _read_own(source, table["depth_file"], len(frames), used, images)
+    if any(frames[i].get("depth_file_path") is not None for i in used):
+        maps = [
+            _read_axial(source, i, frames[i].get("depth_file_path"), images, k)
+            for k, i in enumerate(used)
+        ]
+        return np.stack(maps)
+    return None
+
+
+def _frames_of(source: Path, frames: Sequence[Any], images: PosedImages) -> list[int]:
+    """Return the frames of the images, which leave out those that are missing."""
+    missing = set(images.missing)
+    used = [i for i, frame in enumerate(frames) if frame["file_path"] not in missing]
+    if len(used) != len(images):
+        raise InputError(
+            f"{source}: frames: {len(used)} with an image, but {len(images)} images "
+            "were given; read images and depth from one folder"
+        )
+    return used
+
+
+def _read_own(
+    source: Path, name: Any, n_frames: int, used: list[int], images: PosedImages
+) -> np.ndarray:
+    where = source.parent / _path(source, "depth_file", name)
     depth = files.read_safetensors(where)[0].get("depth")
-    if depth is None or depth.ndim != 3 or len(depth) != len(images):
+    if depth is None or depth.ndim != 3 or len(depth) != n_frames:
         shape = None if depth is None else depth.shape
         raise InputError(
             f"{where}: tensor 'depth' has shape {shape}; needs one map for each of "
-            f"{len(images)} images; remove depth_file from {source} to fit without"
+            f"{n_frames} frames; remove depth_file from {source} to fit without"
         )
-    if not (depth > 0).all():
-        raise InputError(f"{where}: tensor 'depth' holds NaN or a depth of 0 or less")
-    height, width = depth.shape[1:]
-    camera = images.camera
+    if (depth <= 0).any():
+        raise InputError(
+            f"{where}: tensor 'depth' holds a depth of 0 or less; write infinity where "
+            "nothing is hit, and NaN where it is unknown"
+        )
+    return np.stack([_at_pixels(depth[i], images.camera) for i in used])
+
+
+def _read_axial(
+    source: Path, frame: int, name: Any, images: PosedImages, index: int
+) -> np.ndarray:
+    """Read depth along the optical axis and turn it into depth along the rays."""
+    camera = images.camera_of(index)
+    if name is None:
+        return np.full((camera.height, camera.width), np.nan, np.float32)
+    where = _path(source, f"frames[{frame}].depth_file_path", name)
+    if Path(where).suffix.lower() != ".png":
+        raise InputError(
+            f"{source}: frames[{frame}].depth_file_path: {name!r}; must be a PNG of 16 "
+            "bits, millimetres"
+        )
+    axial = _at_pixels(files.read_image16(source.parent / where), camera) * _MILLIMETRE
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    if camera.is_distorted:
+        x, y = undistort(x, y, *camera.distortion)
+    depth = np.where(axial > 0, axial * np.sqrt(1 + x * x + y * y), np.nan)
+    return depth.astype(np.float32)
+
+
+def _path(source: Path, field: str, name: Any) -> str:
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{source}: {field}: {name!r}; needs a path")
+    return name.replace("\\", "/")
+
+
+def _at_pixels(values: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pick the values of a map (h, w) at the centres of a camera's pixels."""
+    height, width = values.shape
     rows = ((np.arange(camera.height) + 0.5) * height / camera.height).astype(int)
     columns = ((np.arange(camera.width) + 0.5) * width / camera.width).astype(int)
-    return depth[:, rows][:, :, columns]
+    return values[rows][:, columns]
 
 
 def find_bounds(
@@ -66,12 +137,14 @@ def find_bounds(
     """Choose the box of a field.
 
     Given bounds win. With depth, the box of all points seen, and 1 % of its longest
-    edge (at least 5 cm) around it. Otherwise a cube around the point nearest to all
-    optical axes; its half edge is twice the distance of the farthest camera.
+    edge (at least 5 cm) around it. With sparse points, the box of all cameras and of
+    the points without the outermost 2 % on either side, and 10 % around it. Otherwise
+    a cube around the point nearest to all optical axes; its half edge is twice the
+    distance of the farthest camera.
 
     Args:
-        images: the posed images.
-        depth: (n, height, width), metres along the ray, or None.
+        images: the posed images, perhaps with sparse points.
+        depth: (n, height, width), metres along the ray, NaN where unknown; or None.
         given: x0, y0, z0, x1, y1, z1, metres, or None.
 
     Returns:
@@ -90,6 +163,8 @@ def find_bounds(
         return lower, upper
     if depth is not None and np.isfinite(depth).any():
         return _box_of_points(images, depth)
+    if images.points is not None and len(images.points) > 0:
+        return _box_of_sparse(images.points, images.camera_to_world[:, :3, 3])
     focus = _focus(images.camera_to_world)
     reach = np.linalg.norm(images.camera_to_world[:, :3, 3] - focus, axis=1).max()
     return focus - _CUBE * reach, focus + _CUBE * reach
@@ -106,6 +181,15 @@ def _box_of_points(
     lower = np.min([low for low, _ in corners], axis=0)
     upper = np.max([high for _, high in corners], axis=0)
     margin = max(_MIN_MARGIN_M, _MARGIN * float((upper - lower).max()))
+    return lower - margin, upper + margin
+
+
+def _box_of_sparse(
+    points: np.ndarray, eyes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.percentile(points, [_POINTS_PERCENT, 100 - _POINTS_PERCENT], axis=0)
+    lower, upper = np.minimum(ends[0], eyes.min(0)), np.maximum(ends[1], eyes.max(0))
+    margin = _POINTS_MARGIN * float((upper - lower).max())
     return lower - margin, upper + margin
 
 

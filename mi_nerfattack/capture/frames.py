@@ -27,10 +27,12 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.conventions import opencv_to_opengl, opengl_to_opencv
 
-_FILE_NAMES = ("transforms.json", "transforms_train.json")
+FILE_NAMES = ("transforms.json", "transforms_train.json")
+"""What the JSON file of a folder may be called; the first that is there is read."""
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp")
 
 __all__ = [
+    "FILE_NAMES",
     "PosedImages",
     "check_rigid",
     "find_transforms",
@@ -82,14 +84,14 @@ def _nothing_found(folder: Path) -> str:
         else "give the folder that holds one of them"
     )
     return (
-        f"{folder}: no posed images; looked for {' or '.join(_FILE_NAMES)}, and for a "
+        f"{folder}: no posed images; looked for {' or '.join(FILE_NAMES)}, and for a "
         f"COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_PLACES)}"
         f"; {advice}"
     )
 
 
 def _json_in(folder: Path) -> Path | None:
-    found = [folder / name for name in _FILE_NAMES if (folder / name).is_file()]
+    found = [folder / name for name in FILE_NAMES if (folder / name).is_file()]
     return found[0] if found else None
 
 
@@ -244,7 +246,7 @@ def find_transforms(path: Path) -> Path:
         return path
     found = _json_in(path)
     if found is None:
-        raise InputError(f"{path}: has neither {_FILE_NAMES[0]} nor {_FILE_NAMES[1]}")
+        raise InputError(f"{path}: has neither {FILE_NAMES[0]} nor {FILE_NAMES[1]}")
     return found
 
 
