@@ -1,9 +1,6 @@
 """Gradients of an NGP's parameters at many points, by products of matrices.
 
-A kernel that differentiates an NGP point by point adds each point's part to every
-weight by an atomic operation, which on a CPU takes most of its time. Here points are
-collected first; then the networks run over batches of them as products of matrices,
-whose derivatives by the weights are products again.
+Points are collected in a kernel first; then the networks run over batches of them.
 """
 
 from __future__ import annotations
@@ -11,10 +8,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import drjit.nn as nn
 import mitsuba as mi
 
 from mi_nerfattack.fields.base import AbstractPoints
+from mi_nerfattack.fields.ngp_matrices import (
+    add_gradient,
+    apply,
+    column,
+    lay_out,
+    matrices,
+    some_rows,
+)
 
 if TYPE_CHECKING:
     from mi_nerfattack.fields.ngp import NGPField
@@ -80,7 +84,7 @@ class NGPPoints(AbstractPoints):
         towards = dr.gather(
             mi.Vector3f, heading, dr.gather(mi.UInt32, self._ray, index)
         )
-        harmonics = _rows(dr.sh_eval(towards, field.sh_order))
+        harmonics = lay_out(dr.sh_eval(towards, field.sh_order))
         given = [mi.Float(numbers[k]) for k in range(3, 7)]
         unit = mi.Point3f(numbers[0], numbers[1], numbers[2])
         dr.eval(harmonics, given, unit)
@@ -95,17 +99,20 @@ def _differentiate(
     """Accumulate the weights' gradients; return the derivatives by the features."""
     count, size = dr.width(given[0]), field.encoding.n_output_features
     nets = (field.density_net, field.colour_net)
-    weights = [_matrices(net) for net in nets]
+    weights = [matrices(net) for net in nets]
+    for net, own in zip(nets, weights, strict=True):
+        if dr.grad_enabled(net["weights"]):
+            dr.enable_grad(own)
     slopes = dr.zeros(mi.Float, count * size)
     for start in range(0, count, CHUNK):
         first, height = dr.opaque(mi.UInt32, start), min(CHUNK, count - start)
-        x = _some_rows(features, first, height, size)
-        view = _some_rows(harmonics, first, height, dr.width(harmonics) // count)
+        x = some_rows(features, first, height, size)
+        view = some_rows(harmonics, first, height, dr.width(harmonics) // count)
         dr.enable_grad(x)
-        geometry = _apply(weights[0], x)
-        raw = _apply(weights[1], dr.concat([geometry, view], axis=1))
+        geometry = apply(weights[0], x)
+        raw = apply(weights[1], dr.concat([geometry, view], axis=1))
         values = field.activate(
-            _column(geometry, 0), [_column(raw, c) for c in range(3)]
+            column(geometry, 0), [column(raw, c) for c in range(3)]
         )
         row = first + dr.arange(mi.UInt32, height)
         parts = [
@@ -116,56 +123,10 @@ def _differentiate(
         by_x = dr.grad(x).array
         dr.scatter(slopes, by_x, first * size + dr.arange(mi.UInt32, dr.width(by_x)))
         dr.eval(slopes)
-    for net, matrices in zip(nets, weights, strict=True):
+    for net, own in zip(nets, weights, strict=True):
         if dr.grad_enabled(net["weights"]):
-            parts = [dr.grad(matrix).array for matrix in matrices]
-            dr.accum_grad(net["weights"], dr.concat(parts))
+            add_gradient(net, own)
     return slopes
-
-
-def _apply(matrices: list[Any], x: Any) -> Any:
-    """Apply linear layers with rectifiers between them to (n, k) rows."""
-    for matrix in matrices[:-1]:
-        x = dr.maximum(dr.matmul(x, matrix, Bt=True), 0)
-    return dr.matmul(x, matrices[-1], Bt=True)
-
-
-def _column(rows: Any, k: int) -> mi.Float:
-    """Read a column of (n, width) rows; no two lanes share an entry."""
-    height, width = rows.shape
-    index = k + width * dr.arange(mi.UInt32, height)
-    mode = dr.ReduceMode.NoConflicts
-    return dr.gather(mi.Float, rows.array, index, mode=mode)
-
-
-def _matrices(net: nn.Module) -> list[Any]:
-    """Return the matrices of a packed network as tensors that collect gradients."""
-    result = []
-    for layer in net.layers:
-        if isinstance(layer, nn.Linear):
-            view = layer.weights
-            index = view.offset + dr.arange(mi.UInt32, view.size)
-            flat = dr.gather(mi.Float, dr.detach(view.buffer), index)
-            matrix = mi.TensorXf(flat, view.shape)
-            if dr.grad_enabled(net["weights"]):
-                dr.enable_grad(matrix)
-            result.append(matrix)
-    return result
-
-
-def _rows(values: Any) -> mi.Float:
-    """Lay k arrays (n,) out row by row, (n k,)."""
-    columns = mi.ArrayXf([mi.Float(value) for value in values])
-    count = dr.width(columns)
-    flat = dr.zeros(mi.Float, count * len(columns))
-    dr.scatter(flat, columns, dr.arange(mi.UInt32, count))
-    return flat
-
-
-def _some_rows(flat: mi.Float, first: mi.UInt32, height: int, width: int) -> Any:
-    """Copy rows; their place is not compiled into the kernel."""
-    index = first * width + dr.arange(mi.UInt32, height * width)
-    return mi.TensorXf(dr.gather(mi.Float, flat, index), (height, width))
 
 
 def _scatter(field: NGPField, unit: mi.Point3f, slopes: mi.Float) -> None:
