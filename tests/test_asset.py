@@ -198,3 +198,29 @@ class TestAsset:
         rgb = images.images[images.images[..., 3] == 255][:, :3].mean(0)
         if name == "Duck.glb":  # it is yellow
             assert rgb[0] > 150 and rgb[1] > 120 and rgb[2] < 80
+
+    def test_what_lies_behind_a_hole(self):
+        """It is lit, and seen at its own depth."""
+        front = np.array([[-1.0, -1, 0], [1, -1, 0], [1, -1, 2], [-1, -1, 2]])
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        back = meshes.MeshPart(front * [1, -1, 1], faces, (0.1, 0.6, 0.2))
+        hole = np.zeros((1, 1, 4), np.uint8)
+        uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+        cut = meshes.MeshPart(front, faces, texture=hole, uv=uv)
+        mesh = meshes.TexturedMesh("panes", (cut, back))
+        images, depth = asset.render_asset(
+            mesh, 24, 16, lighting=asset.Lighting(ambient=1.0), spp=100
+        )
+        eyes = images.camera_to_world[:, :3, 3]
+        axes = images.camera_to_world[:, :3, 2]
+        reach = (1 - eyes[:, 1]) / axes[:, 1]  # along the optical axis to y = 1
+        at = eyes + reach[:, None] * axes
+        inner = (np.abs(at - [0, 1, 1]).max(1) < 0.5) & (np.abs(axes[:, 1]) > 0.5)
+        assert inner.sum() >= 3
+        # four pixels meet in the middle of an even image
+        found = depth[inner, 7:9, 7:9].mean((1, 2))
+        np.testing.assert_allclose(found, reach[inner], rtol=0.02)
+        colour = images.images[inner, 8, 8]
+        expected = linear_to_uint8(np.array([0.1, 0.6, 0.2]))
+        np.testing.assert_allclose(colour[:, :3].astype(int), expected[None], atol=3)
+        assert np.all(colour[:, 3] == 255)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,10 +16,17 @@ from mi_nerfattack.capture.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.views import iterate_views
 from mi_nerfattack.colour import linear_to_uint8
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import from_fov, look_at
+from mi_nerfattack.render.camera import (
+    Camera,
+    from_fov,
+    generate_rays,
+    look_at,
+    pose_arrays,
+)
 
 _FOV_DEG = 40.0
 _MARGIN = 1.05
+_MAX_LAYERS = 64  # of transparent surfaces on one ray
 _SHARE_BELOW, _LOWEST = 0.15, -0.4
 
 
@@ -40,6 +48,11 @@ class Lighting:
     ambient: float = 0.75
     sharpness: float = 16.0
     key: tuple[float, float, float] = (0.5, -0.6, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not 0 <= self.ambient <= 1:
+            raise InputError(f"ambient: {self.ambient}; must be in [0, 1]")
 
     def emitter(self) -> dict[str, Any]:
         """Describe the light as an `envmap` (64 x 128), z up."""
@@ -117,7 +130,8 @@ def render_asset(
 
     Returns:
         Images (RGBA, alpha from the geometry, not premultiplied), and depth (n_views,
-        size_px, size_px), float32, metres along the ray, infinite beside the mesh.
+        size_px, size_px), float32, metres along the ray to the first surface that is
+        at least half opaque, infinite beside the mesh.
     """
     if n_views < 1 or size_px < 1 or spp < 1:
         raise InputError(
@@ -133,16 +147,38 @@ def render_asset(
         {"type": "scene", "light": light.emitter(), **mitsuba_shapes(mesh)},
         parallel=False,
     )
-    integrator = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
+    is_solid = all(part.is_solid for part in mesh.parts)
+    # volpath alone does not count passing through a mask as a bounce
+    kind = "path" if is_solid else "volpath"
+    integrator = mi.load_dict({"type": kind, "max_depth": 2, "hide_emitters": True})
     images = np.empty((n_views, size_px, size_px, 4), np.uint8)
     depth = np.empty((n_views, size_px, size_px), np.float32)
     views = iterate_views(scene, camera, poses, spp, seed, integrator)
     for i, view in enumerate(views):
         images[i] = _straight_rgba(view.rgb, view.alpha)
-        depth[i] = view.depth
+        depth[i] = view.depth if is_solid else _solid_depth(scene, camera, poses[i])
         progress(i + 1, n_views)
     names = tuple(f"{mesh.name}:{i:04d}" for i in range(n_views))
     return PosedImages(images, poses, camera, names), depth
+
+
+def _solid_depth(scene: Any, camera: Camera, pose: np.ndarray) -> np.ndarray:
+    """Return the depth image of surfaces that are at least half opaque."""
+    origin, rotation = pose_arrays(pose)
+    o, d = generate_rays(camera, origin, rotation, 1)
+    ray, active = mi.Ray3f(o, d), mi.Bool(True)
+    depth = mi.Float(dr.inf)
+    for _ in range(_MAX_LAYERS):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        through = dr.mean(si.bsdf(ray).eval_null_transmission(si, active))
+        goes_on = active & (through > 0.5)
+        depth = dr.select(active & ~goes_on, dr.norm(si.p - o), depth)
+        ray, active = si.spawn_ray(d), goes_on
+        dr.eval(depth, ray, active)
+        if not dr.any(active):
+            break
+    return depth.numpy().reshape(camera.height, camera.width)
 
 
 def _straight_rgba(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:

@@ -117,10 +117,7 @@ class TexturedMesh:
 
     def turned(self, angle_deg: float) -> TexturedMesh:
         """Return the mesh turned about z, counter-clockwise as seen from above."""
-        if not np.isfinite(angle_deg):
-            raise InputError(f"turn_deg: {angle_deg}; must be finite")
-        cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-        matrix = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        matrix = turn_matrix(angle_deg)
         parts = (part.placed(matrix, np.zeros(3)) for part in self.parts)
         return replace(self, parts=tuple(parts))
 
@@ -165,20 +162,42 @@ def normalise(
             neither, the file's unit is taken to be the metre.
     """
     low, high = mesh.bounds
-    extent = high - low
+    scale = extent_scale(mesh.name, high - low, height_m, longest_m)
+    offset = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
+    return mesh.transformed(scale, offset)
+
+
+def extent_scale(
+    name: str, extent: np.ndarray, height_m: float | None, longest_m: float | None
+) -> float:
+    """Return the factor that brings an extent (3,) to a height or a longest edge.
+
+    Raises:
+        InputError: with the name, if there is nothing to scale; or a size is not
+            positive, or both are given.
+    """
     if height_m is not None and longest_m is not None:
         raise InputError("height_m, longest_m: give one of them, not both")
-    wanted = height_m if longest_m is None else longest_m
-    present = extent[2] if longest_m is None else extent.max()
-    offset = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
-    if wanted is None:
-        return mesh.transformed(1.0, offset)
-    if not 0 < wanted < np.inf:
-        name = "height_m" if longest_m is None else "longest_m"
-        raise InputError(f"{name}: {wanted}; must be positive")
-    if present <= 0:
-        raise InputError(f"{mesh.name}: has no height to scale; give its longest edge")
-    return mesh.transformed(wanted / present, offset)
+    for key, wanted, present in (
+        ("height_m", height_m, float(extent[2])),
+        ("longest_m", longest_m, float(extent.max())),
+    ):
+        if wanted is None:
+            continue
+        if not 0 < wanted < np.inf:
+            raise InputError(f"{key}: {wanted}; must be positive")
+        if present <= 0:
+            raise InputError(f"{name}: has no height to scale; give its longest edge")
+        return wanted / present
+    return 1.0
+
+
+def turn_matrix(angle_deg: float) -> np.ndarray:
+    """Return the rotation (3, 3) about z, counter-clockwise as seen from above."""
+    if not np.isfinite(angle_deg):
+        raise InputError(f"turn_deg: {angle_deg}; must be finite")
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
 def mitsuba_shapes(mesh: TexturedMesh) -> dict[str, Any]:

@@ -55,10 +55,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: unknown suffix; use {', '.join(SUFFIXES)}")
-    up = up or ("z" if suffix == ".ply" else "y")
-    if up not in _TO_Z_UP:
-        raise InputError(f"up: {up!r}; allowed: {', '.join(_TO_Z_UP)}")
-    turn = np.array(_TO_Z_UP[up], np.float64)
+    turn = up_matrix(up or ("z" if suffix == ".ply" else "y"))
     base_colours: tuple[BaseColour, ...] = ()
     chunks: Mapping[str, bytes] = {}
     if suffix in (".glb", ".gltf"):
@@ -85,6 +82,17 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             part = part.placed(turn @ transform[:3, :3], turn @ transform[:3, 3])
             parts.append(part)
     return _checked(path, tuple(parts))
+
+
+def up_matrix(axis: str) -> np.ndarray:
+    """Return the rotation (3, 3) that brings an axis to z.
+
+    Args:
+        axis: "x", "y", "z", "-x", "-y" or "-z". For y, x stays and z becomes -y.
+    """
+    if axis not in _TO_Z_UP:
+        raise InputError(f"up: {axis!r}; allowed: {', '.join(_TO_Z_UP)}")
+    return np.array(_TO_Z_UP[axis], np.float64)
 
 
 def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:

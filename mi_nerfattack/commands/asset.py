@@ -1,39 +1,63 @@
-"""``mi-nerfattack asset``: turn a mesh into an object whose texture can be attacked."""
+"""``mi-nerfattack asset``: make an object whose texture can be attacked."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from mi_nerfattack.commands.bars import StageBars
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mi_nerfattack.capture.fit_options import FitOptions
+    from mi_nerfattack.capture.object_views import ObjectViews
 
 
 @dataclass(frozen=True)
 class Asset:
-    """Render a mesh from all sides and fit a decoder-free grid to it.
+    """Fit a decoder-free grid to views of an object.
 
-    The object is centred in x and y and stands on z = 0. Every 8th view is held out
-    and scored.
+    The views are rendered from a mesh or a cube, or read from a folder, as Blender's
+    synthetic scenes have them. The object is centred in x and y and stands on z = 0,
+    unless --bounds is given. Every 8th view is held out and scored.
     """
 
-    mesh: tyro.conf.Positional[Path]
-    """glTF (.glb, .gltf), OBJ or PLY."""
+    source: tyro.conf.Positional[str]
+    """glTF (.glb, .gltf), OBJ or PLY; a folder with transforms.json or
+    transforms_train.json and RGBA images; or the word cube (./cube is a file)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Field file to write (.safetensors); FILE.report beside it says how good it is."""
+    """Field file to write (.safetensors); a report of the fit lies beside it."""
     height_m: float | None = None
     """Scale to this height, metres."""
     longest_m: float | None = None
     """Scale the longest edge of the bounding box to this, metres."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis of the source that points up; y for glTF and OBJ, z for PLY and folders."""
+    turn_deg: float = 0.0
+    """Turn about the vertical, counter-clockwise as seen from above."""
+    edge_m: float | None = None
+    """Edge of the cube, metres."""
+    faces: Path | None = None
+    """Folder of six pictures of the cube: px.png, nx.png, py.png ... nz.png."""
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """Box of a folder's object: x0 y0 z0 x1 y1 z1; found from the alpha if left out."""
+    long_edge: int | None = None
+    """Reduce a folder's images to this longer edge, pixels."""
+    ambient: float = 0.75
+    """Share of light from everywhere in renders; 1 bakes no shading into colours."""
     resolution: Literal[64, 128] = 64
     """Finest level of the grid: 64 for a hydrant, 128 for a car."""
     views: int = 96
     """Views rendered."""
     size: int | None = None
-    """Width and height of a view, pixels; about three for each cell by default."""
-    steps: int = 600
-    """Steps of the optimiser."""
+    """Width and height of a render, pixels; about three for each cell by default."""
+    steps: int | None = None
+    """Steps of the optimiser; 600, or 1500 for a folder, which has no depth."""
     budget_minutes: float | None = None
     """End the fit after this time."""
     batch_rays: int = 4096
@@ -44,26 +68,42 @@ class Asset:
     """End with one line of JSON in place of the table."""
 
     def run(self) -> int:
-        """Render, fit, score and write."""
+        """Render or read the views, fit, score and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.asset import render_asset
-        from mi_nerfattack.capture.fit import FitOptions, fit_grid
-        from mi_nerfattack.capture.mesh import normalise
-        from mi_nerfattack.capture.mesh_files import load_mesh
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.commands.fit_report import (
-            check_output,
-            finish,
-            show_fit,
-            show_views,
-        )
+        from mi_nerfattack.capture.fit import fit_grid
+        from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
         from mi_nerfattack.fields.grid import GridLayout
 
         check_output(self.output)
         variant.ensure()
-        mesh = normalise(load_mesh(self.mesh), self.height_m, self.longest_m)
-        options = FitOptions(
-            steps=self.steps,
+        with StageBars() as bars:
+            found = self._views(bars)
+            # room for the outermost vertices' own cells
+            room = 2.0 / self.resolution * float((found.upper - found.lower).max())
+            result = fit_grid(
+                found.images,
+                found.lower - room,
+                found.upper + room,
+                GridLayout(16, 16, self.resolution),
+                self._options(found.depth is not None),
+                found.depth,
+                progress=partial(show_fit, bars),
+            )
+        result.field.info.update(
+            {
+                "provenance.object_lower": _text(found.lower),
+                "provenance.object_upper": _text(found.upper),
+            }
+        )
+        provenance = {"source": Path(self.source).name, "seed": str(self.seed)}
+        finish(result, found.images, self.output, provenance, self.json, found.depth)
+        return 0
+
+    def _options(self, has_depth: bool) -> FitOptions:
+        from mi_nerfattack.capture.fit_options import FitOptions
+
+        return FitOptions(
+            steps=(600 if has_depth else 1500) if self.steps is None else self.steps,
             budget_minutes=self.budget_minutes,
             batch_rays=self.batch_rays,
             seed=self.seed,
@@ -71,26 +111,50 @@ class Asset:
             occupancy_start=100,
             occupancy_every=100,
         )
-        lower, upper = mesh.bounds
-        # room for the outermost vertices' own cells
-        room = 2.0 / self.resolution * float((upper - lower).max())
-        with StageBars() as bars:
-            images, depth = render_asset(
-                mesh,
-                self.views,
-                self.size or 200 * self.resolution // 64,
-                self.seed,
-                progress=partial(show_views, bars),
-            )
-            result = fit_grid(
-                images,
-                lower - room,
-                upper + room,
-                GridLayout(16, 16, self.resolution),
-                options,
-                depth,
-                progress=partial(show_fit, bars),
-            )
-        provenance = {"source": self.mesh.name, "seed": str(self.seed)}
-        finish(result, images, self.output, provenance, self.json, depth)
-        return 0
+
+    def _views(self, bars: StageBars) -> ObjectViews:
+        from mi_nerfattack.capture.asset import Lighting
+        from mi_nerfattack.capture.object_views import (
+            Placement,
+            read_views,
+            render_views,
+        )
+        from mi_nerfattack.commands.fit_report import show_views
+
+        placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+        is_cube, is_folder = self.source == "cube", Path(self.source).is_dir()
+        self._refuse_unused(is_cube, is_folder or self.source.endswith(".json"))
+        if is_folder or self.source.endswith(".json"):
+            return read_views(self.source, placement, self.bounds, self.long_edge)
+        if is_cube:
+            mesh = placement.cube(self.edge_m, self.faces)
+        else:
+            mesh = placement.mesh(self.source)
+        return render_views(
+            mesh,
+            self.views,
+            self.size or 200 * self.resolution // 64,
+            self.seed,
+            Lighting(self.ambient),
+            partial(show_views, bars),
+        )
+
+    def _refuse_unused(self, is_cube: bool, is_folder: bool) -> None:
+        """Raise InputError for an option that the kind of source has no use for."""
+        from mi_nerfattack.errors import InputError
+
+        for name, value, allowed, kind in (
+            ("edge-m", self.edge_m, is_cube, "the cube"),
+            ("faces", self.faces, is_cube, "the cube"),
+            ("bounds", self.bounds, is_folder, "folders"),
+            ("long-edge", self.long_edge, is_folder, "folders"),
+            ("height-m", self.height_m, not is_cube, "meshes and folders"),
+            ("longest-m", self.longest_m, not is_cube, "meshes and folders"),
+            ("up", self.up, not is_cube, "meshes and folders"),
+        ):
+            if value is not None and not allowed:
+                raise InputError(f"--{name}: is for {kind}, not for {self.source}")
+
+
+def _text(vector: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in vector)
