@@ -22,6 +22,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
+Row = tuple[Finite, Finite, Finite, Finite]
+Matrix = tuple[Row, Row, Row, Row]
 
 BUNDLED = "bundled:"
 
@@ -33,11 +35,12 @@ class _Section(BaseModel):
 class SceneSection(_Section):
     """Where the drive takes place."""
 
-    field: str  # field file of the scene: the surrogate
+    field: str  # field file of the scene, or .ply of Gaussian splats: the surrogate
     deployment: str  # Mitsuba scene XML: the deployment environment
     routes: str  # JSON of routes
     route: str  # name of the route that is driven
     composite: Literal["depth", "interleaved"] = "depth"  # of fields, in the surrogate
+    to_world: Matrix | None = None  # of the field: turn, uniform scale, translation
 
 
 class ObjectSection(_Section):
@@ -244,6 +247,8 @@ def _allowed(location: list[Any]) -> list[str]:
 
 def _line_of(text: str, location: list[Any]) -> int | None:
     """Find the line of a key in TOML text: its table, then its name; 1-based."""
+    while len(location) > 1 and isinstance(location[-1], int):  # an item of an array
+        location = location[:-1]
     tables = [part for part in location[:-1] if isinstance(part, str)]
     index = next((part for part in location if isinstance(part, int)), 0)
     name, current, seen = str(location[-1]), "", -1

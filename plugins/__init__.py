@@ -12,12 +12,13 @@ _MODULES = (
     "field_volume",
     "grid_field",
     "ngp_field",
+    "splat_background",
     "field_emitter",
     "field_integrator",
     "opencv_camera",
 )
 _REGISTERED = {
-    "register_texture": ("grid_field", "ngp_field"),
+    "register_texture": ("grid_field", "ngp_field", "splat_background"),
     "register_emitter": ("field_emitter",),
     "register_integrator": ("field_integrator",),
     "register_sensor": ("opencv_camera",),

@@ -75,7 +75,8 @@ class FieldEmitter(mi.Emitter):
         spectrum.prepare()
         self.stop = read_stop(props)
         self.composite = read_composite(props)
-        self.volumes, others = read_nested(props, "field_emitter")
+        kinds = (shared.AbstractFieldVolume,)
+        self.volumes, others = read_nested(props, "field_emitter", kinds)
         refuse_nested(others, "field_emitter")
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
@@ -164,12 +165,13 @@ def read_composite(props: mi.Properties) -> AbstractComposite:
     return COMPOSITES[name]()
 
 
-def read_nested(props: mi.Properties, plugin: str) -> tuple[list[Any], list[Any]]:
-    """Split nested objects into field volumes, at least one, and the others."""
+def read_nested(
+    props: mi.Properties, plugin: str, kinds: tuple[type, ...]
+) -> tuple[list[Any], list[Any]]:
+    """Split nested objects into volumes of some kinds, at least one, and the others."""
     volumes, others = [], []
     for _, item in props.objects():
-        is_volume = isinstance(item, shared.AbstractFieldVolume)
-        (volumes if is_volume else others).append(item)
+        (volumes if isinstance(item, kinds) else others).append(item)
     if not volumes:
         raise InputError(
             f"{plugin}: no nested grid_field or ngp_field; give one or more"

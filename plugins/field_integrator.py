@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import (
     background,
     read_composite,
@@ -16,7 +17,10 @@ from mi_nerfattack.plugins.field_emitter import (
     read_stop,
     refuse_nested,
 )
+from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
+from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render import spectrum
+from mi_nerfattack.render.backdrop import only_fields
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.relight import LIGHT_SAMPLES, Relighting
@@ -41,7 +45,8 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     =============  ==========  =======  =============================================
     name           type        default  meaning
     =============  ==========  =======  =============================================
-    (nested)       volume               ``grid_field``, ``ngp_field``; 1 or more
+    (nested)       volume               ``grid_field``, ``ngp_field``,
+                                        ``splat_background``; 1 or more
     (nested)       integrator  none     renders surfaces and lights behind
     composite      string      inter-   ``interleaved`` or ``depth``
                                leaved
@@ -50,6 +55,8 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     relit_samples  integer     16       light samples a ray, for each field and for
                                         what lies behind; only if a field is ``relit``
     =============  ==========  =======  =============================================
+
+    A ``splat_background`` is a layer of ``depth`` alone, and takes no derivatives.
 
     .. code-block:: xml
 
@@ -84,18 +91,24 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         self.stop = read_stop(props)
         self.composite = read_composite(props)
         self.jitter = bool(props.get("jitter", False))
-        self.volumes, others = read_nested(props, "field_integrator")
+        kinds = (AbstractFieldVolume, SplatBackgroundVolume)
+        self.volumes, others = read_nested(props, "field_integrator", kinds)
         is_first = bool(others) and isinstance(others[0], mi.SamplingIntegrator)
         refuse_nested(
             others[1:] if is_first else others,
             "field_integrator",
-            ", and one sampling integrator such as path",
+            ", splat_background, and one sampling integrator such as path",
         )
         self.posed = [volume.posed for volume in self.volumes]
+        self.composite.check(self.posed)
         self.behind = others[0] if is_first else None
         samples = int(props.get("relit_samples", LIGHT_SAMPLES))
         relit = tuple(volume.relit for volume in self.volumes)
         relighting = Relighting(relit, samples, self.stop)
+        if any(relit):
+            only_fields(
+                self.posed, "relit objects throw no shadow on it", "set relit to false"
+            )
         self.relighting = relighting if any(relit) else None
         self._has_aovs = True
 
@@ -245,8 +258,15 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
 
     def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        if len(scene.shapes()) == 0:
+        shapes = scene.shapes()
+        if not shapes:
             return mi.Float(dr.inf)
+        for shape in shapes:
+            if shape.is_ellipsoids():
+                raise InputError(
+                    f"{shape.id()}: ellipsoids among the scene's shapes would hide the "
+                    "fields; nest a splat_background in field_integrator instead"
+                )
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         return dr.select(hit.is_valid(), hit.t, dr.inf)
 
@@ -281,7 +301,8 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         passed = 1 - total.opacity
         if behind is not None:
             return spectrum.emission(total.radiance, wavelengths) + passed * behind
-        sky = background(self.volumes, rays.direction) & (rays.t_max == dr.inf)
+        fields = [v for v in self.volumes if isinstance(v, AbstractFieldVolume)]
+        sky = background(fields, rays.direction) & (rays.t_max == dr.inf)
         return spectrum.emission(total.radiance + passed * sky, wavelengths)
 
     def _aovs(self, seen: Seen) -> list[mi.Float]:

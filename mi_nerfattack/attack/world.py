@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.mitsuba import PathTracedSensor
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
+from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
 from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.posed import Pose, PosedField
 from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.render.splats import SplatBackground
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor
 from mi_nerfattack.scenario import Scenario, VehicleSection, resolve
@@ -78,7 +82,7 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
     Raises:
         InputError: a file is missing or wrong.
     """
-    scene = PosedField(load_field(resolve(scenario.scene.field, base)))
+    scene = _load_surrogate(scenario, base)
     fields = [load_grid(resolve(item.field, base)) for item in scenario.objects]
     posed = [
         PosedField(
@@ -108,6 +112,25 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
         policy,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )
+
+
+def _load_surrogate(scenario: Scenario, base: str | Path) -> Layer:
+    """Load the scene: a field, or splats, which are told by the suffix .ply."""
+    path, matrix = resolve(scenario.scene.field, base), scenario.scene.to_world
+    try:
+        pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
+    except ValueError as err:
+        raise InputError(
+            f"scene.to_world: {err}; give rotation, uniform scale and translation"
+        ) from err
+    if path.suffix.lower() != ".ply":
+        return PosedField(load_field(path), pose)
+    if scenario.attack.attached:
+        raise InputError(
+            f"{path}: splats have no derivative by the camera; set attack.attached to "
+            "false, or fit a field to the scene"
+        )
+    return SplatBackground(read_splats(path), pose)
 
 
 def initial_states(

@@ -171,8 +171,8 @@ def _binary_rows(
     needed = count * dtype.itemsize
     if len(raw) - start < needed:
         raise InputError(
-            f"{path}: {len(raw) - start} bytes of data; {count} vertices need {needed}; "
-            "it is truncated; copy or export it again"
+            f"{path}: {len(raw) - start} bytes of data, {needed} for {count} vertices "
+            "are needed: truncated; copy or export it again"
         )
     return np.frombuffer(raw, dtype, count, start)
 

@@ -190,10 +190,10 @@ class DepthComposite(AbstractComposite):
         stop: float,
     ) -> tuple[mi.Vector3f, mi.Vector3f]:
         """See :meth:`AbstractComposite.backward_rays`."""
-        d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
-        parts = self._cotangents(seen, cotangent)
         purpose = "a backdrop is not differentiated by rays"
         lit = rays.light(only_fields(posed, purpose, "keep the camera detached"))
+        d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+        parts = self._cotangents(seen, cotangent)
         for item, layer, part in zip(lit, seen.layers, parts, strict=True):
             _, by_origin, by_direction = march_derivative(
                 dr.ADMode.Backward, item, *rays, layer, part, stop

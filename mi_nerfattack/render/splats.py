@@ -41,8 +41,8 @@ MAX_HITS = 4096  # of a ray; what comes behind is not seen
 WAITING = 16  # entered splats that wait for their turn
 
 _THINNEST = 1e-4  # standard deviation, of the splat's largest
-_THINNEST_SHELL = 1e-2  # likewise, of what rays are intersected with
-_SPREAD = 0.02  # by which shells differ, so that equal splats are entered apart
+_THINNEST_SHELL = 5e-2  # likewise, of what rays are intersected with
+_SPREAD = 0.05  # by which shells differ, so that equal splats are entered apart
 _RECORD = 16  # floats: centre, three rows of diag(1/s) R^T, opacity, padding
 
 
@@ -67,6 +67,7 @@ class _Cursor:
 
     reached: mi.Float = field(default_factory=lambda: mi.Float(0))
     last: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0xFFFFFFFF))
+    second_last: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0xFFFFFFFF))
 
 
 @dataclass
@@ -121,9 +122,14 @@ class SplatBackground(AbstractBackdrop):
         return [self, tiers, self._columns, self._records, self._harmonics]
 
     def march(self, rays: Rays, stop: float) -> March:
-        """See :meth:`AbstractBackdrop.march`."""
+        """See :meth:`AbstractBackdrop.march`; evaluated when it returns.
+
+        A kernel that ran later might find the acceleration structures gone.
+        """
         with dr.suspend_grad():
-            return self._march(rays, stop)
+            seen = self._march(rays, stop)
+        dr.eval(seen)
+        return seen
 
     @dr.syntax
     def _march(self, rays: Rays, stop: float) -> March:
@@ -172,16 +178,19 @@ class SplatBackground(AbstractBackdrop):
             )
             hit = chosen & near.is_valid()
             entry = cursor.reached + dr.select(hit, near.t, 0)
-            size = dr.max(dr.abs(rays.origin)) + dr.abs(entry)
-            beyond = entry + 1e-6 * (1 + size)  # single precision's step, and more
             index = tier.first + near.prim_index
-            fresh = hit & (index != cursor.last)
+            # what is left of a shell by rounding may be entered once more
+            again = (index == cursor.last) | (index == cursor.second_last)
+            size = dr.max(dr.abs(rays.origin)) + dr.abs(entry)
+            step = (1e-7 + size) * dr.select(again, 2e-6, 3e-7)
+            fresh = hit & ~again
             found = _choose(fresh, self._meet(index, rays, fresh), found)
-            end = dr.select(hit, beyond, dr.inf)
+            end = dr.select(hit, entry + step, dr.inf)
             result.append(
                 _Cursor(
                     dr.select(chosen, end, cursor.reached),
-                    dr.select(hit, index, cursor.last),
+                    dr.select(fresh, index, cursor.last),
+                    dr.select(fresh, cursor.last, cursor.second_last),
                 )
             )
         return result, found

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from mi_nerfattack.colour import linear_to_srgb
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
 from mi_nerfattack.render.composite import (
     AbstractComposite,
@@ -81,7 +82,7 @@ class AbstractDifferentiableSensor(AbstractSensor):
 
 
 class FieldSensor(AbstractDifferentiableSensor):
-    """Camera in a scene field with objects: the surrogate simulator.
+    """Camera in a scene with objects: the surrogate simulator.
 
     One ray a pixel through its centre; behind everything the background of the
     scene's field. All fields are marched in one kernel, for all vehicles together.
@@ -90,7 +91,8 @@ class FieldSensor(AbstractDifferentiableSensor):
     the rays that meet an object (over all rays and fields when attached).
 
     Args:
-        scene: the scene's field in the world.
+        scene: the scene's field in the world, or a backdrop; that one needs the depth
+            composite, and has no attached derivatives.
         objects: fields with textures, posed in the world; may be empty.
         camera: intrinsics.
         mount: pose on the vehicle.
@@ -102,7 +104,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def __init__(
         self,
-        scene: PosedField,
+        scene: Layer,
         objects: list[PosedField],
         camera: Camera,
         mount: CameraMount | None = None,
@@ -120,6 +122,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         self.jitter_seed = jitter_seed
         self.stop = stop
         self.composite = composite or DepthComposite()
+        self.composite.check(self._fields)
         self.renders = 0
         # Tracing these in Python takes longer than running them.
         self._frozen_render = freeze_method(self._render, self._state)
@@ -224,7 +227,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         return mi.sample_tea_float32(key, dr.arange(mi.UInt32, count))
 
     @property
-    def _fields(self) -> list[PosedField]:
+    def _fields(self) -> list[Layer]:
         return [self.scene, *self.objects]
 
     def _develop(self, total: March, direction: mi.Vector3f) -> mi.Color3f:

@@ -1,0 +1,93 @@
+"""The volume `splat_background`."""
+
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
+import mitsuba as mi
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.plugins.field_volume import read_pose
+from mi_nerfattack.render import spectrum
+from mi_nerfattack.render.splats import SplatBackground
+
+
+class SplatBackgroundVolume(mi.Volume):
+    r"""3D Gaussian splats as a constant background (``splat_background``).
+
+    The scene that a 3D Gaussian splatting trainer wrote, seen by ``field_integrator``
+    behind, between and in front of fields, by depth. Splats are intersected through
+    Mitsuba's ``ellipsoids``, with the kernel of ``volprim_rf_basic``, and laid over
+    each other by the distance of their peaks: ``I = sum_i c_i a_i prod_{j<i} (1 -
+    a_j)``, ``a_i = min(opacity_i exp(-m_i^2 / 2), 0.9999)``, m_i the least distance of
+    the ray from the centre in standard deviations, at most 3. See ``render.splats``.
+
+    =============  =========  =======  ========  ====================================
+    name           type       unit     default   meaning
+    =============  =========  =======  ========  ====================================
+    filename       string                        .ply with ``f_dc_*``, ``opacity``,
+                                                 ``scale_*``, ``rot_*``, ``f_rest_*``
+    to_world       transform  metre    identity  rotation, translation, uniform scale
+                                                 (metres per unit of the file)
+    =============  =========  =======  ========  ====================================
+
+    .. code-block:: xml
+
+        <integrator type="field_integrator">
+            <string name="composite" value="depth"/>
+            <volume type="splat_background" id="street">
+                <string name="filename" value="street.ply"/>
+            </volume>
+            <volume type="grid_field" id="object">
+                <string name="filename" value="hydrant.safetensors"/>
+            </volume>
+        </integrator>
+
+    .. code-block:: python
+
+        {"type": "splat_background", "filename": "street.ply"}
+
+    Limits: a layer of the ``depth`` composite alone; splats have no density, so that
+    ``interleaved``, media and ``field_emitter`` refuse them, and so does ``relit``.
+    It has no parameters, and nothing is differentiated by it.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        spectrum.prepare()
+        pose = read_pose(props)
+        name = mi.file_resolver().resolve(props["filename"])
+        super().__init__(props)
+        self.splats = read_splats(str(name))
+        self.posed = SplatBackground(self.splats, pose)
+        self.relit = False
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> Any:
+        """Refuse to be a medium."""
+        del it, active
+        self._refuse()
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        """Refuse to be a medium."""
+        del it, active
+        self._refuse()
+
+    def max(self) -> float:
+        """Refuse to be a medium."""
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise InputError(
+            f"{self.id()}: a splat_background is no medium; nest it in a "
+            "field_integrator with composite 'depth'"
+        )
+
+    def to_string(self) -> str:
+        """Describe the checked parameters."""
+        return (
+            f"splat_background[{self.splats.count} splats of degree "
+            f"{self.splats.degree}]"
+        )
+
+
+mi.register_texture("splat_background", lambda props: SplatBackgroundVolume(props))
