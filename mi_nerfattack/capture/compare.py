@@ -48,9 +48,9 @@ class CompareOptions:
 
     camera: Camera = field(default_factory=drive_camera)
     mount: CameraMount = field(default_factory=CameraMount)
-    spacing_m: float = 1.0
+    spacing_m: float = 2.0
     lateral_m: float = 0.0
-    spp: int = 128
+    spp: int = 64
     near_m: float = 15.0
     seed: int = 0
     worst: int = 2

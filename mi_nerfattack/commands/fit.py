@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from mi_nerfattack.commands.compare_report import CompareArguments
 
 
 @dataclass(frozen=True)
@@ -20,8 +22,9 @@ class Fit:
     """
 
     folder: tyro.conf.Positional[Path]
-    """Folder with transforms.json and images, or the JSON file."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder with transforms.json and images, or the JSON file; or a field file
+    (.safetensors), which is only compared with a scene."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Field file to write (.safetensors); FILE.report beside it says how good it is."""
     long_edge: int | None = None
     """Reduce the images to this longer edge, pixels."""
@@ -47,21 +50,32 @@ class Fit:
     """Of all random numbers."""
     skip_missing: bool = False
     """Leave out frames whose image file is missing."""
+    against: Annotated[CompareArguments, tyro.conf.OmitArgPrefixes] = field(
+        default_factory=CompareArguments
+    )
     json: bool = False
     """End with one line of JSON in place of the table."""
 
     def run(self) -> int:
-        """Fit, score and write."""
+        """Fit, score, write and compare."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.fit import FitOptions, fit_ngp
         from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
         from mi_nerfattack.capture.frames import read_transforms
         from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.commands.compare_report import compare_file
         from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.fields.ngp import NGPLayout
 
-        check_output(self.output)
         variant.ensure()
+        self.against.check()
+        if self.folder.suffix == ".safetensors":
+            compare_file(self.folder, self.against, self.json)
+            return 0
+        if self.output is None:
+            raise InputError("--output: missing; give the field file to write (-o)")
+        check_output(self.output)
         images = read_transforms(self.folder, self.long_edge, self.skip_missing)
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
@@ -85,5 +99,5 @@ class Fit:
                 progress=partial(show_fit, bars),
             )
         provenance = {"source": self.folder.name, "seed": str(self.seed)}
-        finish(result, images, self.output, provenance, self.json, depth)
+        finish(result, images, self.output, provenance, self.json, depth, self.against)
         return 0

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from mi_nerfattack.capture.fit import FitProgress, FitResult
     from mi_nerfattack.capture.frames import PosedImages
+    from mi_nerfattack.commands.compare_report import CompareArguments
 
 
 def show_fit(bars: StageBars, at: FitProgress) -> None:
@@ -60,8 +61,9 @@ def finish(
     provenance: Mapping[str, str],
     as_json: bool,
     depth: np.ndarray | None = None,
+    against: CompareArguments | None = None,
 ) -> None:
-    """Write the field and the report of its fit, and print the scores.
+    """Write the field and the report of its fit, compare it, and print the scores.
 
     Args:
         result: of the fit.
@@ -70,8 +72,12 @@ def finish(
         provenance: source and settings, for the file's header.
         as_json: print one line of JSON in place of the table.
         depth: (n, height, width), metres along the ray, or None.
+        against: the scene to compare with; None, or one without a scene, compares
+            with nothing.
     """
+    from mi_nerfattack.commands.compare_report import print_comparison
     from mi_nerfattack.fields import save_field
+    from mi_nerfattack.report.compare_page import document
     from mi_nerfattack.report.fit_page import summary, write_fit_report
 
     result.field.info.update(
@@ -85,19 +91,26 @@ def finish(
     save_field(output, result.field)
     title = f"Fit of {output.name}"
     page = write_fit_report(report_folder(output), result, images, depth, title)
+    comparison = None if against is None else against.run(result.field, output)
     if as_json:
-        print(json.dumps(summary(result)))
+        more = {} if comparison is None else {"compare": document(comparison)}
+        print(json.dumps(summary(result) | more))
         return
-    table = Table("held-out view", "PSNR dB", "SSIM")
-    for score in sorted(result.per_view, key=lambda score: score.psnr_db):
-        table.add_row(score.name, f"{score.psnr_db:.2f}", f"{score.ssim:.4f}")
-    mean = f"{result.psnr_heldout_db:.2f}", f"{result.ssim_heldout:.4f}"
-    table.add_row("mean", *mean, style="bold")
-    console = Console()
-    console.print(table)
-    console.print(
+    _print_scores(result)
+    Console().print(
         f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {page} "
         "(is it good enough, worst views, depth, training curve).",
         soft_wrap=True,
         highlight=False,
     )
+    if comparison is not None:
+        print_comparison(comparison, output)
+
+
+def _print_scores(result: FitResult) -> None:
+    table = Table("held-out view", "PSNR dB", "SSIM")
+    for score in sorted(result.per_view, key=lambda score: score.psnr_db):
+        table.add_row(score.name, f"{score.psnr_db:.2f}", f"{score.ssim:.4f}")
+    mean = f"{result.psnr_heldout_db:.2f}", f"{result.ssim_heldout:.4f}"
+    table.add_row("mean", *mean, style="bold")
+    Console().print(table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,32 @@ def _pair(name: str, value: Any) -> str:
         f"<tr><td>{html.escape(str(name))}</td>"
         f'<td class="number">{html.escape(text)}</td></tr>'
     )
+
+
+def table(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    bad: Container[tuple[int, int]] = (),
+) -> str:
+    """Return a table whose first column is text and whose others are numbers.
+
+    Args:
+        columns: their names.
+        rows: of cells, as many as columns.
+        bad: row and column, from 0, of the cells that stand out.
+    """
+    head = "".join(_cell("th", i, name, False) for i, name in enumerate(columns))
+    lines = []
+    for i, row in enumerate(rows):
+        cells = [_cell("td", j, text, (i, j) in bad) for j, text in enumerate(row)]
+        lines.append("<tr>" + "".join(cells) + "</tr>")
+    body = "\n".join(lines)
+    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table>"
+
+
+def _cell(tag: str, column: int, text: str, is_bad: bool) -> str:
+    kind = ("number" if column else "") + (" bad" if is_bad else "")
+    return f'<{tag} class="{kind}">{html.escape(text)}</{tag}>'
 
 
 def figure(title: str, path: str | Path) -> str:

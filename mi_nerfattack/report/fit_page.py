@@ -20,7 +20,7 @@ from mi_nerfattack.capture.evaluation import (
 )
 from mi_nerfattack.capture.fit_options import FitResult
 from mi_nerfattack.capture.frames import PosedImages, held_out
-from mi_nerfattack.report.elements import STYLE, figure, pairs
+from mi_nerfattack.report.elements import STYLE, figure, pairs, table
 from mi_nerfattack.report.fit_plots import write_curve, write_histogram
 from mi_nerfattack.report.verdict import Criterion, judge, verdict
 from mi_nerfattack.report.view_pictures import (
@@ -111,7 +111,7 @@ def write_fit_report(
         "good_enough": all(item.met for item in criteria),
         "settings": result.field.metadata(),
     }
-    files.write_json(root / "metrics.json", _finite(document))
+    files.write_json(root / "metrics.json", finite(document))
     facts = _facts(result, fitted_db, depth_m)
     page = _page(root, title, result, criteria, facts, depth is not None)
     files.write_text(root / "report.html", page)
@@ -163,7 +163,7 @@ def summary(result: FitResult) -> dict[str, Any]:
         "steps": result.steps,
         "per_view": [view_entry(score) for score in result.per_view],
     }
-    return _finite(document)
+    return finite(document)
 
 
 def view_entry(score: ViewScore) -> dict[str, Any]:
@@ -236,30 +236,30 @@ def _duration(seconds: float) -> str:
 
 
 def _criteria_table(criteria: Sequence[Criterion]) -> str:
-    rows = "\n".join(
-        f"<tr><td>{html.escape(item.name)}</td>"
-        f'<td class="number{"" if item.met else " bad"}">{item.value:.3g}</td>'
-        f'<td class="number">{"at least" if item.at_least else "at most"} '
-        f"{item.limit:g}</td><td>{'met' if item.met else 'not met'}</td></tr>"
+    rows = [
+        [
+            item.name,
+            f"{item.value:.4g}",
+            f"{'at least' if item.at_least else 'at most'} {item.limit:g}",
+            "met" if item.met else "not met",
+        ]
         for item in criteria
-    )
-    head = '<th>measured</th><th class="number">value</th>'
-    head += '<th class="number">limit</th><th></th>'
-    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+    ]
+    bad = {(i, 1) for i, item in enumerate(criteria) if not item.met}
+    return table(("measured", "value", "limit", ""), rows, bad)
 
 
 def _views_table(scores: Sequence[ViewScore]) -> str:
-    rows = "\n".join(
-        f"<tr><td>{html.escape(score.name)}</td>"
-        f'<td class="number">{score.psnr_db:.2f}</td>'
-        f'<td class="number">{score.ssim:.4f}</td>'
-        f'<td class="number">{100 * score.hazy:.1f} %</td></tr>'
+    rows = [
+        [
+            score.name,
+            f"{score.psnr_db:.2f}",
+            f"{score.ssim:.4f}",
+            f"{100 * score.hazy:.1f} %",
+        ]
         for score in sorted(scores, key=lambda score: score.psnr_db)
-    )
-    head = "<th>view, worst first</th>" + "".join(
-        f'<th class="number">{name}</th>' for name in ("PSNR (dB)", "SSIM", "hazy rays")
-    )
-    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+    ]
+    return table(("view, worst first", "PSNR (dB)", "SSIM", "hazy rays"), rows)
 
 
 def _entry(item: Criterion) -> dict[str, Any]:
@@ -267,12 +267,12 @@ def _entry(item: Criterion) -> dict[str, Any]:
     return {name: getattr(item, name) for name in names}
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Replace infinite and undefined numbers, which JSON has not, by null."""
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
