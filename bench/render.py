@@ -77,10 +77,10 @@ class Worker:
         self.process.kill()
         self.process.communicate()
 
-    def ask(self, question: str) -> Any:
+    def ask(self, question: str, *arguments: Any) -> Any:
         """Put a question, a method of a side, and wait for the answer."""
         assert self.process.stdin is not None
-        self.process.stdin.write(question + "\n")
+        self.process.stdin.write(json.dumps([question, *arguments]) + "\n")
         self.process.stdin.flush()
         return self._answer()
 

@@ -42,6 +42,26 @@ class AbstractSide(ABC):
         return {"peak_memory_mb": peak_memory_mb()}
 
 
+class AbstractTrainer(ABC):
+    """A field being fitted to pictures, in a process of its own."""
+
+    @abstractmethod
+    def steps(self, count: int) -> dict[str, float]:
+        """Do training steps.
+
+        Returns:
+            ``seconds`` and ``loss`` of a step, means.
+        """
+
+    @abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """Return what is not timed: ``rays`` and ``samples`` of a step, settings."""
+
+    def memory(self) -> dict[str, float]:
+        """Return the largest resident size of the process so far, in MB."""
+        return {"peak_memory_mb": peak_memory_mb()}
+
+
 def route_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Make the rays of the policies' camera at the start of the route `straight`.
 

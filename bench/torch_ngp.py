@@ -51,11 +51,14 @@ class TorchNGP:
     Attributes:
         parameters: table and matrices by the names of :class:`NGPData`; they collect
             gradients where they are asked to.
+        sky: (height, width, 3) raw colours behind the field; likewise.
+        batches: ranks of samples that are evaluated together, in order.
         evaluated: samples in front of the end of their rays, counted up.
     """
 
     def __init__(self, data: NGPData, grid: AbstractHashGrid, stop: float) -> None:
         self.grid, self.limit = grid, -math.log(stop)
+        self.batches = BATCHES
         table = data.tensors["table"].reshape(grid.rows, grid.features)
         self.parameters = {"table": _single(table)} | {
             name: _single(value)
@@ -70,22 +73,29 @@ class TorchNGP:
         self.step, self.cone = data.step_m, max(data.cone, 1e-6)
         self.evaluated = 0
 
-    def render(self, origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+    def render(
+        self,
+        origin: torch.Tensor,
+        direction: torch.Tensor,
+        jitter: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Render rays over the sky.
 
         Args:
             origin: (n, 3), metres.
             direction: (n, 3), unit vectors.
+            jitter: (n,) in [0, 1), position of the samples in their intervals; the
+                middle when left out.
 
         Returns:
             (n, 3) linear radiance.
         """
         count = len(origin)
-        samples = self.samples(origin, direction)
+        samples = self.samples(origin, direction, jitter)
         harmonics = spherical_harmonics(direction)
         depth = torch.zeros(count)  # optical depth so far
         radiance = torch.zeros(count, 3)
-        for low, high in BATCHES:
+        for low, high in self.batches:
             on = (samples.rank >= low) & (samples.rank < high)
             chosen = (on & (depth.detach() < self.limit)[samples.ray]).nonzero()[:, 0]
             if not len(chosen):
@@ -104,7 +114,12 @@ class TorchNGP:
             self.evaluated += len(lit)
         return radiance + torch.exp(-depth)[:, None] * self._background(direction)
 
-    def samples(self, origin: torch.Tensor, direction: torch.Tensor) -> Samples:
+    def samples(
+        self,
+        origin: torch.Tensor,
+        direction: torch.Tensor,
+        jitter: torch.Tensor | None = None,
+    ) -> Samples:
         """Make all lattice intervals of rays and keep those in occupied cells."""
         start_unit = (origin - self.lower) / self.extent
         slope = direction / self.extent
@@ -119,7 +134,7 @@ class TorchNGP:
         edges = self._lattice(torch.arange(first, max(last, first) + 1.0))
         start = torch.maximum(edges[:-1], near[:, None])  # (rays, intervals)
         end = torch.minimum(edges[1:], far[:, None])
-        t = torch.lerp(start, end, 0.5)
+        t = torch.lerp(start, end, 0.5 if jitter is None else jitter[:, None])
         cell = torch.zeros(t.shape, dtype=torch.int32)
         for axis, size in enumerate(self.cells.shape):
             place = start_unit[:, axis, None] + t * slope[:, axis, None]

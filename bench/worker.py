@@ -1,4 +1,6 @@
-"""A side of a comparison as a process: questions on stdin, answers as JSON on stdout.
+"""A side of a comparison as a process: questions and answers are lines of JSON.
+
+A question on stdin is the name of a method of the side and its arguments, in a list.
 
 Sides run in processes of their own because PyTorch's threads keep spinning for a while
 after their work, which slows down whatever else its process computes, and because the
@@ -15,22 +17,28 @@ from typing import Any
 
 from mi_nerfattack import variant
 from mi_nerfattack.bench.full_ngp import NGPData
-from mi_nerfattack.bench.sides import AbstractSide
+from mi_nerfattack.bench.sides import AbstractSide, AbstractTrainer
 
 
 def main(arguments: Sequence[str]) -> None:
     """Serve one side until stdin ends.
 
     Args:
-        arguments: role, width, height, and what the role needs: the field's file
-            (``ours``, ``plain``, ``tuned``), samples per ray (``slab``), nothing
-            (``object``); then, for the peers, sizes of chunks.
+        arguments: ``fit`` and what :func:`make_trainer` takes; or role, width, height,
+            and what the role needs: the field's file (``ours``, ``plain``,
+            ``tuned``), samples per ray (``slab``), nothing (``object``); then, for the
+            peers, sizes of chunks.
     """
-    role, width, height, *rest = arguments
-    side = make_side(role, int(width), int(height), rest)
+    side: Any
+    if arguments[0] == "fit":
+        side = make_trainer(*arguments[1:])
+    else:
+        role, width, height, *rest = arguments
+        side = make_side(role, int(width), int(height), rest)
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
-        print(json.dumps(_answer(side, line.strip())), flush=True)
+        question, *given = json.loads(line)
+        print(json.dumps(getattr(side, question)(*given)), flush=True)
 
 
 def make_side(role: str, width: int, height: int, rest: list[str]) -> AbstractSide:
@@ -51,8 +59,26 @@ def make_side(role: str, width: int, height: int, rest: list[str]) -> AbstractSi
     return ours.scene_side(NGPData.read(Path(rest[0])), width, height)
 
 
-def _answer(side: AbstractSide, question: str) -> Any:
-    return getattr(side, question)()
+def make_trainer(role: str, start: str, *rest: str) -> AbstractTrainer:
+    """Make a side of a comparison of training steps; imports only what it needs.
+
+    Args:
+        role: ``ours``, ``plain`` or ``tuned``.
+        start: for ours, the file of what is fitted; for a peer, the field's file.
+        rest: for a peer, the file of the pictures, rays a step, and, to try nothing
+            else, the rays of a chunk.
+    """
+    if role in ("plain", "tuned"):
+        from mi_nerfattack.bench.fit_peer import TorchTrainer
+
+        pictures, rays, *chunk = rest
+        return TorchTrainer(
+            role, Path(start), Path(pictures), int(rays), *map(int, chunk)
+        )
+    variant.ensure()
+    from mi_nerfattack.bench.fit_ours import OurTrainer
+
+    return OurTrainer(Path(start))
 
 
 if __name__ == "__main__":
