@@ -61,7 +61,7 @@ class Fit:
         from mi_nerfattack import variant
         from mi_nerfattack.capture.fit import FitOptions, fit_ngp
         from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
-        from mi_nerfattack.capture.frames import read_transforms
+        from mi_nerfattack.capture.frames import read_images
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.compare_report import compare_file
         from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
@@ -76,7 +76,7 @@ class Fit:
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
         check_output(self.output)
-        images = read_transforms(self.folder, self.long_edge, self.skip_missing)
+        images = read_images(self.folder, self.long_edge, self.skip_missing)
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
         options = FitOptions(
