@@ -22,8 +22,8 @@ class Fit:
     """
 
     folder: tyro.conf.Positional[Path]
-    """Folder with transforms.json and images, or the JSON file; or a field file
-    (.safetensors), which is only compared with a scene."""
+    """Folder with images and transforms.json or a COLMAP model, or the JSON file; or
+    a field file (.safetensors), which is only compared with a scene."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Field file to write (.safetensors); FILE.report beside it says how good it is."""
     long_edge: int | None = None
