@@ -16,9 +16,10 @@ from mi_nerfattack.commands.compare_report import CompareArguments
 class Fit:
     """Fit a neural field to posed images, and score it on every 8th image.
 
-    Without --bounds the field's box is that of all points in the folder's depth file
-    or, without such a file, a cube around the point nearest to all optical axes, four
-    times as wide as the farthest camera is away from it.
+    Without --bounds the field's box is that of all depths that the folder holds or,
+    without depth, of its cameras and sparse points or, without these too, a cube around
+    the point nearest to all optical axes, four times as wide as the farthest camera is
+    away from it.
     """
 
     folder: tyro.conf.Positional[Path]
