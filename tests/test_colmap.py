@@ -141,6 +141,7 @@ def test_images_and_points_are_those_of_the_files(scene):
     first = files.read_image(scene / "images" / "a.png")
     np.testing.assert_array_equal(posed.images[0], first)
     np.testing.assert_array_equal(posed.points, POINTS)
+    assert posed.unit == "arbitrary"
     assert posed.cameras == (
         Camera(WIDTH, HEIGHT, *PINHOLE),
         Camera(WIDTH, HEIGHT, *OPENCV),

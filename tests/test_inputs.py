@@ -193,7 +193,7 @@ class TestFolders:
     def test_instant_ngp(self, tmp_path):
         read = read_images(instant_ngp(tmp_path))
         lens = (0.01, 0.002, 0.001, 0.002)
-        assert read.cameras == ()
+        assert read.cameras == () and read.unit == "unknown"
         assert read.camera == Camera(WIDTH, HEIGHT, 10.0, 11.0, 6.5, 3.75, *lens)
         np.testing.assert_allclose(
             read.camera_to_world, np.array(poses(3)) * [1, -1, -1, 1], atol=1e-12

@@ -130,7 +130,8 @@ class TestCorner:
     def test_file_says_the_unit_and_what_is_left_out(self, corner):
         root, result, _ = corner
         table = json.loads((root / "out/transforms.json").read_text())
-        assert table["units"] == "metre" and table["left_out"] == ["flat.png"]
+        assert read_images(root / "out").unit == table["units"] == "metre"
+        assert table["left_out"] == ["flat.png"]
         assert sorted(p.name for p in (root / "out/images").iterdir()) == list(
             result.placed
         )

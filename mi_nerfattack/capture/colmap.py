@@ -120,6 +120,7 @@ def read_colmap(
         missing,
         differing(reduced),
         kind.points(points) if points.is_file() else None,
+        "arbitrary",
     )
 
 

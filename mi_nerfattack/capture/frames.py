@@ -145,6 +145,7 @@ def read_transforms(
         tuple(missing),
         differing(cameras),
         _read_points(source, table),
+        str(table.get("units", "unknown")),
     )
 
 

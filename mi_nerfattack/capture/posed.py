@@ -34,6 +34,8 @@ class PosedImages:
         cameras: n intrinsics, where they differ between the images; else empty.
         points: (m, 3), float64, metres: points that the images show, sparse and with
             outliers, as structure from motion leaves them; None if unknown.
+        unit: what one unit of the poses is, as its source says: "metre",
+            "arbitrary", "unknown" or another word.
 
     Raises:
         InputError: the shapes contradict each other or a pose is not rigid.
@@ -46,6 +48,7 @@ class PosedImages:
     missing: tuple[str, ...] = ()
     cameras: tuple[Camera, ...] = ()
     points: np.ndarray | None = None
+    unit: str = "metre"
 
     def __post_init__(self) -> None:
         """Check shapes and poses."""

@@ -249,6 +249,11 @@ def capture_scene(
         depth[i] = view.depth
         progress(i + 1, n)
     files.write_safetensors(root / "depth.safetensors", {"depth": depth})
-    extra = {"depth_file": "depth.safetensors", "spp": spp, "seed": seed}
+    extra = {
+        "units": "metre",
+        "depth_file": "depth.safetensors",
+        "spp": spp,
+        "seed": seed,
+    }
     write_poses(root / "transforms.json", names, camera, poses, extra)
     return root / "transforms.json"

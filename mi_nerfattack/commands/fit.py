@@ -99,6 +99,10 @@ class Fit:
                 step_m=self.step_m,
                 progress=partial(show_fit, bars),
             )
-        provenance = {"source": self.folder.name, "seed": str(self.seed)}
+        provenance = {
+            "source": self.folder.name,
+            "source_unit": images.unit,
+            "seed": str(self.seed),
+        }
         finish(result, images, self.output, provenance, self.json, depth, self.against)
         return 0
