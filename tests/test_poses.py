@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -225,6 +226,20 @@ class TestUnusable:
     def test_nothing_placed(self, tmp_path):
         pytest.importorskip("pycolmap")
         self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
+
+    def test_interrupt_ends_the_work(self, tmp_path):
+        pytest.importorskip("pycolmap")
+        folder = self.photographs(tmp_path / "p", 3)
+
+        def interrupt(stage: str, done: int, total: int) -> None:
+            if stage == "features":
+                raise KeyboardInterrupt
+
+        threads = threading.active_count()
+        with pytest.raises(KeyboardInterrupt):
+            estimate_poses(folder, tmp_path / "out", progress=interrupt)
+        assert not (tmp_path / "out").exists()
+        assert threading.active_count() == threads
 
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_scale(self, scale):

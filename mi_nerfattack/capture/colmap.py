@@ -84,13 +84,7 @@ def read_colmap(
             `COLMAP_MODELS`, missing images, or images of several sizes.
     """
     root = Path(path)
-    model = find_model(root)
-    kind = None if model is None else _format_of(model)
-    if model is None or kind is None:
-        raise InputError(
-            f"{root}: no COLMAP model (cameras and images, .bin or .txt); looked in "
-            f"{', '.join(MODEL_PLACES)}"
-        )
+    model, kind = _model_in(root)
     source = model / f"cameras{kind.suffix}"
     cameras = _cameras(source, kind.cameras(source))
     where = model / f"images{kind.suffix}"
@@ -121,6 +115,17 @@ def read_colmap(
         differing(reduced),
         kind.points(points) if points.is_file() else None,
         "arbitrary",
+    )
+
+
+def _model_in(root: Path) -> tuple[Path, _Format]:
+    for place in MODEL_PLACES:
+        kind = _format_of(root / place)
+        if kind is not None:
+            return root / place, kind
+    raise InputError(
+        f"{root}: no COLMAP model (cameras and images, .bin or .txt); looked in "
+        f"{', '.join(MODEL_PLACES)}"
     )
 
 
