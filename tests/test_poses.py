@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -260,6 +262,23 @@ class TestUnusable:
         with pytest.raises(InputError, match="0.jpg: its EXIF data turn it"):
             estimate_poses(folder, tmp_path)
         assert (folder / "0.jpg").read_bytes() == before
+
+
+_TERMINATED = """
+import os, signal, sys
+import mi_nerfattack
+from mi_nerfattack.capture import structure
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+structure._pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+def test_pycolmap_leaves_sigterm_to_us():
+    pytest.importorskip("pycolmap")
+    command = [sys.executable, "-c", _TERMINATED]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 7 and result.stderr == ""
 
 
 def write_turned(path: Path, image: np.ndarray) -> None:

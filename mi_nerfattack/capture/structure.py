@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -98,6 +99,7 @@ def reconstruct(
 
 
 def _pycolmap() -> Any:
+    before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
@@ -105,6 +107,9 @@ def _pycolmap() -> Any:
             f"pycolmap: {error}; poses are estimated with it: pip install pycolmap, "
             "or reconstruct with COLMAP elsewhere and give the model to 'fit'"
         ) from error
+    # its import takes SIGTERM to print a stack trace; it must end us as before
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     return pycolmap
 
 
