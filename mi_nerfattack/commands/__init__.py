@@ -15,7 +15,9 @@ from mi_nerfattack.commands.bench import Bench
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
+from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
+from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.train import Train
 
@@ -33,8 +35,10 @@ COMMANDS: dict[str, type[Command]] = {
     "demo": Demo,
     "render": Render,
     "capture": Capture,
+    "poses": Poses,
     "fit": Fit,
     "asset": Asset,
+    "export": Export,
     "train": Train,
     "attack": Attack,
     "bench": Bench,

@@ -57,7 +57,7 @@ class Asset:
     size: int | None = None
     """Width and height of a render, pixels; about three for each cell by default."""
     steps: int | None = None
-    """Steps of the optimiser; 600, or 1500 for a folder, which has no depth."""
+    """Steps of the optimiser; 600, or 1000 for a folder, which has no depth."""
     budget_minutes: float | None = None
     """End the fit after this time."""
     batch_rays: int = 4096
@@ -103,7 +103,7 @@ class Asset:
         from mi_nerfattack.capture.fit_options import FitOptions
 
         return FitOptions(
-            steps=(600 if has_depth else 1500) if self.steps is None else self.steps,
+            steps=(600 if has_depth else 1000) if self.steps is None else self.steps,
             budget_minutes=self.budget_minutes,
             batch_rays=self.batch_rays,
             seed=self.seed,

@@ -1,0 +1,105 @@
+"""``mi-nerfattack export``: an object as a coloured mesh or as cube-face pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from mi_nerfattack.fields.grid import GridField
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an object's field as a coloured mesh (glTF) or as six pictures (PNG).
+
+    A run folder of attack holds its attacked objects as fields, objects/ID.safetensors.
+    Colours are radiance: reflectance times the light that the object was captured in.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field of an object (.safetensors), as asset and attack write them."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json."""
+    mesh: Path | None = None
+    """Colour the triangles of this mesh, which the field was fitted to, in place of
+    the surface of the field; give the size and axes that were given to asset."""
+    height_m: float | None = None
+    """Of --mesh: scale to this height, metres."""
+    longest_m: float | None = None
+    """Of --mesh: scale the longest edge of the bounding box to this, metres."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Of --mesh: axis that points up."""
+    turn_deg: float = 0.0
+    """Of --mesh: turn about the vertical."""
+    pixels_per_m: float | None = None
+    """Of the pictures; 256 pixels along the longest edge by default."""
+
+    def run(self) -> int:
+        """Read, sample the surface or look at the sides, and write."""
+        from mi_nerfattack import files, variant
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.fields.io import load_grid
+
+        suffix = self.output.suffix.lower()
+        if suffix not in (".glb", ""):
+            raise InputError(f"{self.output}: give FILE.glb or a folder's name")
+        self._refuse_unused(is_mesh=suffix == ".glb")
+        variant.ensure()
+        grid = load_grid(self.field)
+        if suffix == "":
+            return self._write_faces(grid)
+        files.check_writable(self.output)
+        return self._write_mesh(grid)
+
+    def _write_mesh(self, grid: GridField) -> int:
+        from mi_nerfattack.capture.gltf_writer import write_glb
+        from mi_nerfattack.capture.object_views import Placement
+        from mi_nerfattack.capture.surface_mesh import field_surface, painted_mesh
+
+        if self.mesh is None:
+            mesh = field_surface(grid)
+        else:
+            placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
+            mesh = painted_mesh(grid, placement.mesh(self.mesh))
+        write_glb(self.output, mesh)
+        print(
+            f"Wrote {self.output}: {len(mesh.faces)} triangles, "
+            f"{len(mesh.vertices)} vertices"
+        )
+        return 0
+
+    def _write_faces(self, grid: GridField) -> int:
+        from mi_nerfattack.capture.cube_faces import render_faces, write_faces
+        from mi_nerfattack.errors import InputError
+
+        if self.output.is_file():
+            raise InputError(f"{self.output}: is a file; give a folder's name")
+        faces = render_faces(grid, self.pixels_per_m)
+        write_faces(self.output, faces)
+        edges = " x ".join(f"{edge:.3f}" for edge in faces.upper - faces.lower)
+        print(
+            f"Wrote {self.output}: 6 pictures of a box of {edges} m, "
+            f"{faces.pixels_per_m:.0f} pixels a metre"
+        )
+        return 0
+
+    def _refuse_unused(self, is_mesh: bool) -> None:
+        """Raise InputError for an option that the kind of output has no use for."""
+        from mi_nerfattack.errors import InputError
+
+        if not is_mesh and self.mesh is not None:
+            raise InputError("--mesh: is for FILE.glb, not for pictures")
+        if is_mesh and self.pixels_per_m is not None:
+            raise InputError("--pixels-per-m: is for pictures, not for FILE.glb")
+        for name, value in (
+            ("height-m", self.height_m),
+            ("longest-m", self.longest_m),
+            ("up", self.up),
+            ("turn-deg", self.turn_deg or None),
+        ):
+            if value is not None and self.mesh is None:
+                raise InputError(f"--{name}: needs --mesh")
