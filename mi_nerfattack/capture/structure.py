@@ -211,18 +211,23 @@ class _Steps:
                 )
             except BaseException as error:  # raised again below
                 failure.append(error)
+            finally:
+                ended.set()
 
+        # not join(): interrupted, it may take a running thread for an ended one
+        ended = threading.Event()
         thread = threading.Thread(target=work)
         thread.start()
         try:
-            while thread.is_alive():
+            while not ended.wait(_POLL_S):
                 count = self._ask(done) if isinstance(done, str) else done()
                 self._progress(stage, min(count, total - 1), total)
-                thread.join(_POLL_S)
         except BaseException:
             self._token.cancel()
-            thread.join()
+            ended.wait()
             raise
+        finally:
+            thread.join()
         if failure:
             raise failure[0]
         self._progress(stage, total, total)
