@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from PIL import Image
 from mi_nerfattack import cli, files
 from mi_nerfattack.capture.frames import read_images
 from mi_nerfattack.capture.poses import PoseOptions, estimate_poses, upright
-from mi_nerfattack.capture.structure import Structure
+from mi_nerfattack.capture.structure import Structure, _Steps
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera, from_fov, look_at
 
@@ -229,20 +230,6 @@ class TestUnusable:
         pytest.importorskip("pycolmap")
         self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
 
-    def test_interrupt_ends_the_work(self, tmp_path):
-        pytest.importorskip("pycolmap")
-        folder = self.photographs(tmp_path / "p", 3)
-
-        def interrupt(stage: str, done: int, total: int) -> None:
-            if stage != "photographs":
-                raise KeyboardInterrupt
-
-        threads = threading.active_count()
-        with pytest.raises(KeyboardInterrupt):
-            estimate_poses(folder, tmp_path / "out", progress=interrupt)
-        assert not (tmp_path / "out").exists()
-        assert threading.active_count() == threads
-
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_scale(self, scale):
         with pytest.raises(InputError, match="metres_per_unit: .*positive"):
@@ -262,6 +249,40 @@ class TestUnusable:
         with pytest.raises(InputError, match="0.jpg: its EXIF data turn it"):
             estimate_poses(folder, tmp_path)
         assert (folder / "0.jpg").read_bytes() == before
+
+
+class Token:
+    """Stands for pycolmap's token of cancellation."""
+
+    def __init__(self) -> None:
+        self.cancelled = threading.Event()
+        self.cancel = self.cancelled.set
+
+
+def test_interrupt_cancels_and_waits(tmp_path):
+    def interrupt(stage: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    def work(cancellation_token: Token) -> None:
+        assert cancellation_token.cancelled.wait(10)
+        time.sleep(0.1)
+        ended.append(True)
+        raise InterruptedError
+
+    ended: list[bool] = []
+    steps = _Steps(tmp_path / "database.db", Token(), interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        steps.run("features", 3, lambda: 0, work)
+    assert ended
+
+
+def test_failures_of_the_thread_arrive(tmp_path):
+    def work(cancellation_token: Token) -> None:
+        raise ZeroDivisionError
+
+    steps = _Steps(tmp_path / "database.db", Token(), lambda *_: None)
+    with pytest.raises(ZeroDivisionError):
+        steps.run("features", 3, "SELECT 1", work)
 
 
 _TERMINATED = """
