@@ -24,7 +24,7 @@ from mi_nerfattack.colour import linear_to_srgb_numpy
 from mi_nerfattack.render.camera import from_fov, look_at
 from mi_nerfattack.report.fit_page import summary, write_fit_report
 from mi_nerfattack.report.fit_plots import running_mean
-from mi_nerfattack.report.verdict import judge, verdict
+from mi_nerfattack.report.verdict import judge, pooled_db, verdict
 from mi_nerfattack.report.view_pictures import abs_difference
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -177,8 +177,8 @@ def scores_of(psnr: list[float], hazy: float = 0.01) -> list[ViewScore]:
         ([30, 31, 29], 31, 0.01, []),
         ([30, 31], 31, 0.01, ["held-out views"]),
         ([23, 23, 23], 25, 0.01, ["mean PSNR"]),
-        ([30, 17, 30], 28, 0.01, ["worst"]),
-        ([25, 25, 25], 31, 0.01, ["fitted less"]),
+        ([30, 17, 30], 25, 0.01, ["worst"]),
+        ([25, 25, 25], 31, 0.01, ["fitted rays less"]),
         ([25, 25, 25], 26, 0.2, ["opacity"]),
         ([np.inf] * 3, np.inf, 0.0, []),
     ],
@@ -191,6 +191,14 @@ def test_verdict_names_what_is_not_met(psnr, fitted, hazy, failed):
     text = verdict(criteria)
     assert text.startswith("Not good enough" if failed else "Good enough")
     assert all(name in text for name in names)
+
+
+def test_pooled_psnr_averages_squared_errors():
+    assert pooled_db([20.0, 20.0]) == pytest.approx(20)
+    expected = -10 * np.log10((1e-2 + 1e-4) / 2)
+    assert pooled_db([20.0, 40.0]) == pytest.approx(expected)
+    assert pooled_db([np.inf]) == np.inf
+    assert len(judge(scores_of([30.0]))) == len(judge(scores_of([30.0]), 30.0)) - 1
 
 
 def test_running_mean_keeps_lines():

@@ -14,15 +14,14 @@ import numpy as np
 from mi_nerfattack import files
 from mi_nerfattack.capture.evaluation import (
     ViewScore,
-    evaluate,
     reference,
     worst_views,
 )
-from mi_nerfattack.capture.fit_options import FitResult
-from mi_nerfattack.capture.frames import PosedImages, held_out
+from mi_nerfattack.capture.fit_options import FitProgress, FitResult
+from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.report.elements import STYLE, figure, pairs, table
 from mi_nerfattack.report.fit_plots import write_curve, write_histogram
-from mi_nerfattack.report.verdict import Criterion, judge, verdict
+from mi_nerfattack.report.verdict import Criterion, judge, pooled_db, verdict
 from mi_nerfattack.report.view_pictures import (
     SOLID,
     ViewPair,
@@ -32,7 +31,6 @@ from mi_nerfattack.report.view_pictures import (
 )
 
 _SHOWN_VIEWS = 4
-_FITTED_VIEWS = 4  # scored too, to see whether the field learnt images by heart
 
 _PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -79,8 +77,7 @@ def write_fit_report(
 ) -> Path:
     """Write `report.html`, `metrics.json`, `worst.png`, `depth.png`, ... of a fit.
 
-    The page holds its pictures, and needs no network. Held-out views are not rendered
-    again; four of the others are, to compare fitted with held-out ones.
+    The page holds its pictures, and needs no network. No view is rendered again.
 
     Args:
         folder: made if needed; files of these names are replaced.
@@ -94,8 +91,7 @@ def write_fit_report(
         Path of the page, which is written last.
     """
     root = files.make_folder(folder)
-    fitted = _fitted_scores(result, images)
-    fitted_db = float(np.mean([score.psnr_db for score in fitted]))
+    fitted_db = _fitted_db(result.history)
     criteria = judge(result.per_view, fitted_db)
     worst = worst_views(result.per_view, _SHOWN_VIEWS)
     shown = [_pair(score, images, depth) for score in worst]
@@ -105,7 +101,7 @@ def write_fit_report(
     write_curve(root / "curve.png", result.history, result.psnr_heldout_db)
     write_histogram(root / "views.png", result.per_view)
     document = summary(result) | {
-        "fitted_views": [view_entry(score) for score in fitted],
+        "psnr_fitted_db": fitted_db,
         "depth_error_median_m": depth_m,
         "criteria": [_entry(item) for item in criteria],
         "good_enough": all(item.met for item in criteria),
@@ -172,11 +168,12 @@ def view_entry(score: ViewScore) -> dict[str, Any]:
     return {name: getattr(score, name) for name in names}
 
 
-def _fitted_scores(result: FitResult, images: PosedImages) -> list[ViewScore]:
-    others = np.setdiff1d(np.arange(len(images)), held_out(len(images)))
-    count = min(_FITTED_VIEWS, len(others))
-    chosen = others[np.linspace(0, len(others) - 1, count).round().astype(int)]
-    return evaluate(result.field, images, chosen, keep=0)
+def _fitted_db(history: Sequence[FitProgress]) -> float | None:
+    """Return the PSNR of the rays fitted to in the last tenth of a fit."""
+    if not history:
+        return None
+    late = [at.psnr_db for at in history if at.step >= 0.9 * history[-1].step]
+    return pooled_db(late)
 
 
 def _pair(score: ViewScore, images: PosedImages, depth: np.ndarray | None) -> ViewPair:
@@ -208,7 +205,7 @@ def _depth_error(views: Sequence[ViewPair]) -> float | None:
 
 
 def _facts(
-    result: FitResult, fitted_db: float, depth_m: float | None
+    result: FitResult, fitted_db: float | None, depth_m: float | None
 ) -> dict[str, Any]:
     field = result.field
     low, high = (
@@ -217,14 +214,16 @@ def _facts(
     facts = {
         "mean PSNR, held-out views": f"{result.psnr_heldout_db:.2f} dB",
         "mean SSIM, held-out views": f"{result.ssim_heldout:.4f}",
-        "mean PSNR, fitted views (a sample)": f"{fitted_db:.2f} dB",
         "held-out views": str(len(result.per_view)),
         "steps": f"{result.steps:,}",
         "wall time of fit and scores": _duration(result.wall_s),
-        "box": f"({low}) to ({high}) m",
-        "frame": "that of the poses, metres; z up where the poses have z up",
+        "box": f"({low}) to ({high})",
+        "frame and unit": "those of the poses",
+        "unit of the poses": field.info.get("fit.source_unit", "metre"),
         "source": field.info.get("fit.source", "unknown"),
     }
+    if fitted_db is not None:
+        facts["PSNR of the rays fitted to, at the end"] = f"{fitted_db:.2f} dB"
     if depth_m is not None:
         facts["median depth error, worst views"] = f"{depth_m:.3f} m"
     return facts

@@ -65,9 +65,8 @@ def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:
         if values:
             low, high = np.floor(min(values)), np.floor(max(values)) + 1
             width = max(0.5, np.ceil((high - low) / 30))
-            axis.hist(
-                values, np.arange(low, high + width, width), color=BLUE, rwidth=0.9
-            )
+            bins = np.arange(low, high + width, width).tolist()
+            axis.hist(values, bins, color=BLUE, rwidth=0.9)
             axis.axvline(float(np.mean(values)), color=ORANGE, linestyle="--")
             label = f"mean {np.mean(values):.2f} dB"
             axis.set_title(label, loc="right", fontsize=8, color=ORANGE)
@@ -78,7 +77,7 @@ def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:
         axis.grid(alpha=0.25, axis="y")
 
 
-def running_mean(values: Sequence[float]) -> np.ndarray:
+def running_mean(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """Average each value with those around it, fewer at both ends; same length."""
     data = np.asarray(values, np.float64)
     reach = min(_SMOOTH // 2, len(data) // 8)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
@@ -18,7 +18,7 @@ from mi_nerfattack.report.charts import DPI, WIDTH_PX, chart
 SOLID = 0.5  # opacity from which on a ray has a depth worth showing
 _ERROR_MAX = 0.4  # of sRGB values, at the end of the scale
 _FAR = 0.98  # quantile of depths at the end of the scale
-_NOTHING = "#c8c8c8"
+_DEPTHS, _ERRORS, _NOTHING = "viridis_r", "inferno", "#c8c8c8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,9 @@ def write_colours(path: str | Path, views: Sequence[ViewPair], wanted: str) -> N
             error = np.abs(view.shown - view.wanted).mean(axis=2)
             axes[0].imshow(np.clip(view.wanted, 0, 1), interpolation="nearest")
             axes[1].imshow(np.clip(view.shown, 0, 1), interpolation="nearest")
-            mapped = axes[2].imshow(
-                error, cmap="inferno", norm=scale, interpolation="nearest"
-            )
+            _map(axes[2], error, _ERRORS, scale)
         label = "difference of sRGB values (0 to 1), mean of the channels"
-        _bar(figure, mapped, rows, label, "max")
+        _bar(figure, rows, _ERRORS, scale, label)
 
 
 def write_depths(path: str | Path, views: Sequence[ViewPair]) -> None:
@@ -83,13 +81,13 @@ def write_depths(path: str | Path, views: Sequence[ViewPair]) -> None:
     with chart(path, _height(views, 3 if known else 2)) as figure:
         rows = _panels(figure, views, columns)
         for i, axes in enumerate(rows):
-            mapped = _map(axes[0], shown[i], "viridis_r", scale)
+            _map(axes[0], shown[i], _DEPTHS, scale)
             if known:
-                _map(axes[1], given[i], "viridis_r", scale)
-                missed = _map(axes[2], errors[i], "inferno", error_scale)
-        _bar(figure, mapped, rows, "depth along the ray (m)", "max")
+                _map(axes[1], given[i], _DEPTHS, scale)
+                _map(axes[2], errors[i], _ERRORS, error_scale)
+        _bar(figure, rows, _DEPTHS, scale, "depth along the ray (m)")
         if known:
-            _bar(figure, missed, rows, "difference of depths (m)", "max")
+            _bar(figure, rows, _ERRORS, error_scale, "difference of depths (m)")
 
 
 def abs_difference(shown: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -100,10 +98,10 @@ def abs_difference(shown: np.ndarray, known: np.ndarray) -> np.ndarray:
     return result
 
 
-def _map(axis: Axes, values: np.ndarray, name: str, scale: Normalize) -> Any:
+def _map(axis: Axes, values: np.ndarray, name: str, scale: Normalize) -> None:
     colours = matplotlib.colormaps[name].with_extremes(bad=_NOTHING)
     masked = np.ma.masked_where(~np.isfinite(values), values)
-    return axis.imshow(masked, cmap=colours, norm=scale, interpolation="nearest")
+    axis.imshow(masked, cmap=colours, norm=scale, interpolation="nearest")
 
 
 def _range(maps: Sequence[np.ndarray]) -> tuple[float, float]:
@@ -143,13 +141,15 @@ def _panels(
     return grid
 
 
-def _bar(figure: Figure, mapped: Any, rows: np.ndarray, label: str, more: Any) -> None:
+def _bar(
+    figure: Figure, rows: np.ndarray, name: str, scale: Normalize, label: str
+) -> None:
     figure.colorbar(
-        mapped,
+        ScalarMappable(scale, name),
         ax=rows.ravel().tolist(),
         location="bottom",
         label=label,
-        extend=more,
+        extend="max",
         shrink=0.6,
         aspect=50,
         pad=0.02,
