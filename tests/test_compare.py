@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from small_fields import sigmoid_to_linear
+from sphere_views import sphere_views
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.compare import (
@@ -17,10 +18,13 @@ from mi_nerfattack.capture.compare import (
     depth_errors,
     quantile,
 )
+from mi_nerfattack.capture.evaluation import evaluate
+from mi_nerfattack.capture.fit_options import FitResult
 from mi_nerfattack.colour import linear_to_srgb_numpy
 from mi_nerfattack.commands.compare_report import CompareArguments, print_comparison
+from mi_nerfattack.commands.fit_report import finish
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridField, GridLayout, save_field
+from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
 from mi_nerfattack.render.camera import CameraMount, from_fov
 from mi_nerfattack.report.compare_page import document, verdict, write_compare_report
 
@@ -217,6 +221,23 @@ def test_arguments_are_checked_first(place, tmp_path):
         CompareArguments(scene, routes).check()
     CompareArguments().check()
     assert CompareArguments().run(wall(1.0), tmp_path / "a") is None
+
+
+def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
+    """One line of JSON: the scores of the fit, and the comparison beside them."""
+    images, _ = sphere_views(2, alpha=False)
+    field = wall(WALL_X + 0.2)
+    scores = tuple(evaluate(field, images, [0]))
+    psnr, ssim = scores[0].psnr_db, scores[0].ssim
+    result = FitResult(field, psnr, ssim, scores, (), 1.0, 25)
+    against = CompareArguments(*place, (24, 16), 30.0, compare_spp=2)
+    output = tmp_path / "wall.safetensors"
+    finish(result, images, output, {"source": "x"}, True, against=against)
+    table = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert table["psnr_heldout_db"] == psnr and table["steps"] == 25
+    assert table["compare"]["routes"]["ahead"]["frames"] == 5
+    assert load_field(output).info["fit.source"] == "x"
+    assert (tmp_path / "wall.report" / "report.html").is_file()
 
 
 def test_command_compares_a_field_file(place, tmp_path, capsys):

@@ -132,7 +132,9 @@ def print_comparison(comparison: Comparison, output: Path) -> None:
 
     from mi_nerfattack.report.compare_page import COLUMNS, rows, settings_line, verdict
 
-    table = Table(*COLUMNS, box=rich.box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, name in enumerate(COLUMNS):
+        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0)
     for cells in rows(comparison):
         table.add_row(*cells)
     console = Console()

@@ -97,7 +97,7 @@ def write_fit_report(
     shown = [_pair(score, images, depth) for score in worst]
     depth_m = _depth_error(shown)
     write_colours(root / "worst.png", shown, "image")
-    write_depths(root / "depth.png", shown)
+    write_depths(root / "depth.png", shown, _unit(result))
     write_curve(root / "curve.png", result.history, result.psnr_heldout_db)
     write_histogram(root / "views.png", result.per_view)
     document = summary(result) | {
@@ -218,15 +218,20 @@ def _facts(
         "steps": f"{result.steps:,}",
         "wall time of fit and scores": _duration(result.wall_s),
         "box": f"({low}) to ({high})",
-        "frame and unit": "those of the poses",
-        "unit of the poses": field.info.get("fit.source_unit", "metre"),
+        "frame": "that of the poses",
+        "unit": _unit(result),
         "source": field.info.get("fit.source", "unknown"),
     }
     if fitted_db is not None:
         facts["PSNR of the rays fitted to, at the end"] = f"{fitted_db:.2f} dB"
     if depth_m is not None:
-        facts["median depth error, worst views"] = f"{depth_m:.3f} m"
+        facts["median depth error, worst views"] = f"{depth_m:.3f} {_unit(result)}"
     return facts
+
+
+def _unit(result: FitResult) -> str:
+    unit = result.field.info.get("fit.source_unit", "metre")
+    return "m" if unit == "metre" else f"of {unit} length"
 
 
 def _duration(seconds: float) -> str:

@@ -62,7 +62,7 @@ def write_colours(path: str | Path, views: Sequence[ViewPair], wanted: str) -> N
         _bar(figure, rows, _ERRORS, scale, label)
 
 
-def write_depths(path: str | Path, views: Sequence[ViewPair]) -> None:
+def write_depths(path: str | Path, views: Sequence[ViewPair], unit: str = "m") -> None:
     """Write the field's depth of views below each other, beside the known one.
 
     Grey is where the field stops less than half of the light, or nothing is known.
@@ -70,6 +70,7 @@ def write_depths(path: str | Path, views: Sequence[ViewPair]) -> None:
     Args:
         path: PNG file.
         views: at least one, all of one size.
+        unit: of the depths, for the labels.
     """
     known = all(view.known_depth is not None for view in views)
     shown = [np.where(view.opacity >= SOLID, view.depth, np.inf) for view in views]
@@ -85,9 +86,9 @@ def write_depths(path: str | Path, views: Sequence[ViewPair]) -> None:
             if known:
                 _map(axes[1], given[i], _DEPTHS, scale)
                 _map(axes[2], errors[i], _ERRORS, error_scale)
-        _bar(figure, rows, _DEPTHS, scale, "depth along the ray (m)")
+        _bar(figure, rows, _DEPTHS, scale, f"depth along the ray ({unit})")
         if known:
-            _bar(figure, rows, _ERRORS, error_scale, "difference of depths (m)")
+            _bar(figure, rows, _ERRORS, error_scale, f"difference of depths ({unit})")
 
 
 def abs_difference(shown: np.ndarray, known: np.ndarray) -> np.ndarray:
