@@ -230,6 +230,11 @@ class TestUnusable:
         pytest.importorskip("pycolmap")
         self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
 
+    def test_without_pycolmap(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "pycolmap", None)
+        folder = self.photographs(tmp_path / "p", 3)
+        self.refused(folder, "pycolmap: .*pip install pycolmap")
+
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_scale(self, scale):
         with pytest.raises(InputError, match="metres_per_unit: .*positive"):
