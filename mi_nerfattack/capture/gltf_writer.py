@@ -29,8 +29,8 @@ def write_glb(path: str | Path, mesh: ColouredMesh) -> None:
     for array, kind, target in (
         (_y_up(mesh.vertices), "VEC3", _ARRAY_BUFFER),
         (_y_up(mesh.normals), "VEC3", _ARRAY_BUFFER),
-        (np.float32(mesh.colours), "VEC3", _ARRAY_BUFFER),
-        (np.uint32(mesh.faces.ravel()), "SCALAR", _ELEMENT_BUFFER),
+        (mesh.colours.astype(np.float32), "VEC3", _ARRAY_BUFFER),
+        (mesh.faces.ravel().astype(np.uint32), "SCALAR", _ELEMENT_BUFFER),
     ):
         data = np.ascontiguousarray(array).tobytes()
         accessor: dict[str, Any] = {
@@ -71,8 +71,8 @@ def write_glb(path: str | Path, mesh: ColouredMesh) -> None:
 
 
 def _y_up(vectors: np.ndarray) -> np.ndarray:
-    x, y, z = np.float32(vectors).T
-    return np.stack([x, z, -y], axis=1)
+    x, y, z = vectors.T
+    return np.stack([x, z, -y], axis=1).astype(np.float32)
 
 
 def _glb(text: str, blob: bytes) -> bytes:

@@ -14,10 +14,10 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.distortion import distort
 
-_CELLS = 64  # along each edge
+_COARSE, _FINE = 32, 64  # cells along each edge: while the box shrinks, and at last
 _VIEWS = 48  # at most; fewer cones make the hull larger, never smaller
 _PIXELS = 256  # silhouettes are reduced to about this edge
-_PASSES = 6
+_PASSES = 8
 _SEEN_BY = 0.5  # share of the views that must have a point in their frame
 _ALPHA = 0.02  # opacity from which a pixel belongs to the object
 
@@ -60,21 +60,23 @@ def silhouette_bounds(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
     chosen = np.unique(np.linspace(0, len(images) - 1, _VIEWS).round().astype(int))
     silhouettes = [_reduced(images.images[i, ..., 3] > 255 * _ALPHA) for i in chosen]
     lower, upper = find_bounds(replace(images, points=None))
+    cells = _COARSE
     for _ in range(_PASSES):
-        inside = _inside(images, chosen, silhouettes, lower, upper)
+        inside = _inside(images, chosen, silhouettes, lower, upper, cells)
         if not inside.any():
             raise InputError(
                 "images: no point lies inside of all silhouettes; check the poses and "
                 "the alpha, or give the object's box (--bounds x0 y0 z0 x1 y1 z1)"
             )
         found = np.stack(np.nonzero(inside))
-        cell = (upper - lower) / _CELLS
+        cell = (upper - lower) / cells
         low = np.maximum(lower, lower + (found.min(1) - 1) * cell)
         high = np.minimum(upper, lower + (found.max(1) + 2) * cell)
-        done = np.all(high - low > 0.9 * (upper - lower))
+        shrunk = np.any(high - low < 0.85 * (upper - lower))
         lower, upper = low, high
-        if done:
+        if cells == _FINE:
             break
+        cells = _COARSE if shrunk else _FINE
     return lower, upper
 
 
@@ -104,12 +106,13 @@ def _inside(
     silhouettes: list[tuple[np.ndarray, int]],
     lower: np.ndarray,
     upper: np.ndarray,
+    cells: int,
 ) -> np.ndarray:
     """Mark the cells of a grid that no silhouette excludes, boolean (n, n, n)."""
-    unit = (np.arange(_CELLS) + 0.5) / _CELLS
+    unit = (np.arange(cells) + 0.5) / cells
     grid = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1)
     points = lower + grid.reshape(-1, 3) * (upper - lower)
-    radius = 0.5 * float(np.linalg.norm((upper - lower) / _CELLS))
+    radius = 0.5 * float(np.linalg.norm((upper - lower) / cells))
     alive = np.arange(len(points))
     seen = np.zeros(len(points), int)
     for index, (mask, factor) in zip(chosen, silhouettes, strict=True):
@@ -126,7 +129,7 @@ def _inside(
     alive = alive[seen[alive] >= _SEEN_BY * len(chosen)]
     inside = np.zeros(len(points), bool)
     inside[alive] = True
-    return inside.reshape((_CELLS,) * 3)
+    return inside.reshape((cells,) * 3)
 
 
 def _reduced(mask: np.ndarray) -> tuple[np.ndarray, int]:

@@ -133,10 +133,10 @@ def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
         solid = np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1) > 0
         longest = float(np.linalg.norm(edges, axis=2).max())
         rounds = int(np.ceil(np.log2(max(1.0, longest / edge_m)))) + 1
-        vertices, faces = subdivide_to_size(
+        divided = subdivide_to_size(
             part.vertices, part.faces[solid], edge_m, max_iter=rounds
         )
-        found.append(vertices[faces])
+        found.append(divided[0][divided[1]])
         if sum(map(len, found)) > _MAX_TRIANGLES:
             raise InputError(
                 f"{mesh.name}: more than {_MAX_TRIANGLES} triangles; simplify it"
@@ -222,9 +222,10 @@ def _solid(opacity: np.ndarray) -> np.ndarray:
     """Fill hollows behind pinholes and leave out specks; values of about 0 and 1."""
     opaque = opacity > _OPAQUE
     filled = opaque | _hollows(opaque)
-    labels, count = ndimage.label(filled, _BLOCK)
-    if count == 0:
+    if not filled.any():
         raise InputError("the field is nowhere opaque, so that it has no surface")
+    labels = np.zeros(filled.shape, np.int32)
+    ndimage.label(filled, _BLOCK, output=labels)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     kept = (sizes >= _SPECK * sizes.max())[labels] & filled
