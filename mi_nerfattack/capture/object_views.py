@@ -11,7 +11,7 @@ import numpy as np
 from mi_nerfattack import files
 from mi_nerfattack.capture.asset import Lighting, render_asset
 from mi_nerfattack.capture.fit_inputs import find_bounds
-from mi_nerfattack.capture.frames import PosedImages, read_transforms
+from mi_nerfattack.capture.frames import PosedImages, read_images
 from mi_nerfattack.capture.hull import check_alpha, place, silhouette_bounds
 from mi_nerfattack.capture.mesh import (
     CUBE_FACES,
@@ -109,7 +109,7 @@ def read_views(
     what is scaled, centred in x and y and put on z = 0. With them, nothing is moved.
 
     Args:
-        folder: of transforms.json or transforms_train.json, or the JSON file.
+        folder: as `read_images` takes it.
         placement: size and pose; `up` is z if None.
         bounds: x0, y0, z0, x1, y1, z1 in the unit of the poses, metres.
         long_edge_px: reduce the images to this longer edge.
@@ -118,7 +118,7 @@ def read_views(
         InputError: the folder cannot be read, its images have no alpha, or both
             `bounds` and a placement are given.
     """
-    images = read_transforms(folder, long_edge_px)
+    images = read_images(folder, long_edge_px)
     check_alpha(images, str(folder))
     if bounds is not None:
         if placement != Placement():

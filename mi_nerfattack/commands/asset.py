@@ -28,8 +28,8 @@ class Asset:
     """
 
     source: tyro.conf.Positional[str]
-    """glTF (.glb, .gltf), OBJ or PLY; a folder with transforms.json or
-    transforms_train.json and RGBA images; or the word cube (./cube is a file)."""
+    """glTF (.glb, .gltf), OBJ or PLY; a folder with RGBA images and poses, as fit reads
+    it; or the word cube (./cube is a file)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Field file to write (.safetensors); a report of the fit lies beside it."""
     height_m: float | None = None
