@@ -145,9 +145,13 @@ def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
     _, opacity, moment = made.reference(item, np.zeros(3), directions)
     assert np.median(opacity) > 0.5
     seen = look(item, directions=directions)
-    for found, expected in ((seen.opacity, opacity), (seen.moment, moment)):
-        error = np.abs(found.numpy() / expected - 1)  # two entered as one: up to 1e-2
-        assert np.quantile(error, 0.95) < 2e-4 and error.max() < 0.02
+    for found, expected, scale in (
+        (seen.opacity, opacity, 1),
+        (seen.moment, moment, 20),
+    ):
+        error = np.abs(found.numpy() - expected) / scale
+        assert np.quantile(error, 0.97) < 1e-4  # now and then two are entered as one
+        assert error.max() < 0.02
 
 
 def test_the_order_in_the_file_does_not_matter(rng) -> None:
