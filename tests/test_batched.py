@@ -54,10 +54,10 @@ def recorded(posed: PosedField, rays: Rays, primal: March, cotangent: March):
 
 
 @pytest.mark.parametrize("capacity", [1 << 17, 200, 3])
-@pytest.mark.parametrize("chunk", [1 << 14, 64])
-def test_equals_the_recorded_derivative(posed, rng, monkeypatch, capacity, chunk):
+@pytest.mark.parametrize("block", [1 << 12, 64])
+def test_equals_the_recorded_derivative(posed, rng, monkeypatch, capacity, block):
     monkeypatch.setattr(batched, "CAPACITY", capacity)
-    monkeypatch.setattr("mi_nerfattack.fields.ngp_points.CHUNK", chunk)
+    monkeypatch.setattr("mi_nerfattack.fields.mlp.BLOCK", block)
     rays = make_rays(rng)
     primal = march(posed, *rays, STOP)
     cotangent = small.random_march(rng, COUNT)

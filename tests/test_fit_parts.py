@@ -13,9 +13,9 @@ from mi_nerfattack.capture.fit_cells import (
     depth_points,
     grid_shape,
 )
+from mi_nerfattack.capture.fit_count import sample_count
 from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
 from mi_nerfattack.capture.fit_loss import LossWeights, huber, loss_and_cotangent
-from mi_nerfattack.capture.fit_order import coherent_order, sample_count
 from mi_nerfattack.capture.fit_rays import RayBank, RayBatch
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
@@ -109,7 +109,9 @@ def test_cotangent_is_the_losss_derivative(depth, alpha):
     )
     primal = March(mi.Color3f(values[:3].tolist()), mi.Float(0.7), mi.Float(1.75))
     background = mi.Color3f(ray["background"].tolist())
-    loss, _, cotangent = loss_and_cotangent(primal, background, batch, weights)
+    loss, _, cotangent = loss_and_cotangent(
+        primal, background, batch, weights, mi.Float(1)
+    )
     assert loss[0] == pytest.approx(loss_reference(values, ray, weights), rel=1e-3)
     parts = (cotangent.radiance.numpy(), cotangent.opacity, cotangent.moment)
     found = np.concatenate([np.ravel(part) for part in parts])
@@ -123,7 +125,9 @@ def test_loss_of_white_before_white_still_has_a_derivative():
         mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.Color3f(0.5), mi.Float(1), None
     )
     primal = March(mi.Color3f(1), mi.Float(1), mi.Float(1))
-    cotangent = loss_and_cotangent(primal, mi.Color3f(0), batch, LossWeights())[2]
+    cotangent = loss_and_cotangent(
+        primal, mi.Color3f(0), batch, LossWeights(), mi.Float(1)
+    )[2]
     assert cotangent.radiance.numpy().min() > 0.1
 
 
@@ -201,7 +205,7 @@ def test_depth_that_does_not_fit_is_an_error(tmp_path, fault):
         read_depth(tmp_path, images)
 
 
-def test_rays_are_ordered_by_the_cells_they_cross():
+def test_samples_are_counted_by_the_cells_that_rays_cross():
     # occupied below z = 0: a vertical ray from z = 1 meets 4 steps of 0.25 m
     cells = np.zeros((8, 8, 8), bool)
     cells[:, :, :4] = True
@@ -216,5 +220,3 @@ def test_rays_are_ordered_by_the_cells_they_cross():
     direction = mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])
     posed, far = PosedField(grid), mi.Float(dr.inf)
     assert sample_count(posed, origin, direction, far).numpy().tolist() == [4, 2, 0]
-    order = coherent_order(posed, origin, direction, far)
-    assert order.numpy().tolist() == [2, 1, 0]

@@ -40,21 +40,27 @@ def huber(error: Any, delta: float) -> Any:
 
 
 def loss_and_cotangent(
-    primal: March, background: Any, batch: RayBatch, weights: LossWeights
+    primal: March,
+    background: Any,
+    batch: RayBatch,
+    weights: LossWeights,
+    share: Any,
+    gain: Any = None,
 ) -> tuple[Any, Any, March]:
     """Compare a march with the images.
 
     Per ray, the mean over channels of the Huber loss between sRGB values, plus, where
     the batch has depths, the Huber loss of relative error of the depth moment (for
-    rays that hit something) and of opacity; neither where depth is NaN, unknown. The
-    objective is the mean over rays; derivatives reach `background` through Dr.Jit's
-    graph.
+    rays that hit something) and of opacity; neither where depth is NaN, unknown.
+    Derivatives reach `background` and `gain` through Dr.Jit's graph.
 
     Args:
         primal: of the batch's rays, detached.
         background: `mi.Color3f`, (3, n) linear, behind the field.
         batch: rays and images.
         weights: of the terms.
+        share: (n,), weight of each ray in the objective.
+        gain: (3, n), exposure of the rays' images; None for 1.
 
     Returns:
         loss (n,) and squared sRGB error (n,), both detached, and the derivative of the
@@ -70,13 +76,15 @@ def loss_and_cotangent(
         batch.alpha * srgb_to_linear(batch.colour) + (1 - batch.alpha) * behind
     )
     linear = seen.radiance + (1 - seen.opacity) * background
+    if gain is not None:
+        linear *= gain
     error = linear_to_srgb(linear * _BELOW_WHITE) - wanted
     terms = [huber(channel, weights.huber) for channel in error]
     loss = (terms[0] + terms[1] + terms[2]) / 3
     if batch.depth is not None:
         loss += _geometry_loss(seen, batch.depth, weights)
     square = dr.detach(dr.squared_norm(mi.Vector3f(error))) / 3
-    dr.backward(loss * dr.opaque(mi.Float, 1 / dr.width(batch.direction)))
+    dr.backward(loss * share)
     cotangent = March(*(dr.grad(leaf) for leaf in leaves))
     return dr.detach(loss), square, cotangent
 

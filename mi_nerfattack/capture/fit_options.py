@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from mi_nerfattack.capture.evaluation import ViewScore
 from mi_nerfattack.capture.fit_loss import LossWeights
@@ -17,9 +20,12 @@ class FitOptions:
     """How a field is fitted.
 
     Attributes:
-        steps: of the optimiser.
-        budget_minutes: end after this time if `steps` are not done by then; the
+        steps: of the optimiser; None for as many as `epochs` take.
+        epochs: over the pixels of the fitted images, where `steps` is None.
+        budget_minutes: end after this time if the fit is not done by then; the
             learning rate then decays by time. None sets no limit.
+        patience: end early if this many steps lower the loss by less than 1 % against
+            as many steps before; None never does.
         batch_rays: rays a step, at most.
         samples: of a step, about; as long as the occupancy is full, and rays therefore
             long, a batch has fewer rays.
@@ -29,39 +35,49 @@ class FitOptions:
         final_rate: share of `learning_rate` that is left at the end; between, it
             falls exponentially.
         occupancy_resolution: cells along the longest edge of the box.
-        occupancy_every: steps between two updates of the occupancy.
+        occupancy_every: steps between two looks at some cells; every fourth changes
+            the occupancy.
         occupancy_start: steps before the first one.
-        network_every: of an NGP, steps between two updates of the networks' weights,
-            whose gradient costs as much as that of the table; every step at first.
+        exposure: learn the exposure of each image.
+        poses: learn corrections of the cameras' poses.
+        camera_rate: learning rate of these, as a share of the field's.
         loss: weights of the terms.
     """
 
-    steps: int = 2000
+    steps: int | None = None
+    epochs: float = 50.0
     budget_minutes: float | None = None
+    patience: int | None = None
     batch_rays: int = 4096
     samples: int = 1 << 16
     seed: int = 0
     learning_rate: float = 1e-2
     final_rate: float = 0.03
     occupancy_resolution: int = 128
-    occupancy_every: int = 250
-    occupancy_start: int = 250
-    network_every: int = 4
+    occupancy_every: int = 16
+    occupancy_start: int = 128
+    exposure: bool = False
+    poses: bool = False
+    camera_rate: float = 0.02
     loss: LossWeights = field(default_factory=LossWeights)
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in (
             "steps",
+            "patience",
             "batch_rays",
             "samples",
             "occupancy_resolution",
             "occupancy_every",
         ):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)}; must be at least 1")
-        if self.budget_minutes is not None and not self.budget_minutes > 0:
-            raise InputError(f"budget_minutes: {self.budget_minutes}; must be positive")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name}: {value}; must be at least 1")
+        for name in ("epochs", "budget_minutes", "camera_rate"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name}: {value}; must be positive")
         if not 0 < self.learning_rate < 1:
             raise InputError(f"learning_rate: {self.learning_rate}; must be in (0, 1)")
 
@@ -71,22 +87,27 @@ class FitProgress:
     """State of a running fit.
 
     Attributes:
-        step, steps: done, and planned.
+        step: done.
+        steps: planned; None where epochs or time decide.
         fraction: of the whole fit, by steps or by time, whichever is further.
         loss: mean over the last steps.
         psnr_db: of the last batches, sRGB.
         elapsed_s, remaining_s: wall time.
         occupied: share of cells that are marched through.
+        rays: of a step, mean over the last steps.
+        samples: of a step that light reaches the eye from, likewise.
     """
 
     step: int
-    steps: int
+    steps: int | None
     fraction: float
     loss: float
     psnr_db: float
     elapsed_s: float
     remaining_s: float
     occupied: float
+    rays: float = 0.0
+    samples: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -99,8 +120,10 @@ class FitResult:
         ssim_heldout: mean over held-out views.
         per_view: one entry for each held-out view.
         history: reports in order.
-        wall_s: of the fit and the evaluation.
+        wall_s: of the fit and the evaluation, interruptions not counted.
         steps: done.
+        exposure: (n, 3), factors of linear radiance of the fitted images, or None.
+        poses: (n, 4, 4), corrected camera_to_world of the fitted images, or None.
     """
 
     field: GridField | NGPField
@@ -110,6 +133,8 @@ class FitResult:
     history: tuple[FitProgress, ...]
     wall_s: float
     steps: int
+    exposure: np.ndarray | None = None
+    poses: np.ndarray | None = None
 
 
 ProgressCallback = Callable[[FitProgress], None]

@@ -9,9 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.capture.fit_cameras import CameraCorrections
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera, pixel_rays, pose_arrays
+from mi_nerfattack.render.camera import Camera, Lens, lens_rays, pose_arrays
 
 _CHUNK = 1 << 22
 
@@ -27,13 +28,15 @@ class RayBatch:
         alpha: (n,), in [0, 1]; 1 where the images have none.
         depth: (n,), metres along the ray, infinite where nothing is hit, NaN where it
             is unknown; None where the images come without depth.
+        image: (n,), of the images drawn from.
     """
 
     origin: Any
     direction: Any
     colour: Any
     alpha: Any
-    depth: Any
+    depth: Any = None
+    image: Any = None
 
 
 class RayBank:
@@ -49,6 +52,7 @@ class RayBank:
             images; or None.
         box: lower and upper corner, metres: only pixels whose rays meet the box are
             drawn. None draws from all.
+        corrections: of the cameras; none by default.
 
     Raises:
         InputError: depth has another shape than the images, more pixels than
@@ -61,6 +65,7 @@ class RayBank:
         indices: np.ndarray,
         depth: np.ndarray | None = None,
         box: tuple[np.ndarray, np.ndarray] | None = None,
+        corrections: CameraCorrections | None = None,
     ) -> None:
         if depth is not None and depth.shape != images.images.shape[:3]:
             raise InputError(
@@ -81,10 +86,19 @@ class RayBank:
         self._depth = None
         if depth is not None:
             self._depth = mi.Float(depth[indices].astype(np.float32).ravel().copy())
+        self.corrections = corrections or CameraCorrections(len(indices), ())
         self._origin, self._rotation = pose_arrays(images.camera_to_world[indices])
+        self._lens = Lens([images.camera_of(index) for index in indices])
         self.count = len(indices) * self.camera.width * self.camera.height
         dr.make_opaque(self._pixels, self._depth, self._origin)
-        self._chosen = None if box is None else self._seeing(*box)
+        self._chosen = None
+        if box is not None:
+            self._chosen = self._seeing(*box)
+
+    def state(self) -> list[Any]:
+        """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
+        device = [self._pixels, self._depth, self._origin, self._rotation, self._chosen]
+        return [self, device, self._lens.state(), self.corrections.values]
 
     def draw(self, random: Any) -> Any:
         """Draw pixels with replacement, `mi.UInt32` (n,), as `batch` takes them.
@@ -98,8 +112,11 @@ class RayBank:
         return dr.gather(mi.UInt32, self._chosen, slot)
 
     def batch(self, index: Any) -> RayBatch:
-        """Return the rays of given pixels, `mi.UInt32` (n,), image by image, by row."""
-        origin, direction = self._rays(index)
+        """Return the rays of given pixels, `mi.UInt32` (n,), image by image, by row.
+
+        Origin and direction are differentiable in the corrections of the poses.
+        """
+        image, origin, direction = self._rays(index)
         byte = type(self._pixels)
         base = index * self.channels
         values = [
@@ -110,9 +127,10 @@ class RayBank:
         depth = None
         if self._depth is not None:
             depth = dr.gather(mi.Float, self._depth, index)
-        return RayBatch(origin, direction, mi.Color3f(*values[:3]), alpha, depth)
+        colour = mi.Color3f(*values[:3])
+        return RayBatch(origin, direction, colour, alpha, depth, image)
 
-    def _rays(self, index: Any) -> tuple[Any, Any]:
+    def _rays(self, index: Any) -> tuple[Any, Any, Any]:
         per_image = self.camera.width * self.camera.height
         image = index // per_image
         pixel = index - image * per_image
@@ -120,9 +138,10 @@ class RayBank:
         position = mi.Point2f(pixel - row * self.camera.width, row) + 0.5
         columns = [dr.gather(mi.Vector3f, c, image) for c in self._rotation]
         origin = dr.gather(mi.Point3f, self._origin, image)
-        return pixel_rays(
-            self.camera, origin, (columns[0], columns[1], columns[2]), position
-        )
+        origin, columns = self.corrections.move(image, origin, columns)
+        lens = self._lens.of(image)
+        rotation = (columns[0], columns[1], columns[2])
+        return image, *lens_rays(lens, origin, rotation, position)
 
     def _seeing(self, lower: np.ndarray, upper: np.ndarray) -> Any:
         box = mi.BoundingBox3f(lower.tolist(), upper.tolist())
@@ -130,7 +149,7 @@ class RayBank:
         for start in range(0, self.count, _CHUNK):
             size = min(_CHUNK, self.count - start)
             index = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
-            hit, _, far = box.ray_intersect(mi.Ray3f(*self._rays(index)))
+            hit, _, far = box.ray_intersect(mi.Ray3f(*self._rays(index)[1:]))
             seen = dr.compress(hit & (far > 0))
             if dr.width(seen) > 0:
                 found.append(seen + start)

@@ -63,6 +63,11 @@ class NGPLayout:
                     f"{name}: {getattr(self, name)}; allowed are {low} to {high}"
                 )
 
+    @staticmethod
+    def small() -> NGPLayout:
+        """Return 10 levels of 2^17 with width 32, for machines without a GPU."""
+        return NGPLayout(levels=10, log2_table=17, width=32)
+
     @property
     def growth(self) -> float:
         """Factor between the resolutions of neighbouring levels."""

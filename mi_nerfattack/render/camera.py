@@ -9,6 +9,7 @@ corner of the image, so the centre of the first pixel is (0.5, 0.5).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -303,13 +304,55 @@ def pixel_rays(
     Returns:
         origins (`mi.Point3f`) and unit directions (`mi.Vector3f`), one per ray.
     """
-    fx, fy, cx, cy = (
-        dr.opaque(mi.Float, v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)
-    )
+    return lens_rays(Lens([camera]).of(mi.UInt32(0)), origin, rotation, position)
+
+
+class Lens:
+    """Intrinsics of cameras on the device; none is compiled into a kernel.
+
+    Args:
+        cameras: at least one; equal ones count as one.
+    """
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        shared = cameras[:1] if len(set(cameras)) == 1 else cameras
+        table = [(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in shared]
+        count = 8 if any(c.is_distorted for c in shared) else 4
+        self._columns = [mi.Float(list(v)) for v in list(zip(*table, strict=True))]
+        self._columns = self._columns[:count]
+        dr.make_opaque(self._columns)
+
+    def of(self, index: Any) -> list[Any]:
+        """Return fx, fy, cx, cy and, if any camera is distorted, k1, k2, p1, p2.
+
+        Args:
+            index: `mi.UInt32` (n,), of the cameras.
+        """
+        if dr.width(self._columns[0]) == 1:
+            return self._columns
+        return [dr.gather(mi.Float, column, index) for column in self._columns]
+
+    def state(self) -> list[Any]:
+        """Return the device arrays."""
+        return self._columns
+
+
+def lens_rays(
+    lens: list[Any], origin: Any, rotation: tuple[Any, Any, Any], position: Any
+) -> tuple[Any, Any]:
+    """Make the rays through given positions in images; as `pixel_rays`.
+
+    Args:
+        lens: from `Lens.of`.
+        origin: `mi.Point3f`, one entry per ray or one for all, metres.
+        rotation: columns (right, down, forward) as `mi.Vector3f`, like origin.
+        position: `mi.Point2f`, pixels from the top-left corner, one entry per ray.
+    """
+    fx, fy, cx, cy, *distortion = lens
     x = (position.x - cx) / fx
     y = (position.y - cy) / fy
-    if camera.is_distorted:
-        x, y = undistort(x, y, *(dr.opaque(mi.Float, k) for k in camera.distortion))
+    if distortion:
+        x, y = undistort(x, y, *distortion)
     right, down, forward = rotation
     direction = dr.normalize(right * x + down * y + forward)
     origins = mi.Point3f(origin)

@@ -1,8 +1,4 @@
-"""Order rays so that those of one SIMD packet take about equally many samples.
-
-A recorded loop runs until the longest ray of a packet ends. Rays of random pixels
-differ by a factor of ten, so that most lanes would idle.
-"""
+"""How many samples rays take, as far as the occupancy tells."""
 
 from __future__ import annotations
 
@@ -13,12 +9,6 @@ import mitsuba as mi
 
 from mi_nerfattack.render.march import seek
 from mi_nerfattack.render.posed import PosedField
-
-
-def coherent_order(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:
-    """Return the permutation, `mi.UInt32` (n,), that sorts rays by `sample_count`."""
-    count = sample_count(posed, origin, direction, t_max)
-    return mi.UInt32(dr.argsort(mi.UInt32(count)))
 
 
 @dr.syntax

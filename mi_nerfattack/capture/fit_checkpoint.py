@@ -1,0 +1,123 @@
+"""Checkpoints of a fit: one safetensors file, replaced atomically."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import astuple, fields, replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import mi_nerfattack
+from mi_nerfattack import files
+from mi_nerfattack.capture.fit_options import FitProgress
+from mi_nerfattack.capture.fit_training import Training
+from mi_nerfattack.errors import InputError
+
+FORMAT = "mi_nerfattack fit checkpoint 1"
+_EVERY_S = 30.0
+_MAX_SHARE = 0.02  # of the time that may go into writing
+
+
+class FitCheckpoint:
+    """Keeps the state of a fit on disk.
+
+    Args:
+        path: file, replaced atomically.
+        training: the fit.
+        resume: continue from the file if it exists; False refuses one that does.
+
+    Attributes:
+        elapsed_s: wall time of the fit before it was interrupted.
+        history: reports before it was interrupted.
+
+    Raises:
+        InputError: the file exists and `resume` is False, cannot be read, or belongs
+            to other images, options or versions.
+    """
+
+    def __init__(self, path: Path, training: Training, resume: bool) -> None:
+        self.path, self.training = path, training
+        self.elapsed_s = 0.0
+        self.history: list[FitProgress] = []
+        self._header = {"format": FORMAT, **_versions(), "fit": _digest(training)}
+        if path.exists():
+            if not resume:
+                raise InputError(
+                    f"{path}: an unfinished fit; continue it (--resume), or delete "
+                    "the file to start again"
+                )
+            self._load()
+        files.check_writable(path)
+        self._written = time.perf_counter()
+        self._cost_s = 0.0
+
+    def save_if_due(self, elapsed_s: float, history: Sequence[FitProgress]) -> None:
+        """Save if the last time is long enough ago, for what saving costs."""
+        waited = time.perf_counter() - self._written
+        if waited >= max(_EVERY_S, self._cost_s / _MAX_SHARE):
+            self.save(elapsed_s, history)
+
+    def save(self, elapsed_s: float, history: Sequence[FitProgress]) -> None:
+        """Write the complete state."""
+        start = time.perf_counter()
+        tensors = self.training.tensors()
+        rows = [astuple(replace(at, steps=at.steps or -1)) for at in history]
+        tensors["history"] = np.array(rows, np.float64).reshape(len(rows), -1)
+        tensors["elapsed"] = np.array([elapsed_s])
+        files.write_safetensors(self.path, tensors, self._header)
+        self._written = time.perf_counter()
+        self._cost_s = self._written - start
+
+    def remove(self) -> None:
+        """Delete the file: the fit is done."""
+        self.path.unlink(missing_ok=True)
+
+    def _load(self) -> None:
+        tensors, metadata = files.read_safetensors(self.path)
+        for key, value in self._header.items():
+            if metadata.get(key) != value:
+                raise InputError(
+                    f"{self.path}: {key} is {metadata.get(key)!r}, this fit has "
+                    f"{value!r}; resume with the same images, options and versions, "
+                    "or delete the file to start again"
+                )
+        try:
+            self.training.load_tensors(tensors)
+            self.elapsed_s = float(tensors["elapsed"][0])
+            rows = tensors["history"]
+        except KeyError as err:
+            raise InputError(
+                f"{self.path}: entry {err} is missing; the file is damaged"
+            ) from err
+        whole = [item.name for item in fields(FitProgress)]
+        for row in rows:
+            at = FitProgress(**dict(zip(whole, map(float, row), strict=True)))
+            steps = None if at.steps == -1 else int(at.steps or 0)
+            self.history.append(replace(at, step=int(at.step), steps=steps))
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "mi_nerfattack": mi_nerfattack.__version__,
+        "mitsuba": str(mi.__version__),
+        "drjit": str(dr.__version__),
+        "variant": str(mi.variant()),
+    }
+
+
+def _digest(training: Training) -> str:
+    """Hash what decides a fit: images, poses, cameras, options, architecture, box."""
+    digest = hashlib.sha256()
+    images = training.images
+    digest.update(np.ascontiguousarray(images.images).data)
+    digest.update(np.ascontiguousarray(images.camera_to_world).data)
+    digest.update(repr((images.camera, images.cameras, training.options)).encode())
+    place = training.field.metadata()
+    info = {key: place[key] for key in place if key not in training.field.info}
+    digest.update(repr((info, training.pixels)).encode())
+    return digest.hexdigest()[:16]
