@@ -236,7 +236,10 @@ def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
     table = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert table["psnr_heldout_db"] == psnr and table["steps"] == 25
     assert table["compare"]["routes"]["ahead"]["frames"] == 5
-    assert load_field(output).info["fit.source"] == "x"
+    saved = load_field(output)
+    assert isinstance(saved, GridField) and saved.info["fit.source"] == "x"
+    finish(result, images, output, {}, False)
+    assert "good enough to test a policy in" in capsys.readouterr().out
     assert (tmp_path / "wall.report" / "report.html").is_file()
 
 

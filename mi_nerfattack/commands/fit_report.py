@@ -78,7 +78,8 @@ def finish(
     from mi_nerfattack.commands.compare_report import print_comparison
     from mi_nerfattack.fields import save_field
     from mi_nerfattack.report.compare_page import document
-    from mi_nerfattack.report.fit_page import summary, write_fit_report
+    from mi_nerfattack.report.fit_page import judge_fit, summary, write_fit_report
+    from mi_nerfattack.report.verdict import verdict
 
     result.field.info.update(
         {f"fit.{key}": value for key, value in provenance.items()}
@@ -98,8 +99,8 @@ def finish(
         return
     _print_scores(result)
     Console().print(
-        f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {page} "
-        "(is it good enough, worst views, depth, training curve).",
+        f"{verdict(judge_fit(result))}\n"
+        f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {page}.",
         soft_wrap=True,
         highlight=False,
     )

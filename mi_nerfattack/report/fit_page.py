@@ -92,7 +92,7 @@ def write_fit_report(
     """
     root = files.make_folder(folder)
     fitted_db = _fitted_db(result.history)
-    criteria = judge(result.per_view, fitted_db)
+    criteria = judge_fit(result)
     worst = worst_views(result.per_view, _SHOWN_VIEWS)
     shown = [_pair(score, images, depth) for score in worst]
     depth_m = _depth_error(shown)
@@ -166,6 +166,11 @@ def view_entry(score: ViewScore) -> dict[str, Any]:
     """Return the score of one view without its pictures."""
     names = ("index", "name", "psnr_db", "ssim", "hazy")
     return {name: getattr(score, name) for name in names}
+
+
+def judge_fit(result: FitResult) -> list[Criterion]:
+    """Judge a fit by its held-out views and the rays it was fitted to."""
+    return judge(result.per_view, _fitted_db(result.history))
 
 
 def _fitted_db(history: Sequence[FitProgress]) -> float | None:
