@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from mesh_samples import CORNERS, Gltf, cells, four_colours, plate, seen_from
 
 from mi_nerfattack.capture import mesh as meshes
@@ -180,8 +181,6 @@ class TestNodes:
         np.testing.assert_allclose(rgb, CORNERS[:, ::-1], atol=3)
 
     def test_a_mirrored_sphere_keeps_its_normals_outside(self, tmp_path):
-        import trimesh
-
         ball = trimesh.creation.icosphere(3)
         gltf = plate()
         gltf.material(baseColorFactor=[0.5, 0.5, 0.5, 1])
@@ -226,41 +225,6 @@ class TestAxes:
     def test_unknown_axis(self, tmp_path):
         with pytest.raises(InputError, match="up: 'w'"):
             load_mesh(textured().write(tmp_path / "a.glb"), "w")
-
-    def test_turn(self):
-        cube = meshes.cube_mesh(2.0).transformed(1.0, np.array([5.0, 0.0, 0.0]))
-        bounds = cube.turned(90.0).bounds
-        np.testing.assert_allclose(bounds, [[-1, 4, 0], [1, 6, 2]], atol=1e-12)
-        with pytest.raises(InputError, match="turn_deg: nan"):
-            cube.turned(float("nan"))
-
-
-class TestCube:
-    def test_faces_are_upright_from_outside(self):
-        picture = np.array(four_colours())
-        cube = meshes.cube_mesh(2.0, dict.fromkeys(meshes.CUBE_FACES, picture))
-        np.testing.assert_allclose(cube.bounds, [[-1, -1, 0], [1, 1, 2]], atol=1e-12)
-        assert cube.area == pytest.approx(6 * 4)
-        for name, (normal, _, _) in meshes.CUBE_FACES.items():
-            image = seen_from(cube, normal)[[14, 14, 50, 50], [14, 50, 14, 50], :3]
-            rgb = linear_to_uint8(image).astype(int).reshape(2, 2, 3)
-            # from below, a camera has +y on top, the picture of a face -y
-            wanted = CORNERS[::-1, ::-1] if name == "nz" else CORNERS
-            np.testing.assert_allclose(rgb, wanted, atol=3, err_msg=name)
-
-    def test_each_picture_on_its_face(self):
-        colours = np.linspace(20, 250, 18).astype(np.uint8).reshape(6, 1, 1, 3)
-        cube = meshes.cube_mesh(1.0, dict(zip(meshes.CUBE_FACES, colours, strict=True)))
-        for i, (normal, _, _) in enumerate(meshes.CUBE_FACES.values()):
-            rgb = linear_to_uint8(seen_from(cube, normal)[32, 32, :3])
-            np.testing.assert_allclose(rgb.astype(int), colours[i, 0, 0], atol=1)
-
-    def test_wrong_faces_and_edges(self):
-        with pytest.raises(InputError, match="faces: .'px'.; needs px, nx"):
-            meshes.cube_mesh(1.0, {"px": np.zeros((2, 2, 3), np.uint8)})
-        for edge in (0.0, -1.0, float("nan"), float("inf")):
-            with pytest.raises(InputError, match="edge_m"):
-                meshes.cube_mesh(edge)
 
 
 class TestRefused:
@@ -338,6 +302,34 @@ class TestRefused:
         (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + text)
         with pytest.raises(InputError, match=r"'Wood' is not defined in a\.mtl"):
             load_mesh(tmp_path / "a.obj")
+
+    def test_damaged_texture_of_an_obj(self, tmp_path):
+        (tmp_path / "a.mtl").write_bytes(
+            "newmtl Glühbirne\nmap_Kd t.png\n".encode("latin-1")
+        )
+        (tmp_path / "t.png").write_bytes(b"not a picture")
+        text = "mtllib a.mtl\nusemtl Glühbirne\nv 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n"
+        (tmp_path / "a.obj").write_bytes(text.encode("latin-1"))
+        with pytest.raises(InputError, match=r"a\.obj: its texture 't.png' cannot be"):
+            load_mesh(tmp_path / "a.obj")
+
+    def test_random_damage_is_always_an_input_error(self, tmp_path, rng):
+        gltf = textured()
+        box = trimesh.creation.box((1, 1, 1))
+        box.visual.vertex_colors = [1, 2, 3, 255]
+        box.export(tmp_path / "c.ply")
+        sources = [gltf.write(tmp_path / "a.glb"), gltf.write(tmp_path / "b.gltf")]
+        for source in (*sources, tmp_path / "c.ply"):
+            raw = np.frombuffer(source.read_bytes(), np.uint8)
+            for _ in range(40):
+                damaged = raw.copy()
+                damaged[rng.integers(len(raw), size=2)] = rng.integers(256, size=2)
+                cut = rng.integers(2 * len(raw))  # half of them keep their length
+                source.write_bytes(damaged[:cut].tobytes())
+                try:
+                    load_mesh(source)
+                except InputError as error:
+                    assert str(error).startswith(str(source))
 
     def test_files_outside_of_the_folder_are_not_read(self, tmp_path):
         (tmp_path / "secret.png").write_bytes(b"")

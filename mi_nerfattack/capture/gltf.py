@@ -86,6 +86,8 @@ def prepare(path: Path) -> PreparedGltf:
         ) from error
     try:
         colours = _prepare_tree(path, tree, bool(chunks))
+    except InputError:
+        raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: not a valid glTF file ({type(error).__name__}: {error}); "

@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+from PIL import Image
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.gltf import MAX_BYTES, BaseColour, prepare
@@ -66,6 +67,7 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
         data, kind = files.read_bytes(path, MAX_BYTES), suffix[1:]
     resolver = _recording_resolver(path, chunks)
     if kind == "obj":
+        data = _as_utf8(data)
         _check_materials(path, data, resolver)
     with _as_input_error(path, resolver):
         scene = trimesh.load_scene(
@@ -112,7 +114,8 @@ def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:
 def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
     """Make a trimesh resolver that remembers what it did not find.
 
-    It finds `chunks` by name, and files in the folder of `path` and below.
+    It finds `chunks` by name, and files in the folder of `path` and below. Images of
+    OBJ and PLY that cannot be read are remembered too.
     """
     from trimesh.resolvers import FilePathResolver, Resolver
 
@@ -121,6 +124,7 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
     class RecordingResolver(Resolver):
         def __init__(self) -> None:
             self.missing: list[str] = []
+            self.damaged: list[str] = []
 
         def get(self, key: str) -> bytes:
             if key in chunks:
@@ -132,9 +136,21 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
                 except ValueError:  # outside of the folder
                     continue
                 if found.is_file():
-                    return files.read_bytes(found, MAX_BYTES)
+                    data = files.read_bytes(found, MAX_BYTES)
+                    if found.suffix.lower() == ".mtl":
+                        return _as_utf8(data)
+                    if path.suffix.lower() in (".obj", ".ply"):
+                        self._check_image(key, data)
+                    return data
             self.missing.append(key)
             raise FileNotFoundError(key)
+
+        def _check_image(self, key: str, data: bytes) -> None:
+            """Remember images that trimesh would pass over in silence."""
+            try:
+                Image.open(io.BytesIO(data)).close()
+            except (OSError, ValueError, Image.DecompressionBombError):
+                self.damaged.append(key)
 
         def write(self, name: str, data: Any) -> None:
             raise NotImplementedError("a mesh is only read")
@@ -148,11 +164,25 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
     return RecordingResolver()
 
 
+def _as_utf8(data: bytes) -> bytes:
+    """Encode text of OBJ as UTF-8; the format names no encoding, so Latin-1 else."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
+    return data
+
+
 def _refuse_missing(path: Path, resolver: Any) -> None:
     if resolver.missing:
         raise InputError(
             f"{path}: refers to the missing file {resolver.missing[0]!r}; put it "
             "beside the mesh or remove the reference"
+        )
+    if resolver.damaged:
+        raise InputError(
+            f"{path}: its texture {resolver.damaged[0]!r} cannot be read as an image; "
+            "use PNG or JPEG"
         )
 
 
