@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -135,4 +135,6 @@ def read_views(
     )
     base = np.array([*(0.5 * (lower + upper)[:2]), lower[2]])
     images = place(images, np.eye(3), scale, -scale * base)
+    if (placement.height_m, placement.longest_m) != (None, None):
+        images = replace(images, unit="metre")
     return ObjectViews(images, scale * (lower - base), scale * (upper - base), None)

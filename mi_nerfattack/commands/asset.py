@@ -24,7 +24,8 @@ class Asset:
 
     The views are rendered from a mesh or a cube, or read from a folder, as Blender's
     synthetic scenes have them. The object is centred in x and y and stands on z = 0,
-    unless --bounds is given. Every 8th view is held out and scored.
+    unless --bounds is given. Every 8th view is held out and scored. An interrupted fit
+    leaves a checkpoint; the same command with --resume goes on from there.
     """
 
     source: tyro.conf.Positional[str]
@@ -60,6 +61,8 @@ class Asset:
     """Steps of the optimiser; 600, or 1000 for a folder, which has no depth."""
     budget_minutes: float | None = None
     """End the fit after this time."""
+    resume: bool = False
+    """Continue an interrupted fit from its checkpoint, beside the output."""
     batch_rays: int = 4096
     """Rays a step."""
     seed: int = 0
@@ -88,6 +91,8 @@ class Asset:
                 self._options(found.depth is not None),
                 found.depth,
                 progress=partial(show_fit, bars),
+                checkpoint=self.output.with_suffix(".checkpoint.safetensors"),
+                resume=self.resume,
             )
         result.field.info.update(
             {
@@ -95,7 +100,11 @@ class Asset:
                 "provenance.object_upper": _text(found.upper),
             }
         )
-        provenance = {"source": Path(self.source).name, "seed": str(self.seed)}
+        provenance = {
+            "source": Path(self.source).name,
+            "source_unit": found.images.unit,
+            "seed": str(self.seed),
+        }
         finish(result, found.images, self.output, provenance, self.json, found.depth)
         return 0
 
@@ -108,8 +117,6 @@ class Asset:
             batch_rays=self.batch_rays,
             seed=self.seed,
             occupancy_resolution=self.resolution,
-            occupancy_start=100,
-            occupancy_every=100,
         )
 
     def _views(self, bars: StageBars) -> ObjectViews:
