@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from mi_nerfattack.commands.compare_report import CompareArguments
 
+if TYPE_CHECKING:
+    from mi_nerfattack.fields.ngp import NGPLayout
+
 
 @dataclass(frozen=True)
 class Fit:
     """Fit a neural field to posed images, and score it on every 8th image.
+
+    Interrupted, by Ctrl-C or otherwise, it leaves a checkpoint; the same command with
+    --resume goes on from there.
 
     Without --bounds the field's box is that of all depths that the folder holds or,
     without depth, of its cameras and sparse points or, without these too, a cube around
@@ -29,22 +35,34 @@ class Fit:
     """Field file to write (.safetensors); FILE.report beside it says how good it is."""
     long_edge: int | None = None
     """Reduce the images to this longer edge, pixels."""
-    steps: int = 3000
-    """Steps of the optimiser."""
+    epochs: float = 50.0
+    """Passes over the pixels; hours without a GPU, see --budget-minutes."""
+    steps: int | None = None
+    """Steps of the optimiser, in place of --epochs."""
     budget_minutes: float | None = None
-    """End the fit after this time."""
+    """End the fit after this time; the learning rate decays to fit."""
+    patience: int | None = None
+    """End the fit when this many steps lower the loss by less than 1 %."""
+    resume: bool = False
+    """Continue an interrupted fit from its checkpoint, beside the output."""
     batch_rays: int = 4096
     """Rays a step, at most."""
+    network: Literal["instant-ngp", "small"] = "instant-ngp"
+    """16 levels of 2^19 entries and networks of width 64, or 10 of 2^17 and 32."""
+    levels: int | None = None
+    """Levels of the hash grid, in place of the network's."""
+    log2_table: int | None = None
+    """Binary logarithm of the entries on each level, likewise."""
+    max_resolution: int | None = None
+    """Resolution of the finest level, likewise; 2048 in both."""
+    exposure: bool = False
+    """Learn the exposure of each image; for cameras with automatic exposure."""
+    refine_poses: bool = False
+    """Correct the poses of the fitted images."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box of the field: x0 y0 z0 x1 y1 z1, metres."""
     step_m: float | None = None
     """Marching step near the camera; a thousandth of the longest edge by default."""
-    levels: int = 10
-    """Levels of the hash grid."""
-    log2_table: int = 17
-    """Binary logarithm of the hash table's entries on each level."""
-    max_resolution: int = 2048
-    """Resolution of the finest level."""
     occupancy: int | None = None
     """Cells of the occupancy along the longest edge; 256 with depth, else 128."""
     seed: int = 0
@@ -57,6 +75,14 @@ class Fit:
     json: bool = False
     """End with one line of JSON in place of the table."""
 
+    def _layout(self) -> NGPLayout:
+        from mi_nerfattack.fields.ngp import NGPLayout
+
+        base = NGPLayout.small() if self.network == "small" else NGPLayout()
+        names = ("levels", "log2_table", "max_resolution")
+        given = {name: getattr(self, name) for name in names}
+        return replace(base, **{k: v for k, v in given.items() if v is not None})
+
     def run(self) -> int:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
@@ -67,7 +93,6 @@ class Fit:
         from mi_nerfattack.commands.compare_report import compare_file
         from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.fields.ngp import NGPLayout
 
         variant.ensure()
         self.against.check()
@@ -82,12 +107,17 @@ class Fit:
         lower, upper = find_bounds(images, depth, self.bounds)
         options = FitOptions(
             steps=self.steps,
+            epochs=self.epochs,
+            patience=self.patience,
+            exposure=self.exposure,
+            poses=self.refine_poses,
             budget_minutes=self.budget_minutes,
             batch_rays=self.batch_rays,
             seed=self.seed,
             occupancy_resolution=self.occupancy or (128 if depth is None else 256),
         )
-        layout = NGPLayout(self.levels, 2, self.log2_table, 16, self.max_resolution, 32)
+        layout = self._layout()
+        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
         with StageBars() as bars:
             result = fit_ngp(
                 images,
@@ -98,6 +128,8 @@ class Fit:
                 depth,
                 step_m=self.step_m,
                 progress=partial(show_fit, bars),
+                checkpoint=checkpoint,
+                resume=self.resume,
             )
         provenance = {
             "source": self.folder.name,
