@@ -51,6 +51,19 @@ def splats(
     )
 
 
+def cloud(rng: np.random.Generator, count: int, giants: int = 0) -> Splats:
+    """Make random splats of all shapes around the origin, some of them huge."""
+    sizes = np.exp(rng.normal(-1.8, 0.7, (count, 3)))
+    sizes[:giants] *= 12
+    return splats(
+        rng.uniform(-5, 5, (count, 3)),
+        rng.uniform(0, 1, (count, 3)),
+        rng.uniform(0.02, 0.6, count),
+        sizes,
+        rng.normal(size=(count, 4)),
+    )
+
+
 def wall(
     x: float, colour=(0.1, 0.3, 0.9), half: float = 6.0, step: float = 0.4
 ) -> Splats:

@@ -1,4 +1,4 @@
-"""Splats: the reader, and the kernel against closed formulas and a reference."""
+"""What rays see of splats, against closed formulas and a float64 reference."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
 
 # isort: split
 from dataclasses import replace
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -15,8 +14,7 @@ import splat_files as made
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.colour import srgb_to_linear_numpy
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.splats import Splats, read_splats
+from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import Pose
 from mi_nerfattack.render.splats import SplatBackground
@@ -102,19 +100,6 @@ def test_two_along_a_ray_blend_in_srgb_front_to_back(near: int) -> None:
     np.testing.assert_allclose(seen.radiance.numpy()[:, 0], expected, rtol=1e-5)
 
 
-def cloud(rng: np.random.Generator, count: int, giants: int = 0) -> Splats:
-    """Make random splats of all shapes around the origin, some of them huge."""
-    sizes = np.exp(rng.normal(-1.8, 0.7, (count, 3)))
-    sizes[:giants] *= 12
-    return made.splats(
-        rng.uniform(-5, 5, (count, 3)),
-        rng.uniform(0, 1, (count, 3)),
-        rng.uniform(0.02, 0.6, count),
-        sizes,
-        rng.normal(size=(count, 4)),
-    )
-
-
 def sphere(rng: np.random.Generator, count: int) -> np.ndarray:
     """Return unit vectors in single precision, (count, 3)."""
     v = rng.normal(size=(count, 3))
@@ -123,7 +108,7 @@ def sphere(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("giants", "t_max"), [(0, np.inf), (0, 2.5), (6, np.inf)])
 def test_a_cloud_is_its_float64_sum(rng, giants: int, t_max: float) -> None:
-    item = cloud(rng, 400, giants)
+    item = made.cloud(rng, 400, giants)
     origin, directions = np.array([0.3, -0.2, 0.1]), sphere(rng, 200)
     # among the splats, so that many contain the origin
     display, opacity, moment = made.reference(item, origin, directions, t_max)
@@ -155,7 +140,7 @@ def test_small_and_thin_splats_far_away_are_not_missed(rng) -> None:
 
 
 def test_the_order_in_the_file_does_not_matter(rng) -> None:
-    item, directions = cloud(rng, 300), sphere(rng, 100)
+    item, directions = made.cloud(rng, 300), sphere(rng, 100)
     order = rng.permutation(item.count)
     arrays = ("centers", "scales", "quaternions", "opacities", "harmonics")
     mixed = replace(item, **{name: getattr(item, name)[order] for name in arrays})
@@ -237,7 +222,7 @@ def test_higher_degrees_are_orthonormal_to_the_lower(rng, degree: int) -> None:
 
 
 def test_a_pose_moves_splats_with_their_views(rng) -> None:
-    item = cloud(rng, 100)
+    item = made.cloud(rng, 100)
     item = replace(
         item,
         harmonics=np.concatenate(
@@ -257,148 +242,3 @@ def test_a_pose_moves_splats_with_their_views(rng) -> None:
     np.testing.assert_allclose(
         moved.moment.numpy(), scale * still.moment.numpy(), rtol=1e-3, atol=1e-3
     )
-
-
-# The reader
-
-
-def same(a: Splats, b: Splats) -> None:
-    """Check that splats agree but for rounding."""
-    for name in ("centers", "scales", "quaternions", "opacities", "harmonics"):
-        np.testing.assert_allclose(
-            getattr(a, name), getattr(b, name), rtol=1e-5, atol=1e-7
-        )
-
-
-@pytest.fixture
-def values(rng) -> dict[str, np.ndarray]:
-    """Columns of seven splats of degree 2."""
-    item = cloud(rng, 7)
-    rest = rng.normal(0, 0.3, (7, 8, 3)).astype(np.float32)
-    return made.columns(
-        replace(item, harmonics=np.concatenate([item.harmonics, rest], 1))
-    )
-
-
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_files_come_back(tmp_path: Path, rng, text: bool, degree: int) -> None:
-    item = cloud(rng, 20)
-    rest = rng.normal(0, 0.3, (20, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
-    item = replace(item, harmonics=np.concatenate([item.harmonics, rest], 1))
-    path = made.write_ply(tmp_path / "s.ply", made.columns(item), text)
-    loaded = read_splats(path)
-    assert loaded.degree == degree and loaded.count == 20
-    same(loaded, item)
-
-
-def test_other_orders_types_and_properties_are_read(tmp_path: Path, values) -> None:
-    plain = read_splats(made.write_ply(tmp_path / "a.ply", values))
-    names = [n for n in reversed(values) if not n.startswith("n")] + ["label"]
-    odd = {name: values.get(name, np.arange(7)) for name in names}
-    types = {"x": "double", "label": "uchar"}
-    same(read_splats(made.write_ply(tmp_path / "b.ply", odd, types=types)), plain)
-
-
-def test_a_quaternion_of_any_length_is_a_rotation(tmp_path: Path, values) -> None:
-    plain = read_splats(made.write_ply(tmp_path / "a.ply", values))
-    for k in range(4):
-        values[f"rot_{k}"] = 7.5 * values[f"rot_{k}"]
-    same(read_splats(made.write_ply(tmp_path / "b.ply", values)), plain)
-
-
-def _set(values, name, value):
-    values[name] = values[name].copy()
-    values[name][3] = value
-
-
-BAD_VALUES = {
-    "x of vertex 3 is nan": ("x", np.nan),
-    "f_rest_5 of vertex 3 is inf": ("f_rest_5", np.inf),
-    "opacity of vertex 3 is -inf": ("opacity", -np.inf),
-    "scale_1 of vertex 3 is 40; allowed is at most 15": ("scale_1", 40.0),
-}
-
-
-@pytest.mark.parametrize("message", BAD_VALUES)
-def test_bad_values_are_named(tmp_path: Path, values, message: str) -> None:
-    _set(values, *BAD_VALUES[message])
-    path = made.write_ply(tmp_path / "bad.ply", values)
-    with pytest.raises(InputError, match=f"bad.ply: {message}"):
-        read_splats(path)
-
-
-def test_a_rotation_of_zeros_is_named(tmp_path: Path, values) -> None:
-    for k in range(4):
-        _set(values, f"rot_{k}", 0.0)
-    path = made.write_ply(tmp_path / "bad.ply", values)
-    with pytest.raises(InputError, match="rot_0, rot_1, rot_2, rot_3 of vertex 3"):
-        read_splats(path)
-
-
-@pytest.mark.parametrize(
-    ("gone", "message"),
-    [
-        (["opacity"], "property opacity of 'vertex' is missing; 3D"),
-        (["scale_2"], "property scale_2 of 'vertex' is missing; 3D"),
-        (["rot_0", "rot_1"], "property rot_0 of 'vertex' is missing, and 1 more"),
-        (["f_rest_3"], "23 properties f_rest_"),
-    ],
-)
-def test_missing_properties_are_named(tmp_path, values, gone, message) -> None:
-    for name in gone:
-        del values[name]
-    path = made.write_ply(tmp_path / "bad.ply", values)
-    with pytest.raises(InputError, match=message):
-        read_splats(path)
-
-
-HEADS = {
-    "no PLY header": b"PK\x03\x04 zipped",
-    "format 'binary_big_endian 1.0'": (
-        b"ply\nformat binary_big_endian 1.0\nend_header\n"
-    ),
-    "elements \\['chunk'\\]; the first must be 'vertex'": (
-        b"ply\nformat ascii 1.0\nelement chunk 1\nend_header\n"
-    ),
-    "element vertex: 0": b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n",
-    "element vertex: -4": b"ply\nformat ascii 1.0\nelement vertex -4\nend_header\n",
-    "'property list uchar int x' of a vertex": (
-        b"ply\nformat ascii 1.0\nelement vertex 1\n"
-        b"property list uchar int x\nend_header\n"
-    ),
-    "property x is there twice": (
-        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n"
-        b"property float x\nend_header\n"
-    ),
-}
-
-
-@pytest.mark.parametrize("message", HEADS)
-def test_bad_headers_are_named(tmp_path: Path, message: str) -> None:
-    path = tmp_path / "bad.ply"
-    path.write_bytes(HEADS[message])
-    with pytest.raises(InputError, match=f"bad.ply: {message}"):
-        read_splats(path)
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_truncated_files_are_refused(tmp_path: Path, values, text: bool) -> None:
-    path = made.write_ply(tmp_path / "bad.ply", values, text)
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(InputError, match="bad.ply: .* truncated"):
-        read_splats(path)
-
-
-def test_words_in_place_of_numbers_are_refused(tmp_path: Path, values) -> None:
-    path = made.write_ply(tmp_path / "bad.ply", values, True)
-    head, body = path.read_bytes().split(b"end_header\n")
-    first, rest = body.split(b" ", 1)
-    path.write_bytes(head + b"end_header\n" + b"word " + rest)
-    with pytest.raises(InputError, match="bad.ply: .*word"):
-        read_splats(path)
-
-
-def test_missing_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="none.ply: does not exist"):
-        read_splats(tmp_path / "none.ply")
