@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from mi_nerfattack.bench.full_ngp import NGPData
-from mi_nerfattack.bench.sides import AbstractTrainer, cores
+from mi_nerfattack.bench.sides import COUNTED_RAYS, AbstractTrainer, Clock, cores
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
 from mi_nerfattack.bench.torch_fit import Pictures, Plan, TorchFit
 
@@ -48,16 +48,15 @@ class TorchTrainer(AbstractTrainer):
 
     def steps(self, count: int) -> dict[str, float]:
         """See :meth:`AbstractTrainer.steps`."""
-        start = time.perf_counter()
+        clock = Clock()
         loss = sum(self.fit.step() for _ in range(count))
-        seconds = time.perf_counter() - start
-        return {"seconds": seconds / count, "loss": loss / count}
+        return {**clock.per_step(count), "loss": loss / count}
 
     def facts(self) -> dict[str, Any]:
         """Return rays and samples of a step, and settings."""
         return {
             "rays": self.fit.rays,
-            "samples": self.fit.count_samples(),
+            "samples": self.fit.count_samples(COUNTED_RAYS),
             "threads": torch.get_num_threads(),
             "chunk_rays": self.fit.plan.chunk,
             "batches_by_rank": len(self.fit.plan.batches),

@@ -7,40 +7,25 @@ from typing import Any
 import rich.box
 import rich.table
 
-SIDES = (("ours", ""), ("PyTorch", "torch_"), ("PyTorch, tuned", "torch_tuned_"))
+SIDES = {"ours": "", "PyTorch": "torch_", "PyTorch, tuned": "torch_tuned_"}
 MOST_APART = 0.05  # of samples a step, before the comparison is called unfair
 
 
 def ratio_table(document: dict[str, Any]) -> rich.table.Table:
     """Make the table of a document of :func:`mi_nerfattack.bench.fit.run`."""
-    table = rich.table.Table(box=rich.box.SIMPLE_HEAD)
-    for name in ("network", "stage", "side"):
+    table = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD, title="ms per training step, and times ours"
+    )
+    for name in ("network", "stage"):
         table.add_column(name)
-    for name in (
-        "PyTorch's time / ours",
-        "ms a step",
-        "samples a step",
-        "µs a sample",
-        "loss, first",
-        "last",
-        "peak MB",
-    ):
+    for name in ("ours", "PyTorch", "ratio", "PyTorch, tuned", "ratio"):
         table.add_column(name, justify="right")
     for row in document["steps"]:
-        for side, prefix in SIDES:
-            table.add_row(
-                row["network"] if not prefix else "",
-                row["stage"] if not prefix else "",
-                side,
-                f"{row[f'{prefix}ratio']:.2f}" if prefix else "",
-                f"{1e3 * row[f'{prefix}seconds_per_step']:.1f}",
-                f"{row[f'{prefix}samples_per_step']:.0f}",
-                f"{row[f'{prefix}us_per_sample']:.2f}",
-                f"{row[f'{prefix}loss_first']:.4f}",
-                f"{row[f'{prefix}loss_last']:.4f}",
-                f"{row[f'{prefix}peak_memory_mb']:.0f}",
-            )
-        table.add_section()
+        cells = [f"{1e3 * row['seconds_per_step']:.1f}"]
+        for prefix in ("torch_", "torch_tuned_"):
+            cells.append(f"{1e3 * row[f'{prefix}seconds_per_step']:.1f}")
+            cells.append(f"{row[f'{prefix}ratio']:.2f}")
+        table.add_row(row["network"], row["stage"], *cells)
     return table
 
 
@@ -52,23 +37,36 @@ def remarks(document: dict[str, Any]) -> list[str]:
         f"fitted to {document['data']}",
     ]
     for row in document["steps"]:
-        name = f"{row['network']}, {row['stage']}"
-        apart = row["torch_samples_per_step"] / row["samples_per_step"] - 1
-        if abs(apart) > MOST_APART:
-            lines.append(
-                f"{name}: samples of the two sides differ by {apart:+.1%}; "
-                "do not quote this ratio"
-            )
-        for prefix, side in (("", "ours"), ("torch_", "PyTorch")):
-            if row["stage"] == "early" and not (
-                row[f"{prefix}loss_last"] < row[f"{prefix}loss_first"]
-            ):
-                lines.append(f"{name}: {side} did not learn; do not quote this ratio")
-        lines.append(f"{name}: {_parts(row['breakdown'])}")
+        lines += ["", f"{row['network']}, {row['stage']}, {row['rays']} rays a step"]
+        lines += [_side(row, *side) for side in SIDES.items()]
+        lines += [_parts(row["breakdown"]), *_complaints(row)]
     return lines
+
+
+def _side(row: dict[str, Any], side: str, prefix: str) -> str:
+    """Say what else is known of a side."""
+    return (
+        f"  {side}: {row[f'{prefix}samples_per_step']:.0f} samples a step, "
+        f"{row[f'{prefix}us_per_sample']:.2f} µs each; loss "
+        f"{row[f'{prefix}loss_first']:.4f}, then {row[f'{prefix}loss_last']:.4f}; "
+        f"peak memory {row[f'{prefix}peak_memory_mb']:.0f} MB"
+    )
 
 
 def _parts(breakdown: dict[str, float]) -> str:
     """Say where the time of our step goes."""
     parts = [f"{name} {value:.2f}" for name, value in breakdown.items()]
-    return "our step in µs a sample: " + ", ".join(parts)
+    return "  of ours, µs a sample: " + ", ".join(parts)
+
+
+def _complaints(row: dict[str, Any]) -> list[str]:
+    """Say what makes a comparison unfair."""
+    lines = []
+    apart = row["torch_samples_per_step"] / row["samples_per_step"] - 1
+    if abs(apart) > MOST_APART:
+        lines.append(f"samples of PyTorch differ from ours by {apart:+.1%}")
+    for side, prefix in SIDES.items():
+        first, last = row[f"{prefix}loss_first"], row[f"{prefix}loss_last"]
+        if row["stage"] == "early" and not last < first:
+            lines.append(f"{side} did not learn")
+    return [f"  {line}: do not quote this ratio" for line in lines]

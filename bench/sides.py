@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -16,6 +17,7 @@ from mi_nerfattack.vehicle.route import Route
 
 STOP = 1e-3
 FOV_DEG = 90.0
+COUNTED_RAYS = 1 << 12  # of which the samples of a step are counted
 
 
 class AbstractSide(ABC):
@@ -42,6 +44,20 @@ class AbstractSide(ABC):
         return {"peak_memory_mb": peak_memory_mb()}
 
 
+class Clock:
+    """Measures from where it is made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def per_step(self, count: int) -> dict[str, float]:
+        """Return ``seconds`` of time and of all cores' work, one of `count` parts."""
+        return {
+            "seconds": (time.perf_counter() - self._wall) / count,
+            "cpu_seconds": (time.process_time() - self._cpu) / count,
+        }
+
+
 class AbstractTrainer(ABC):
     """A field being fitted to pictures, in a process of its own."""
 
@@ -50,7 +66,7 @@ class AbstractTrainer(ABC):
         """Do training steps.
 
         Returns:
-            ``seconds`` and ``loss`` of a step, means.
+            ``seconds``, ``cpu_seconds`` and ``loss`` of a step, means.
         """
 
     @abstractmethod

@@ -62,7 +62,7 @@ class Plan:
     @staticmethod
     def candidates(rays: int) -> list[Plan]:
         """Return what is worth trying for a number of rays a step."""
-        chunks = sorted({max(1, rays // share) for share in (1, 4, 16)}, reverse=True)
+        chunks = sorted({max(1, rays // share) for share in (1, 4)}, reverse=True)
         return [Plan(chunk, b) for chunk in chunks for b in (ALL_AT_ONCE, BATCHES)]
 
 
@@ -142,9 +142,13 @@ class TorchFit:
         wanted = self.colour[index].to(linear.dtype) / 255
         return F.smooth_l1_loss(encode(linear * BELOW_WHITE), wanted, beta=self.huber)
 
-    def count_samples(self, batches: int = 4) -> float:
-        """Return the samples of a step in front of the end of their rays."""
-        self.model.evaluated = 0
+    def count_samples(self, rays: int) -> float:
+        """Return the samples of a step in front of the end of their rays.
+
+        Args:
+            rays: of which to take the mean, at least.
+        """
+        self.model.evaluated, batches = 0, -(-rays // self.rays)
         with torch.no_grad():
             for _ in range(batches):
                 self.loss(*self.draw())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import torch
 from small_fields import small_ngp
 
+from mi_nerfattack import cli
 from mi_nerfattack.bench.fit_table import ratio_table, remarks
 from mi_nerfattack.bench.full_ngp import NGPData
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
@@ -152,7 +155,8 @@ def test_pictures_survive_a_file(pictures, tmp_path):
 
 
 def document() -> dict:
-    row = {"network": "small", "stage": "early", "breakdown": {"networks": 1.25}}
+    row = {"network": "small", "stage": "early", "rays": 9, "breakdown": {}}
+    row["breakdown"] = {"networks": 1.25}
     for prefix, seconds in (("", 0.01), ("torch_", 0.06), ("torch_tuned_", 0.02)):
         row |= {
             f"{prefix}ratio": seconds / 0.01,
@@ -172,13 +176,37 @@ def test_the_ratio_comes_first():
     assert "2.00 times" in lines[0]
     assert "networks 1.25" in lines[-1]
     columns = [list(column.cells) for column in ratio_table(document()).columns]
-    assert columns[3] == ["", "6.00", "2.00"]
+    assert [column[0] for column in columns[2:]] == [
+        *("10.0", "60.0", "6.00", "20.0", "2.00")
+    ]
 
 
 def test_unfair_comparisons_are_called_so():
     unfair = document()
     unfair["steps"][0] |= {"torch_samples_per_step": 1100.0, "loss_last": 0.3}
     lines = "\n".join(remarks(unfair))
-    assert "differ by +10.0%" in lines
+    assert "differ from ours by +10.0%" in lines
     assert "ours did not learn" in lines
     assert "PyTorch did not learn" not in lines
+
+
+@pytest.mark.slow
+def test_a_quick_benchmark_prints_the_promised_keys(capsys, tmp_path):
+    path = tmp_path / "fit.json"
+    command = ["bench", "fit", "--quick", "--json", "--repeats", "1", "-o", str(path)]
+    assert cli.main(command) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert json.loads(path.read_text()) == result
+    assert [row["stage"] for row in result["steps"]] == ["early", "late"]
+    for row in result["steps"]:
+        assert row["torch_ratio"] > 0
+        assert row["torch_samples_per_step"] == pytest.approx(
+            row["samples_per_step"], rel=0.1
+        )
+        assert row["torch_samples_per_step"] == row["torch_tuned_samples_per_step"]
+    assert result["ratio"] == min(row["torch_ratio"] for row in result["steps"])
+
+
+def test_bad_repeats_are_refused(capsys):
+    assert cli.main(["bench", "fit", "--repeats", "0"]) == cli.EXIT_INPUT
+    assert "--repeats: 0" in capsys.readouterr().err

@@ -120,10 +120,77 @@ class BenchComposite:
         return 0
 
 
+@dataclass(frozen=True)
+class BenchFit:
+    """Measure a training step of a fit against the same step in PyTorch.
+
+    The same network, rays, occupancy and marching step, both sides from the same
+    state and in turns, in processes of their own, on all cores; medians count. Keep the
+    machine otherwise idle. Takes about ten minutes.
+    """
+
+    folder: Path | None = None
+    """Folder of posed images; without it, views of the bundled intersection."""
+    long_edge: int | None = None
+    """Reduce the folder's images to this longer edge, pixels."""
+    repeats: int = 5
+    """Turns of each side."""
+    quick: bool = False
+    """Take a tiny network and few rays: to see that it works, not for figures."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date: a .json file, or a folder
+    in which it is named by date and machine."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """Measure, print and write."""
+        import dataclasses
+        import json
+
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            fit,
+            results,
+        )
+        from mi_nerfattack.commands.bars import StageBars
+
+        _check_repeats(self.repeats)
+        settings = fit.Settings(repeats=self.repeats)
+        if self.quick:
+            settings = fit.Settings.quick(self.repeats)
+        settings = dataclasses.replace(
+            settings, folder=self.folder, long_edge=self.long_edge
+        )
+        with StageBars() as bars:
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            document = fit.run(settings, show)
+        document = results.stamp(document, self._command())
+        if self.output is not None:
+            path = results.write(self.output, "fit", document)
+            print(f"written to {path}", file=sys.stderr)
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            _print_fit(document)
+        return 0
+
+    def _command(self) -> list[str]:
+        command = ["mi-nerfattack", "bench", "fit", "--repeats", str(self.repeats)]
+        if self.folder is not None:
+            command += ["--folder", self.folder.resolve().name]
+        if self.long_edge is not None:
+            command += ["--long-edge", str(self.long_edge)]
+        return [*command, "--quick"] if self.quick else command
+
+
 _Chosen = tyro.conf.OmitArgPrefixes[
     tyro.conf.OmitSubcommandPrefixes[
         Union[  # noqa: UP007  the members are no plain types
             Annotated[BenchRender, tyro.conf.subcommand("render")],
+            Annotated[BenchFit, tyro.conf.subcommand("fit")],
             Annotated[BenchComposite, tyro.conf.subcommand("composite")],
         ]
     ]
@@ -172,6 +239,21 @@ def _print(document: dict[str, Any]) -> None:
     console = Console()
     console.print(table.render_table(document))
     for line in table.remarks(document):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _print_fit(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+        fit_table,
+    )
+
+    console = Console()
+    first, *others = fit_table.remarks(document)
+    console.print(first, highlight=False, soft_wrap=True)
+    console.print(fit_table.ratio_table(document))
+    for line in others:
         console.print(line, highlight=False, soft_wrap=True)
 
 
