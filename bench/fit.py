@@ -71,7 +71,7 @@ class Settings:
             views=9,
             view_size=(32, 16),
             view_step_m=1.0,
-            chunk=64,
+            chunk=256,
         )
 
 
