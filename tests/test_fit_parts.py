@@ -219,4 +219,5 @@ def test_samples_are_counted_by_the_cells_that_rays_cross():
     origin = mi.Point3f([0, 0, 3], [0, 0, 0], [1, -0.5, 1])
     direction = mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])
     posed, far = PosedField(grid), mi.Float(dr.inf)
-    assert sample_count(posed, origin, direction, far).numpy().tolist() == [4, 2, 0]
+    count = sample_count(posed, origin, direction, far, mi.Float(0.5))
+    assert count.numpy().tolist() == [4, 2, 0]

@@ -163,5 +163,5 @@ def mean_samples(posed: PosedField, source: BatchSource, seed: int) -> float:
     """
     random = mi.PCG32(_PROBE, seed)
     rays = source.draw(random, dr.opaque(mi.UInt32, _PROBE)).rays
-    count = sample_count(posed, rays.origin, rays.direction, rays.t_max)
+    count = sample_count(posed, rays.origin, rays.direction, rays.t_max, rays.jitter)
     return float(dr.mean(count)[0])

@@ -12,7 +12,9 @@ from mi_nerfattack.render.posed import PosedField
 
 
 @dr.syntax
-def sample_count(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> Any:
+def sample_count(
+    posed: PosedField, origin: Any, direction: Any, t_max: Any, jitter: Any
+) -> Any:
     """Count the samples a march would take if nothing stopped it, (n,).
 
     Args:
@@ -20,15 +22,16 @@ def sample_count(posed: PosedField, origin: Any, direction: Any, t_max: Any) -> 
         origin: (3, n), metres in the world.
         direction: (3, n), unit vectors.
         t_max: (n,), metres.
+        jitter: (n,), positions of the samples in their intervals.
     """
     o, d = posed.to_local(origin, direction)
     near, far = posed.interval(o, d, t_max)
-    middle = mi.Float(0.5)
+    jitter = mi.Float(jitter)
     active = mi.Bool(near < far)
     index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
     count = mi.Float(0)
     while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, middle, active)
+        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         count += dr.select(active, 1.0, 0.0)
         index += 1
     return count

@@ -47,7 +47,10 @@ class MarchStep:
         draw = self.source.draw(random, limit)
         rays = draw.rays
         ends = dr.select(rays.active, rays.t_max, 0)
-        count = mi.UInt32(sample_count(self.posed, rays.origin, rays.direction, ends))
+        crossed = sample_count(
+            self.posed, rays.origin, rays.direction, ends, rays.jitter
+        )
+        count = mi.UInt32(crossed)
         # rays of a packet take as long as the longest of them
         order = mi.UInt32(dr.argsort(count))
         sorted_rays = pick_rays(rays, order)

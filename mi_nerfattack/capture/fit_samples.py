@@ -47,9 +47,9 @@ def list_samples(posed: PosedField, rays: Rays, capacity: int) -> Samples:
         capacity: number of slots; from the ray whose samples do not fit, rays stay
             empty.
     """
-    o, d, ends, _, active = rays
+    o, d, ends, jitter, active = rays
     ends = dr.select(active, ends, 0)
-    count = mi.UInt32(sample_count(posed, o, d, ends))
+    count = mi.UInt32(sample_count(posed, o, d, ends, jitter))
     first, fits = _places(count, capacity)
     samples = Samples(
         first,
