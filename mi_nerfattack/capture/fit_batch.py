@@ -54,11 +54,13 @@ class Draw:
     """A batch of rays with its random numbers.
 
     Attributes:
-        batch: rays and what the images show; attached to what is learned of cameras.
-        rays: the rays, detached.
+        index: (n,), of the pixels.
+        batch: rays and what the images show.
+        rays: the rays.
         shade: (3, n), a random colour.
     """
 
+    index: mi.UInt32
     batch: RayBatch
     rays: Rays
     shade: mi.Color3f
@@ -99,13 +101,13 @@ class BatchSource:
         index = self.bank.draw(random)
         jitter = random.next_float32()
         shade = mi.Color3f(*(random.next_float32() for _ in range(3)))
-        batch = self.bank.batch(index)
+        with dr.suspend_grad():
+            batch = self.bank.batch(index)
         active = dr.arange(mi.UInt32, dr.width(index)) < limit
-        origin = mi.Point3f(dr.detach(batch.origin))
-        direction = mi.Vector3f(dr.detach(batch.direction))
-        rays = Rays(origin, direction, self.ends(batch.depth), jitter, active)
+        ends = self.ends(batch.depth)
+        rays = Rays(batch.origin, batch.direction, ends, jitter, active)
         dr.eval(batch, rays, shade, random)
-        return Draw(batch, rays, shade)
+        return Draw(index, batch, rays, shade)
 
     def ends(self, depth: Any) -> Any:
         """End rays a little behind known surfaces: more samples would teach nothing.
@@ -147,9 +149,9 @@ class BatchSource:
 
     def backward_rays(self, draw: Draw, by_origin: Any, by_direction: Any) -> None:
         """Pass derivatives by the rays on to the corrections of the poses."""
+        batch = self.bank.batch(draw.index)  # attached
         dr.backward_from(
-            dr.dot(draw.batch.origin, by_origin)
-            + dr.dot(draw.batch.direction, by_direction)
+            dr.dot(batch.origin, by_origin) + dr.dot(batch.direction, by_direction)
         )
 
 
