@@ -18,12 +18,17 @@ from mi_nerfattack.capture.fit_march import MarchStep
 from mi_nerfattack.capture.fit_occupancy import RunningOccupancy, seen_cells
 from mi_nerfattack.capture.fit_points import PointStep
 from mi_nerfattack.capture.fit_rays import RayBank
-from mi_nerfattack.capture.fit_samples import list_samples
+from mi_nerfattack.capture.fit_samples import (
+    Samples,
+    cotangents,
+    list_samples,
+    measure_spread,
+)
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
 from mi_nerfattack.fields.mlp import MLP, Networks
 from mi_nerfattack.render.camera import from_fov, look_at
-from mi_nerfattack.render.march import Rays
+from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -171,6 +176,40 @@ def test_networks_against_central_differences(rng):
         value += 1e-6 * change
         central = (high - low) / 2e-6
         assert (gradient * change).sum() == pytest.approx(central, rel=1e-5)
+
+
+def test_spread_and_its_derivative_against_all_pairs(rng):
+    count = 7
+    depths = rng.uniform(0.1, 0.6, count)
+    place = np.sort(rng.uniform(0, 1, count))
+    width, factor = 0.1, 0.3
+
+    def penalty(x: np.ndarray) -> float:
+        behind = np.exp(-np.cumsum(x))
+        weight = np.append(1, behind[:-1]) - behind
+        pairs = np.abs(place[:, None] - place[None])
+        return float(weight @ pairs @ weight + (weight**2).sum() * width / 3)
+
+    samples = Samples(
+        mi.UInt32([0]),
+        mi.UInt32([count]),
+        mi.Bool([True]),
+        dr.zeros(mi.UInt32, count),
+        mi.Float(place),
+        dr.full(mi.Float, width, count),
+    )
+    found = measure_spread(
+        samples, mi.Float(depths), mi.Float(place), mi.Float(width), mi.Float(factor)
+    )
+    assert found.penalty[0] == pytest.approx(penalty(depths), rel=1e-5)
+    black = dr.zeros(mi.Color3f, count)
+    nothing = March.zeros(1)
+    by_depth, _ = cotangents(
+        samples, mi.Float(depths), black, nothing, nothing, found
+    )
+    for k, step in enumerate(1e-5 * np.eye(count)):
+        central = (penalty(depths + step) - penalty(depths - step)) / 2e-5
+        assert by_depth[k] == pytest.approx(factor * central, rel=1e-4, abs=1e-6)
 
 
 def test_gains_are_relative_to_their_mean():

@@ -26,11 +26,14 @@ class LossWeights:
         huber: where the colour's Huber loss turns linear, sRGB values.
         depth: of the depth term, against that of colour; 0 ignores depths.
         opacity: of the opacity term where depths tell it; 0 ignores it.
+        spread: of the spread of weights along a ray, which gathers fog on surfaces; of
+            an NGP on a CPU alone.
     """
 
     huber: float = 0.1
     depth: float = 0.1
     opacity: float = 0.05
+    spread: float = 0.0
 
 
 def huber(error: Any, delta: float) -> Any:

@@ -10,10 +10,12 @@ import mitsuba as mi
 from mi_nerfattack.capture.fit_batch import BatchSource, Draw, Score, mean_samples
 from mi_nerfattack.capture.fit_samples import (
     Samples,
+    Spread,
     composite,
     cotangents,
     keep_visible,
     list_samples,
+    measure_spread,
 )
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.ngp_rows import (
@@ -131,12 +133,23 @@ class PointStep:
         score, cotangent = self.source.compare(draw, primal, samples.fits)
         score.kept = dr.sum(samples.count)
         with dr.suspend_grad():
+            spread = self._spread(samples, values)
             by_depth, by_colour = cotangents(
-                samples, values, colours, primal, cotangent
+                samples, values, colours, primal, cotangent, spread
             )
+            score.loss += dr.sum(spread.penalty) * self.source.weights.spread
             dr.eval(by_depth, by_colour)
         dr.backward(depths * by_depth + dr.dot(colour, by_colour))
         return score, dr.grad(leaf)
+
+    def _spread(self, samples: Samples, depths: mi.Float) -> Spread:
+        """Measure spread in steps of the march, as a share of those across the box."""
+        corners = mi.Vector3f(*map(float, self.field.upper - self.field.lower))
+        width = dr.rcp(self.posed.lattice_index(mi.Float(dr.norm(corners))))
+        place = self.posed.lattice_index(samples.t) * width
+        rays = dr.maximum(dr.count(samples.fits), 1)
+        factor = self.source.weights.spread * dr.rcp(mi.Float(rays))
+        return measure_spread(samples, depths, place, width, factor)
 
     def _record_scatter(self, draw: Draw, samples: Samples, slopes: mi.Float) -> None:
         point = _points(draw.rays, samples)

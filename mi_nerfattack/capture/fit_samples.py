@@ -170,6 +170,77 @@ def _pick(colour: mi.Color3f, slot: mi.UInt32, active: mi.Bool) -> mi.Color3f:
     return mi.Color3f(*(dr.gather(mi.Float, c, slot, active) for c in colour))
 
 
+@dataclass
+class Spread:
+    """How far apart the weights of a ray are.
+
+    The penalty is ``sum_jk w_j w_k |s_j - s_k| + sum_k w_k^2 width / 3``.
+
+    Attributes:
+        factor: (n,), of the penalty in the objective.
+        place: (m,), positions s of the samples.
+        width: of an interval, in the same unit; one entry.
+        weight: (n,), sum of w_k.
+        moment: (n,), sum of w_k s_k.
+        penalty: (n,).
+
+    Source: Barron et al. 2022, eq. 15.
+    """
+
+    factor: mi.Float = field(default_factory=lambda: mi.Float(0))
+    place: mi.Float = field(default_factory=lambda: mi.Float(0))
+    width: mi.Float = field(default_factory=lambda: mi.Float(0))
+    weight: mi.Float = field(default_factory=lambda: mi.Float(0))
+    moment: mi.Float = field(default_factory=lambda: mi.Float(0))
+    penalty: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    def slope(
+        self, weight: mi.Float, place: mi.Float, before: mi.Float, moment: mi.Float
+    ) -> mi.Float:
+        """Return the penalty's derivative by a weight.
+
+        Args:
+            weight: of the sample.
+            place: of the sample.
+            before: sum of the weights before it.
+            moment: sum of weight times place before it.
+        """
+        behind = self.weight - before - weight
+        rest = self.moment - moment - weight * place
+        distance = place * (before - behind) - (moment - rest)
+        return 2 * distance + (2 / 3) * weight * self.width
+
+
+@dr.syntax
+def measure_spread(
+    samples: Samples, depths: mi.Float, place: mi.Float, width: mi.Float, factor: Any
+) -> Spread:
+    """Measure the spread of weights along each ray.
+
+    Args:
+        samples: n rays, m slots.
+        depths: (m,), optical depth of each interval.
+        place: (m,), positions of the samples, in whatever unit the spread is to have.
+        width: of an interval, in the same unit; one entry.
+        factor: (n,), of the penalty in the objective.
+    """
+    slot, end = mi.UInt32(samples.first), samples.first + samples.count
+    tau, before, moment, penalty = (mi.Float(0) for _ in range(4))
+    active = slot < end
+    while active:
+        x = dr.gather(mi.Float, depths, slot, active)
+        s = dr.gather(mi.Float, place, slot, active)
+        weight = dr.exp(-tau) * x * absorption(x)[0]
+        # each pair is met once, at its farther sample
+        penalty += weight * (2 * (s * before - moment) + weight * width / 3)
+        before += weight
+        moment += weight * s
+        tau += x
+        slot += 1
+        active &= slot < end
+    return Spread(factor, place, width, before, moment, penalty)
+
+
 @dr.syntax
 def cotangents(
     samples: Samples,
@@ -177,6 +248,7 @@ def cotangents(
     colour: Any,
     primal: March,
     cotangent: March,
+    spread: Spread,
 ) -> tuple[mi.Float, mi.Color3f]:
     """Differentiate an objective by what a composite was made of.
 
@@ -190,6 +262,7 @@ def cotangents(
         colour: (3, m), radiance of each.
         primal: what :func:`composite` returned.
         cotangent: derivative of the objective by `primal`.
+        spread: from :func:`measure_spread`.
 
     Returns:
         the derivatives by `depths` (m,) and by `colour` (3, m), zero in void slots.
@@ -198,19 +271,25 @@ def cotangents(
     by_depth = dr.zeros(mi.Float, count)
     by_colour = dr.zeros(mi.Color3f, count)
     dr.make_opaque(by_depth, by_colour)
-    rest = cotangent.pair(primal)  # sum of w_j g_j still to come
+    # sum of w_j g_j still to come; the penalty is of second degree in the weights
+    rest = cotangent.pair(primal) + 2 * spread.factor * spread.penalty
+    before, moment = mi.Float(0), mi.Float(0)
     slot, end = mi.UInt32(samples.first), samples.first + samples.count
     tau = mi.Float(0)
     active = slot < end
     while active:
         x = dr.gather(mi.Float, depths, slot, active)
+        s = dr.gather(mi.Float, spread.place, slot, active)
         value = _pick(colour, slot, active)
         weight = dr.exp(-tau) * x * absorption(x)[0]
         g = (
             dr.dot(cotangent.radiance, value)
             + cotangent.opacity
             + cotangent.moment * dr.gather(mi.Float, samples.t, slot, active)
+            + spread.factor * spread.slope(weight, s, before, moment)
         )
+        before += weight
+        moment += weight * s
         rest -= weight * g
         dr.scatter(by_depth, dr.exp(-tau - x) * g - rest, slot, active)
         for c in dr.hint(range(3), mode="scalar"):
