@@ -43,8 +43,11 @@ class TorchTrainer(AbstractTrainer):
             self.fit.plan = Plan(chunk)
         else:
             plans = Plan.candidates(rays)
-            self._seconds(plans[0])
-            self.fit.plan = min(plans, key=self._seconds)
+            self._seconds(plans[0])  # warm up
+            seconds = {plan: self._seconds(plan) for plan in plans}
+            for plan in plans:
+                seconds[plan] = min(seconds[plan], self._seconds(plan))
+            self.fit.plan = min(plans, key=seconds.__getitem__)
 
     def steps(self, count: int) -> dict[str, float]:
         """See :meth:`AbstractTrainer.steps`."""

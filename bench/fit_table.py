@@ -39,6 +39,10 @@ def remarks(document: dict[str, Any]) -> list[str]:
     for row in document["steps"]:
         lines += ["", f"{row['network']}, {row['stage']}, {row['rays']} rays a step"]
         lines += [_side(row, *side) for side in SIDES.items()]
+        lines.append(
+            f"  ratio of CPU time, in which waiting threads count: "
+            f"{row['torch_cpu_ratio']:.2f}, to tuned {row['torch_tuned_cpu_ratio']:.2f}"
+        )
         lines += [_parts(row["breakdown"]), *_complaints(row)]
     return lines
 

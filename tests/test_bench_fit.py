@@ -160,6 +160,7 @@ def document() -> dict:
     for prefix, seconds in (("", 0.01), ("torch_", 0.06), ("torch_tuned_", 0.02)):
         row |= {
             f"{prefix}ratio": seconds / 0.01,
+            f"{prefix}cpu_ratio": seconds / 0.02,
             f"{prefix}seconds_per_step": seconds,
             f"{prefix}samples_per_step": 1000.0,
             f"{prefix}us_per_sample": 1e3 * seconds,
@@ -175,6 +176,7 @@ def test_the_ratio_comes_first():
     assert "6.00 times" in lines[0]
     assert "2.00 times" in lines[0]
     assert "networks 1.25" in lines[-1]
+    assert lines[-2].endswith("3.00, to tuned 1.00")
     columns = [list(column.cells) for column in ratio_table(document()).columns]
     assert [column[0] for column in columns[2:]] == [
         *("10.0", "60.0", "6.00", "20.0", "2.00")
