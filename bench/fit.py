@@ -202,8 +202,8 @@ def _figures(
             f"{prefix}peak_memory_mb": memory[role]["peak_memory_mb"],
         }
     for prefix in ("torch_", "torch_tuned_"):
-        row[f"{prefix}ratio"] = (
-            row[f"{prefix}seconds_per_step"] / (row["seconds_per_step"])
-        )
+        for ratio, key in (("ratio", "seconds"), ("cpu_ratio", "cpu_seconds")):
+            theirs, ours = row[f"{prefix}{key}_per_step"], row[f"{key}_per_step"]
+            row[prefix + ratio] = theirs / ours
     row["settings"] = facts
     return row
