@@ -75,7 +75,8 @@ class PointStep:
         size = self.field.encoding.n_output_features
         nets = networks(self.field)
         draw, listed, features, random = self._list(random, limit)
-        nets.raw_density(rows(features, size), self._raw_density.view[:, 0])
+        used = int(dr.sum(listed.count)[0])
+        nets.raw_density(rows(features, size)[:used], self._raw_density.view[:used, 0])
         samples, features, view = self._keep(
             draw.rays, listed, features, self._raw_density.array
         )
@@ -99,7 +100,8 @@ class PointStep:
         with dr.suspend_grad():
             listed = list_samples(self.posed, draw.rays, self.listed)
             unit = self.field.clipped(_points(draw.rays, listed))
-            features = lay_out(self.field.encoding(unit, mi.Bool(True)))
+            used = dr.arange(mi.UInt32, self.listed) < dr.sum(listed.count)
+            features = lay_out(_encode(self.field, unit, used))
         return draw, listed, features, random
 
     def _record_keep(
@@ -163,6 +165,17 @@ class PointStep:
 
     def _is_used(self, samples: Samples) -> mi.Bool:
         return dr.arange(mi.UInt32, self.kept) < dr.sum(samples.count)
+
+
+@dr.syntax
+def _encode(field: NGPField, unit: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
+    """Encode points (3, n) of a mask; packets without any cost nothing."""
+    features = [mi.Float(0) for _ in range(field.encoding.n_output_features)]
+    active = mi.Bool(active)
+    while active:
+        features = [mi.Float(x) for x in field.encoding(unit, active)]
+        active = mi.Bool(False)
+    return features
 
 
 def _along_rays(
