@@ -196,30 +196,3 @@ def test_command_checks_its_output_first(tmp_path, name):
 
     with pytest.raises(InputError, match="field files end|make it first"):
         Asset(tmp_path / "no.glb", tmp_path / name).run()
-
-
-def test_interrupted_command_leaves_nothing(tmp_path, monkeypatch):
-    from mi_nerfattack.commands import bars
-    from mi_nerfattack.commands.fit import Fit
-
-    def interrupt(self, *state):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bars.StageBars, "show", interrupt)
-    folder = files.make_folder(tmp_path / "views")
-    write_folder(folder, None)
-    output = tmp_path / "field.safetensors"
-    command = Fit(
-        folder,
-        output,
-        steps=25,
-        batch_rays=64,
-        network="small",
-        log2_table=8,
-        max_resolution=32,
-        occupancy=8,
-        step_m=0.5,
-    )
-    with pytest.raises(KeyboardInterrupt):
-        command.run()
-    assert sorted(tmp_path.iterdir()) == [folder]

@@ -31,6 +31,7 @@ from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 __all__ = ["FitOptions", "FitProgress", "FitResult", "fit_grid", "fit_ngp", "unpack"]
 
 _REPORT_EVERY = 25
+_SETTLED = 0.95  # of the fit, from where the occupancy stays as it is
 _PROGRESS = 0.99  # of the loss, within `patience`
 
 
@@ -145,7 +146,8 @@ def _run(
     try:
         while not clock.is_over():
             training.do_step(clock.rate())
-            training.update_occupancy()
+            if clock.fraction() < _SETTLED:
+                training.update_occupancy()
             if training.step % _REPORT_EVERY == 0:
                 progress(clock.report())
                 if checkpoint is not None:

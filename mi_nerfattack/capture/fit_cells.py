@@ -1,22 +1,16 @@
-"""Occupancy while fitting: what depth maps allow, and what the field has learned."""
+"""Cells that a fit may fill, as far as depth maps tell."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 from mi_nerfattack.capture.frames import PosedImages
-from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.camera import generate_rays, pose_arrays
 
 _UPSAMPLING = 4
 _SMOOTH_RATIO = 1.5  # neighbours with depths closer than this lie on one surface
-_CHUNK = 1 << 20
 
 
 def grid_shape(
@@ -92,42 +86,3 @@ def cells_near_surfaces(
         inside = ((cell >= 0) & (cell < shape)).all(axis=1)
         cells[tuple(cell[inside].T)] = True
     return cells
-
-
-def learned(
-    field: AbstractField,
-    allowed: np.ndarray,
-    threshold: float,
-    rng: np.random.Generator,
-    samples: int = 4,
-) -> Occupancy:
-    """Keep the allowed cells whose density, or a neighbour's, reaches a threshold.
-
-    As `fields.occupancy.build`, but evaluates allowed cells only, and lowers the
-    threshold to the mean density, so that a field that has learned little keeps cells.
-
-    Args:
-        field: the field as fitted so far.
-        allowed: boolean grid over the field's box.
-        threshold: density, 1/metre.
-        rng: of the positions in the cells.
-        samples: positions a cell.
-    """
-    shape = np.array(allowed.shape)[:, None]
-    lower = np.asarray(field.lower)[:, None]
-    extent = np.asarray(field.upper)[:, None] - lower
-    candidates = np.stack(np.nonzero(allowed))
-    peak = np.zeros(candidates.shape[1], np.float32)
-    for start in range(0, len(peak), _CHUNK):
-        part = slice(start, min(start + _CHUNK, len(peak)))
-        for _ in range(samples):
-            cell = candidates[:, part] + rng.random((3, part.stop - start))
-            position = mi.Point3f(np.float32(lower + cell / shape * extent))
-            dr.make_opaque(position)
-            density = field.density(position, mi.Bool(True)).numpy()
-            peak[part] = np.maximum(peak[part], density)
-    cells = np.zeros(allowed.shape, bool)
-    cells[tuple(candidates)] = peak >= min(threshold, float(peak.mean()))
-    if cells.any():
-        cells = ndimage.binary_dilation(cells, np.ones((3, 3, 3)))
-    return Occupancy(cells & allowed)

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.capture.fit_cells import learned
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
@@ -105,14 +104,6 @@ class RunningOccupancy:
         cells = cells.reshape(self.allowed.shape)
         self._occupied = np.nonzero(cells[tuple(self._cells)])[0]
         self.field.occupancy = Occupancy(cells)
-
-    def finish(self) -> None:
-        """Give the field an occupancy from many samples, with a margin."""
-        rng = np.random.default_rng([self.seed, 1 << 31])
-        with dr.suspend_grad():
-            self.field.occupancy = learned(
-                self.field, self.allowed, self.threshold, rng
-            )
 
 
 def seen_cells(

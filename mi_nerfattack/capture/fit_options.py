@@ -48,7 +48,7 @@ class FitOptions:
     epochs: float = 50.0
     budget_minutes: float | None = None
     patience: int | None = None
-    batch_rays: int = 4096
+    batch_rays: int = 1 << 14
     samples: int = 1 << 16
     seed: int = 0
     learning_rate: float = 1e-2

@@ -174,11 +174,14 @@ class Training:
                 self.occupancy.install()
 
     def finish(self) -> None:
-        """Detach the field from the optimiser, and give it its final occupancy."""
+        """Detach the field from the optimiser.
+
+        It keeps the occupancy of the last steps: density in other cells has had no
+        part in what was compared.
+        """
         self._install({k: dr.detach(v) for k, v in self.optimiser.items()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
-        self.occupancy.finish()
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state."""

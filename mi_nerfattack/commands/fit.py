@@ -45,7 +45,7 @@ class Fit:
     """End the fit when this many steps lower the loss by less than 1 %."""
     resume: bool = False
     """Continue an interrupted fit from its checkpoint, beside the output."""
-    batch_rays: int = 4096
+    batch_rays: int = 16384
     """Rays a step, at most."""
     network: Literal["instant-ngp", "small"] = "instant-ngp"
     """16 levels of 2^19 entries and networks of width 64, or 10 of 2^17 and 32."""
