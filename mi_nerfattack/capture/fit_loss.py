@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import mitsuba as mi
 
 from mi_nerfattack.capture.fit_rays import RayBatch
 from mi_nerfattack.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.march import March
 
 # Rounding may lift a white pixel above 1, where the sRGB curve has no derivative.
@@ -34,6 +36,14 @@ class LossWeights:
     depth: float = 0.1
     opacity: float = 0.05
     spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("depth", "opacity", "spread"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; must not be negative")
+        if not 0 < self.huber < math.inf:
+            raise InputError(f"huber: {self.huber}; must be positive")
 
 
 def huber(error: Any, delta: float) -> Any:

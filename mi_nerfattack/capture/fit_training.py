@@ -79,6 +79,8 @@ class Training:
         if isinstance(radiance_field, NGPField) and radiance_field.collects_points:
             room = options.samples
             self._march = PointStep(radiance_field, source, _LISTED * room, room)
+        elif options.loss.spread > 0:
+            raise InputError("spread: only an NGP on a CPU (LLVM) is fitted with it")
         self.optimiser = mi.ad.Adam(
             lr=options.learning_rate,
             beta_1=0.9,

@@ -65,6 +65,8 @@ class Fit:
     """Marching step near the camera; a thousandth of the longest edge by default."""
     occupancy: int | None = None
     """Cells of the occupancy along the longest edge; 256 with depth, else 128."""
+    spread: float = 0.0
+    """Weight of a penalty on fog, e.g. 0.003."""
     seed: int = 0
     """Of all random numbers."""
     skip_missing: bool = False
@@ -88,6 +90,7 @@ class Fit:
         from mi_nerfattack import variant
         from mi_nerfattack.capture.fit import FitOptions, fit_ngp
         from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
+        from mi_nerfattack.capture.fit_loss import LossWeights
         from mi_nerfattack.capture.frames import read_images
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.compare_report import compare_file
@@ -114,6 +117,7 @@ class Fit:
             budget_minutes=self.budget_minutes,
             batch_rays=self.batch_rays,
             seed=self.seed,
+            loss=LossWeights(spread=self.spread),
             occupancy_resolution=self.occupancy or (128 if depth is None else 256),
         )
         layout = self._layout()
