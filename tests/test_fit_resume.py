@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from sphere_views import BOX, sphere_views, write_folder
@@ -12,6 +13,7 @@ from sphere_views import BOX, sphere_views, write_folder
 from mi_nerfattack import files
 from mi_nerfattack.capture import fit_checkpoint
 from mi_nerfattack.capture.fit import FitOptions, FitResult, fit_grid, fit_ngp
+from mi_nerfattack.capture.fit_loss import LossWeights
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
@@ -179,6 +181,41 @@ def test_exposure_of_each_image_is_found():
     bright, dark = (result.exposure[fitted % 2 == k].mean() for k in (0, 1))
     ratio = bright / dark
     assert ratio == pytest.approx(2, rel=0.1)
+
+
+def test_what_is_learned_of_cameras_is_written(tmp_path):
+    from mi_nerfattack.commands.fit_report import write_cameras
+    from mi_nerfattack.render.conventions import opengl_to_opencv
+
+    images, _ = sphere_views(3, alpha=False)
+    learned = np.arange(6.0).reshape(2, 3), images.camera_to_world[1:]
+    result = FitResult(None, 0.0, 0.0, (), (), 0.0, 0, *learned)
+    write_cameras(tmp_path / "cameras.json", result, images)
+    frames = files.read_json(tmp_path / "cameras.json")["frames"]
+    assert [frame["file_path"] for frame in frames] == ["view 1", "view 2"]
+    assert frames[1]["exposure"] == [3, 4, 5]
+    pose = opengl_to_opencv(np.array(frames[0]["transform_matrix"]))
+    np.testing.assert_allclose(pose, images.camera_to_world[1], atol=1e-12)
+    write_cameras(
+        tmp_path / "none.json", FitResult(None, 0.0, 0.0, (), (), 0.0, 0), images
+    )
+    assert not (tmp_path / "none.json").exists()
+
+
+def test_images_with_alpha_leave_a_black_sky():
+    images, depth = sphere_views(8)
+    result = fit_ngp(
+        images, *BOX, TINY_NGP, options(steps=25), depth, step_m=0.05, cone=0.0
+    )
+    sky = result.field.background(mi.Vector3f(0, 0.6, 0.8)).numpy()
+    np.testing.assert_allclose(sky, 0, atol=1e-6)
+
+
+def test_spread_is_refused_where_it_would_not_count():
+    images, depth = sphere_views(8)
+    settings = options(loss=LossWeights(spread=0.1))
+    with pytest.raises(InputError, match="spread"):
+        fit_grid(images, *BOX, GridLayout(2, 4, 8), settings, depth)
 
 
 def test_exposure_needs_images_without_alpha():

@@ -11,6 +11,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.capture.evaluation import evaluate
@@ -31,6 +33,7 @@ from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 __all__ = ["FitOptions", "FitProgress", "FitResult", "fit_grid", "fit_ngp", "unpack"]
 
 _REPORT_EVERY = 25
+_BLACK = -30.0  # raw value of a colour
 _SETTLED = 0.95  # of the fit, from where the occupancy stays as it is
 _PROGRESS = 0.99  # of the loss, within `patience`
 
@@ -51,7 +54,8 @@ def fit_ngp(
     """Fit an NGP with a sky to images of a place.
 
     Args:
-        images: RGB (or RGBA, whose alpha must then be 1 everywhere that matters).
+        images: RGB, or RGBA: then a random colour lies behind each ray in place of the
+            sky, which stays black.
         lower: corner of the field's box, metres; what lies outside becomes sky.
         upper: opposite corner, metres.
         layout: None for Instant-NGP's: 16 levels of 2^19, width 64. `NGPLayout.small()`
@@ -81,6 +85,8 @@ def fit_ngp(
         cone=cone,
         seed=options.seed,
     )
+    if images.images.shape[3] == 4:
+        ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
     return _start(training, progress, checkpoint, resume)
 

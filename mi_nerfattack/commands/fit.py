@@ -138,7 +138,13 @@ class Fit:
         provenance = {
             "source": self.folder.name,
             "source_unit": images.unit,
+            "size_px": f"{images.camera.width} x {images.camera.height}",
             "seed": str(self.seed),
+            "network": self.network,
+            "budget_minutes": str(self.budget_minutes),
+            "exposure": str(self.exposure),
+            "refine_poses": str(self.refine_poses),
+            "spread": str(self.spread),
         }
         finish(result, images, self.output, provenance, self.json, depth, self.against)
         return 0

@@ -92,6 +92,7 @@ def finish(
     save_field(output, result.field)
     title = f"Fit of {output.name}"
     page = write_fit_report(report_folder(output), result, images, depth, title)
+    write_cameras(report_folder(output) / "cameras.json", result, images)
     comparison = None if against is None else against.run(result.field, output)
     if as_json:
         more = {} if comparison is None else {"compare": document(comparison)}
@@ -106,6 +107,32 @@ def finish(
     )
     if comparison is not None:
         print_comparison(comparison, output)
+
+
+def write_cameras(path: Path, result: FitResult, images: PosedImages) -> None:
+    """Write what the fit learned of the cameras, image by image; nothing if nothing.
+
+    Args:
+        path: JSON file: for each fitted image its ``file_path`` and, where learned,
+            ``exposure`` (factors of linear radiance) and ``transform_matrix`` (OpenGL).
+        result: of the fit.
+        images: that were fitted to.
+    """
+    from mi_nerfattack import files
+    from mi_nerfattack.capture.frames import held_out
+    from mi_nerfattack.render.conventions import opencv_to_opengl
+
+    if result.exposure is None and result.poses is None:
+        return
+    skipped = set(held_out(len(images)).tolist())
+    names = [name for i, name in enumerate(images.names) if i not in skipped]
+    frames: list[dict[str, object]] = [{"file_path": name} for name in names]
+    for i, frame in enumerate(frames):
+        if result.exposure is not None:
+            frame["exposure"] = result.exposure[i].tolist()
+        if result.poses is not None:
+            frame["transform_matrix"] = opencv_to_opengl(result.poses[i]).tolist()
+    files.write_json(path, {"frames": frames})
 
 
 def _print_scores(result: FitResult) -> None:
