@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from abc import ABC, abstractmethod
 from typing import Any
@@ -112,10 +110,3 @@ def pinhole_rays(
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     origin = np.broadcast_to(camera_to_world[:3, 3], direction.shape)
     return origin.astype(np.float32), direction.astype(np.float32)
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -18,6 +18,7 @@ from pathlib import Path
 from packaging.requirements import InvalidRequirement, Requirement
 
 from mi_nerfattack import files, llvm, variant
+from mi_nerfattack.cores import cores
 from mi_nerfattack.errors import NerfAttackError
 
 DISTRIBUTION = "mi-nerfattack"
@@ -186,8 +187,7 @@ def _variants() -> Iterator[Finding]:
 
 
 def _machine() -> Iterator[Finding]:
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
-    yield Finding("cores", str(cores))
+    yield Finding("cores", str(cores()))
     memory = _memory_bytes()
     if memory is not None:
         low = memory < MIN_MEMORY_BYTES

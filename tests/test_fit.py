@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from sphere_views import BOX, RADIUS, directions, sphere_views, write_folder
+from sphere_views import BOX, RADIUS, directions, sphere_views
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.evaluation import compare, evaluate

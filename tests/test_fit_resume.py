@@ -12,6 +12,7 @@ from sphere_views import BOX, sphere_views, write_folder
 
 from mi_nerfattack import files
 from mi_nerfattack.capture import fit_checkpoint
+from mi_nerfattack.capture.evaluation import FieldRenderer
 from mi_nerfattack.capture.fit import FitOptions, FitResult, fit_grid, fit_ngp
 from mi_nerfattack.capture.fit_loss import LossWeights
 from mi_nerfattack.capture.frames import PosedImages
@@ -72,8 +73,12 @@ def grid(checkpoint: Path | None = None, resume: bool = False, **more) -> FitRes
     )  # fmt: skip
 
 
+def interrupt(*arguments, **more) -> None:
+    raise KeyboardInterrupt
+
+
 def stop_after(step: int, error: type[BaseException] = KeyboardInterrupt):
-    def progress(at) -> None:
+    def progress(at, *more) -> None:
         if at.step >= step:
             raise error
 
@@ -88,7 +93,6 @@ def test_resumed_fit_ends_where_the_whole_one_does(tmp_path, one_thread, fit):
         fit(path, progress=stop_after(50))
     assert path.is_file()
     result = fit(path, True)
-    assert not path.exists()
     assert result.steps == whole.steps == 100
     assert [at.step for at in result.history] == [25, 50, 75, 100]
     for name, value in whole.field.tensors().items():
@@ -127,9 +131,6 @@ def test_interrupted_command_is_resumed(tmp_path, monkeypatch, capsys):
     from mi_nerfattack.commands import bars
     from mi_nerfattack.commands.fit import Fit
 
-    def interrupt(self, *state):
-        raise KeyboardInterrupt
-
     folder = files.make_folder(tmp_path / "views")
     write_folder(folder, None)
     output = tmp_path / "field.safetensors"
@@ -156,6 +157,66 @@ def test_interrupted_command_is_resumed(tmp_path, monkeypatch, capsys):
 def test_fit_without_progress_ends_early():
     result = ngp(changes={"steps": 5000, "patience": 50, "learning_rate": 1e-6})
     assert 100 <= result.steps <= 150
+
+
+def test_fit_interrupted_at_once_is_resumed(tmp_path, monkeypatch):
+    from mi_nerfattack.capture.fit_training import Training
+
+    path = tmp_path / "fit.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "do_step", stop_after(0))
+        with pytest.raises(KeyboardInterrupt):
+            ngp(path)
+    assert ngp(path, True).steps == 100
+
+
+def test_fit_interrupted_while_it_is_scored_is_resumed(tmp_path, monkeypatch):
+    from mi_nerfattack.capture import fit as module
+
+    path = tmp_path / "fit.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "evaluate", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            ngp(path)
+    reports = []
+    result = ngp(path, True, progress=reports.append)
+    assert result.steps == 100 and not reports
+    assert np.isfinite(result.psnr_heldout_db)
+
+
+def test_other_depth_is_refused(tmp_path):
+    images, depth = sphere_views(8, alpha=False)
+    path = tmp_path / "fit.safetensors"
+    arguments = (*BOX, TINY_NGP, options())
+    with pytest.raises(KeyboardInterrupt):
+        fit_ngp(images, *arguments, depth, checkpoint=path, progress=stop_after(25))
+    with pytest.raises(InputError, match=r"fit\.safetensors: fit is"):
+        fit_ngp(images, *arguments, depth * 1.001, checkpoint=path, resume=True)
+
+
+def test_room_without_a_sky_becomes_solid():
+    images, _ = sphere_views(16, alpha=False)
+    # looking inwards at the sphere, the grey behind it must become a wall
+    settings = options(sky=False, steps=200)
+    result = fit_ngp(images, *BOX, TINY_NGP, settings, None, step_m=0.05, cone=0.0)
+    sky = result.field.background(mi.Vector3f(0, 0.6, 0.8)).numpy()
+    np.testing.assert_allclose(sky, 0, atol=1e-6)
+    view = FieldRenderer(result.field).render(images.camera, images.camera_to_world[0])
+    assert np.median(view.opacity[10:14, 10:14]) > 0.9
+
+
+def test_images_too_small_for_their_score_are_refused():
+    images, depth = sphere_views(8, alpha=False)
+    small = PosedImages(
+        np.ascontiguousarray(images.images[:, 7:17, 7:17]),
+        images.camera_to_world,
+        Camera(10, 10, images.camera.fx, images.camera.fy, 5, 5),
+        images.names,
+    )
+    with pytest.raises(InputError, match="images: 10 x 10 px"):
+        fit_ngp(small, *BOX, TINY_NGP, options())
+    with pytest.raises(InputError, match="depth"):
+        fit_ngp(images, *BOX, TINY_NGP, options(), 0 * np.minimum(depth, 1))
 
 
 def test_epochs_end_a_fit():
@@ -245,7 +306,7 @@ def test_poses_are_corrected():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"epochs": 0.0}, {"patience": 0}, {"camera_rate": -1.0}]
+    "wrong", [{"epochs": 0.0}, {"patience": 0}, {"camera_rate": -1.0}, {"seed": -1}]
 )
 def test_options_out_of_range(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):

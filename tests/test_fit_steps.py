@@ -27,7 +27,7 @@ from mi_nerfattack.capture.fit_samples import (
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
 from mi_nerfattack.fields.mlp import MLP, Networks
-from mi_nerfattack.render.camera import from_fov, look_at
+from mi_nerfattack.render.camera import Camera, from_fov, look_at
 from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
 
@@ -66,7 +66,7 @@ def source(
     images, _ = sphere_views(COUNT, alpha=alpha)
     corrections = CameraCorrections(COUNT, learn)
     bank = RayBank(images, np.arange(COUNT), corrections=corrections)
-    return BatchSource(bank, LossWeights(), field)
+    return BatchSource(bank, LossWeights(), field, sky=not alpha)
 
 
 def random_numbers():
@@ -204,9 +204,7 @@ def test_spread_and_its_derivative_against_all_pairs(rng):
     assert found.penalty[0] == pytest.approx(penalty(depths), rel=1e-5)
     black = dr.zeros(mi.Color3f, count)
     nothing = March.zeros(1)
-    by_depth, _ = cotangents(
-        samples, mi.Float(depths), black, nothing, nothing, found
-    )
+    by_depth, _ = cotangents(samples, mi.Float(depths), black, nothing, nothing, found)
     for k, step in enumerate(1e-5 * np.eye(count)):
         central = (penalty(depths + step) - penalty(depths - step)) / 2e-5
         assert by_depth[k] == pytest.approx(factor * central, rel=1e-4, abs=1e-6)
@@ -274,6 +272,28 @@ def test_cells_that_cameras_see():
     both = seen_cells(images, np.arange(2), low, high, shape)
     assert at(both, 5, 0, 0) and not at(both, 5, -8, 0)  # the second alone
     assert not at(both, 0.5, 9, 0)
+
+
+def test_cells_at_the_rim_of_a_distorted_image_are_seen():
+    # barrel: the border, 1 / f from the axis, shows what lies farther out
+    lens = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, k1=-0.2)
+    pose = look_at(np.zeros(3), np.array([1.0, 0, 0]))
+    images = PosedImages(
+        np.zeros((1, 16, 16, 3), np.uint8), pose[None], lens, ("ahead",)
+    )
+    low, high = np.full(3, -10.0), np.full(3, 10.0)
+    seen = seen_cells(images, np.array([0]), low, high, (200, 200, 200))
+    corner = world_rays_of(lens)[0, 0]  # right and down of the axis, at distance 1
+    x, y = 9 * corner
+    assert seen[int(10 * 19), int(10 * (10 - x)), int(10 * (10 - y))]
+
+
+def world_rays_of(camera: Camera) -> np.ndarray:
+    """Undistorted image plane positions of the first pixel, by OpenCV."""
+    cv2 = pytest.importorskip("cv2")
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    pixel = np.array([[[0.5, 0.5]]])
+    return cv2.undistortPoints(pixel, matrix, np.array(camera.distortion))
 
 
 def test_running_occupancy_finds_the_dense_half():

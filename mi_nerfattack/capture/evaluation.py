@@ -17,6 +17,7 @@ from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
 
 HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
+MIN_EDGE_PX = 11  # of the window of SSIM
 _WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
 
 

@@ -1,8 +1,8 @@
 """Fit radiance fields to posed images.
 
 Every step draws a batch of pixels, marches their rays, compares with the images in
-sRGB, and replays the march for the gradient: one kernel each whatever the number of
-samples, and no tape. The held-out images (every 8th) are never fitted to.
+sRGB, and accumulates gradients sample by sample: see `fit_points` for an NGP on a CPU,
+`fit_march` for the rest. The held-out images (every 8th) are never fitted to.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def fit_ngp(
     """Fit an NGP with a sky to images of a place.
 
     Args:
-        images: RGB, or RGBA: then a random colour lies behind each ray in place of the
-            sky, which stays black.
+        images: RGB, or RGBA: then, as with `FitOptions.sky` off, a random colour lies
+            behind each ray in place of the sky, which stays black.
         lower: corner of the field's box, metres; what lies outside becomes sky.
         upper: opposite corner, metres.
         layout: None for Instant-NGP's: 16 levels of 2^19, width 64. `NGPLayout.small()`
@@ -67,8 +67,12 @@ def fit_ngp(
         step_m: marching step; None for a thousandth of the longest edge.
         cone: growth of the step with distance.
         progress: called every 25 steps and at the end.
-        checkpoint: file that keeps the state of the fit while it runs, for `resume`.
+        checkpoint: file that keeps the state of the fit, for `resume`; it is the
+            caller's to delete once the field is saved.
         resume: continue from `checkpoint`.
+
+    Returns:
+        the field, and its scores on the held-out images.
 
     Raises:
         InputError: see `Training` and `FitCheckpoint`.
@@ -85,7 +89,7 @@ def fit_ngp(
         cone=cone,
         seed=options.seed,
     )
-    if images.images.shape[3] == 4:
+    if images.images.shape[3] == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
     return _start(training, progress, checkpoint, resume)
@@ -115,8 +119,12 @@ def fit_grid(
         options: None for the defaults.
         depth: (n, height, width), metres along the ray, infinite beside the object.
         progress: called every 25 steps and at the end.
-        checkpoint: file that keeps the state of the fit while it runs, for `resume`.
+        checkpoint: file that keeps the state of the fit, for `resume`; it is the
+            caller's to delete once the field is saved.
         resume: continue from `checkpoint`.
+
+    Returns:
+        the field, and its scores on the held-out images.
 
     Raises:
         InputError: the images have no alpha; and see `Training`, `FitCheckpoint`.
@@ -138,10 +146,7 @@ def _start(
     training: Training, progress: ProgressCallback, path: Path | None, resume: bool
 ) -> FitResult:
     checkpoint = None if path is None else FitCheckpoint(path, training, resume)
-    result = _run(training, progress, checkpoint)
-    if checkpoint is not None:
-        checkpoint.remove()
-    return result
+    return _run(training, progress, checkpoint)
 
 
 def _run(
@@ -162,8 +167,11 @@ def _run(
             progress(clock.report())
     except BaseException as error:
         if checkpoint is not None and _is_interrupt(error):
+            training.collect()
             checkpoint.save(clock.elapsed, clock.history)
         raise
+    if checkpoint is not None:
+        checkpoint.save(clock.elapsed, clock.history)  # scoring may be interrupted
     training.finish()
     scores = evaluate(training.field, training.images, training.held_out)
     poses = training.images.camera_to_world[training.fitted]
@@ -224,7 +232,12 @@ class _Clock:
     def report(self) -> FitProgress:
         """Sum up the steps since the last report."""
         total = self.training.collect()
-        rays = max(1, int(total.rays[0]))
+        rays = int(total.rays[0])
+        if rays == 0:
+            raise InputError(
+                f"samples: {self.options.samples}; no ray has room for its samples, "
+                "give a larger number or a longer marching step (step_m)"
+            )
         steps = max(1, self.training.step - self._reported)
         self._reported = self.training.step
         fraction = self.fraction()

@@ -72,15 +72,20 @@ class BatchSource:
     Args:
         bank: pixels and poses.
         weights: of the loss.
-        radiance_field: whose sky lies behind it if images have no alpha. Behind images
-            with alpha lies a random colour, another one for each ray, so that density
-            cannot hide in the background.
+        radiance_field: the field that is fitted.
+        sky: let the field's background lie behind it. Otherwise a random colour does,
+            another one for each ray, so that density cannot hide in the background.
     """
 
     def __init__(
-        self, bank: RayBank, weights: LossWeights, radiance_field: AbstractField
+        self,
+        bank: RayBank,
+        weights: LossWeights,
+        radiance_field: AbstractField,
+        sky: bool,
     ) -> None:
         self.bank, self.weights, self.field = bank, weights, radiance_field
+        self.sky = sky
 
     @property
     def learns_poses(self) -> bool:
@@ -116,8 +121,10 @@ class BatchSource:
         """
         if depth is None:
             return dr.opaque(mi.Float, dr.inf)
-        step = dr.maximum(self.field.step_m, self.field.cone * depth)
-        return dr.select(dr.isnan(depth), dr.inf, depth + _STEPS_BEHIND * step)
+        is_hit = dr.isfinite(depth)
+        known = dr.select(is_hit, depth, 0)
+        step = dr.maximum(self.field.step_m, self.field.cone * known)
+        return dr.select(is_hit, known + _STEPS_BEHIND * step, dr.inf)
 
     def compare(self, draw: Draw, primal: March, used: mi.Bool) -> tuple[Score, March]:
         """Compare a march with the images.
@@ -134,7 +141,7 @@ class BatchSource:
         """
         batch = draw.batch
         behind = draw.shade
-        if not self.bank.has_alpha:
+        if self.sky:
             behind = self.field.background(draw.rays.direction)
         rays = dr.count(used)
         share = dr.select(used, dr.rcp(mi.Float(dr.maximum(rays, 1))), 0)

@@ -37,7 +37,7 @@ class FitCheckpoint:
 
     Raises:
         InputError: the file exists and `resume` is False, cannot be read, or belongs
-            to other images, options or versions.
+            to other images, depth, options or versions.
     """
 
     def __init__(self, path: Path, training: Training, resume: bool) -> None:
@@ -45,12 +45,8 @@ class FitCheckpoint:
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
         self._header = {"format": FORMAT, **_versions(), "fit": _digest(training)}
+        check_unfinished(path, resume)
         if path.exists():
-            if not resume:
-                raise InputError(
-                    f"{path}: an unfinished fit; continue it (--resume), or delete "
-                    "the file to start again"
-                )
             self._load()
         files.check_writable(path)
         self._written = time.perf_counter()
@@ -67,15 +63,12 @@ class FitCheckpoint:
         start = time.perf_counter()
         tensors = self.training.tensors()
         rows = [astuple(replace(at, steps=at.steps or -1)) for at in history]
-        tensors["history"] = np.array(rows, np.float64).reshape(len(rows), -1)
+        shape = len(rows), len(fields(FitProgress))
+        tensors["history"] = np.array(rows, np.float64).reshape(shape)
         tensors["elapsed"] = np.array([elapsed_s])
         files.write_safetensors(self.path, tensors, self._header)
         self._written = time.perf_counter()
         self._cost_s = self._written - start
-
-    def remove(self) -> None:
-        """Delete the file: the fit is done."""
-        self.path.unlink(missing_ok=True)
 
     def _load(self) -> None:
         tensors, metadata = files.read_safetensors(self.path)
@@ -83,8 +76,8 @@ class FitCheckpoint:
             if metadata.get(key) != value:
                 raise InputError(
                     f"{self.path}: {key} is {metadata.get(key)!r}, this fit has "
-                    f"{value!r}; resume with the same images, options and versions, "
-                    "or delete the file to start again"
+                    f"{value!r}; resume with the same images, depth, options and "
+                    "versions, or delete the file to start again"
                 )
         try:
             self.training.load_tensors(tensors)
@@ -101,6 +94,20 @@ class FitCheckpoint:
             self.history.append(replace(at, step=int(at.step), steps=steps))
 
 
+def check_unfinished(path: Path, resume: bool) -> None:
+    """Raise InputError if there is a checkpoint that is not to be continued.
+
+    Args:
+        path: where the checkpoint of a fit would be.
+        resume: whether to continue from it.
+    """
+    if path.exists() and not resume:
+        raise InputError(
+            f"{path}: an unfinished fit; continue it (--resume), or delete the file "
+            "to start again"
+        )
+
+
 def _versions() -> dict[str, str]:
     return {
         "mi_nerfattack": mi_nerfattack.__version__,
@@ -111,11 +118,13 @@ def _versions() -> dict[str, str]:
 
 
 def _digest(training: Training) -> str:
-    """Hash what decides a fit: images, poses, cameras, options, architecture, box."""
+    """Hash what decides a fit: images, poses, depth, options, architecture, box."""
     digest = hashlib.sha256()
     images = training.images
     digest.update(np.ascontiguousarray(images.images).data)
     digest.update(np.ascontiguousarray(images.camera_to_world).data)
+    if training.depth is not None:
+        digest.update(np.ascontiguousarray(training.depth).data)
     digest.update(repr((images.camera, images.cameras, training.options)).encode())
     place = training.field.metadata()
     info = {key: place[key] for key in place if key not in training.field.info}

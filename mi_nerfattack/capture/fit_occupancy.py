@@ -7,8 +7,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.capture.frames import PosedImages
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.distortion import undistort
 
 _MIN_OPACITY = 0.01  # of a step; cells that reach less are empty
 _FADING = 0.8  # share of the density of a cell that survives a visit
@@ -94,11 +97,11 @@ class RunningOccupancy:
             bits: (bytes,), packed cells of the field's occupancy.
 
         Raises:
-            KeyError: the state is that of another grid.
+            InputError: the state is that of another grid.
         """
         size = self.allowed.size
         if density.shape != self.density.shape or bits.size != (size + 7) // 8:
-            raise KeyError("density or cells of this size")
+            raise InputError("checkpoint: its occupancy is that of another grid")
         self.density = density.astype(np.float32)
         cells = np.unpackbits(bits, count=size).astype(bool)
         cells = cells.reshape(self.allowed.shape)
@@ -135,11 +138,12 @@ def seen_cells(
         low + (np.arange(n) + 0.5) / n * (high - low)
         for n, low, high in zip(coarse, lower, upper, strict=True)
     ]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = np.meshgrid(*axes, indexing="ij")
+    points = np.stack(grid, axis=-1).reshape(-1, 3).astype(np.float32)
     radius = 0.5 * float(np.linalg.norm((upper - lower) / coarse))
     count = np.zeros(len(points), np.int32)
     for index in indices:
-        count += _in_view(images, int(index), points.astype(np.float32), radius)
+        count += _in_view(images, int(index), points, radius)
     seen = (count >= min(cameras, len(indices))).reshape(coarse)
     for axis in range(3):
         seen = np.repeat(seen, _COARSE, axis)
@@ -153,15 +157,24 @@ def _in_view(
     camera, pose = images.camera_of(index), images.camera_to_world[index]
     offset = points - pose[:3, 3].astype(np.float32)
     x, y, z = (offset @ pose[:3, :3].astype(np.float32)).T
-    left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
-    top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
+    left, right, top, bottom = _edges(camera)
     room = 1 + 2 * _BORDER
     near = z > -radius
     depth = np.maximum(z, 0)
     return (
         near
-        & (x > -room * left * depth - 2 * radius)
+        & (x > room * left * depth - 2 * radius)
         & (x < room * right * depth + 2 * radius)
-        & (y > -room * top * depth - 2 * radius)
+        & (y > room * top * depth - 2 * radius)
         & (y < room * bottom * depth + 2 * radius)
     )
+
+
+def _edges(camera: Camera) -> tuple[float, float, float, float]:
+    """Return the least and largest x, then y, that the image shows at distance 1."""
+    across = (np.linspace(0, camera.width, 33) - camera.cx) / camera.fx
+    down = (np.linspace(0, camera.height, 33) - camera.cy) / camera.fy
+    x, y = np.meshgrid(across, down)
+    if camera.is_distorted:
+        x, y = undistort(x, y, *camera.distortion)
+    return float(x.min()), float(x.max()), float(y.min()), float(y.max())

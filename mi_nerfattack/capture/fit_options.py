@@ -38,6 +38,8 @@ class FitOptions:
         occupancy_every: steps between two looks at some cells; every fourth changes
             the occupancy.
         occupancy_start: steps before the first one.
+        sky: of an NGP and images without alpha, learn light from behind the box, by
+            direction; otherwise a random colour lies behind each ray, as with objects.
         exposure: learn the exposure of each image.
         poses: learn corrections of the cameras' poses.
         camera_rate: learning rate of these, as a share of the field's.
@@ -56,6 +58,7 @@ class FitOptions:
     occupancy_resolution: int = 128
     occupancy_every: int = 16
     occupancy_start: int = 128
+    sky: bool = True
     exposure: bool = False
     poses: bool = False
     camera_rate: float = 0.02
@@ -74,6 +77,13 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"{name}: {value}; must be at least 1")
+        if self.seed < 0 or self.occupancy_start < 0:
+            raise InputError(
+                f"seed, occupancy_start: {self.seed}, {self.occupancy_start}; must "
+                "not be negative"
+            )
+        if not 0 < self.final_rate <= 1:
+            raise InputError(f"final_rate: {self.final_rate}; must be in (0, 1]")
         for name in ("epochs", "budget_minutes", "camera_rate"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

@@ -40,6 +40,9 @@ class PointStep:
     networks are products of matrices between launches of fixed width: no step takes
     another kernel than the first.
 
+    Where poses are learned, the dependence of colours and of the sky on direction is
+    left out of their derivative.
+
     Args:
         field: the NGP, at the identity pose.
         source: of rays, and of the loss.

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.capture.evaluation import MIN_EDGE_PX
 from mi_nerfattack.capture.fit_batch import BatchSource, Score
 from mi_nerfattack.capture.fit_cameras import EXPOSURE, POSES, CameraCorrections
 from mi_nerfattack.capture.fit_cells import (
@@ -38,7 +39,7 @@ class Training:
         radiance_field: is changed in place.
         images: posed images; every 8th is held out.
         options: of the fit.
-        depth: (n, height, width), metres along the ray, or None.
+        depth: (n, height, width), metres along the ray, NaN where unknown, or None.
         box_only: draw only rays that meet the field's box, as for an object.
 
     Attributes:
@@ -47,8 +48,8 @@ class Training:
         limit: rays of the next step.
 
     Raises:
-        InputError: too few images, a box that no image or depth reaches, or exposure
-            together with alpha.
+        InputError: too few or too small images, depth that is not positive, a box that
+            no image or depth reaches, or an option that has no use for this fit.
     """
 
     def __init__(
@@ -60,10 +61,18 @@ class Training:
         box_only: bool = False,
     ) -> None:
         self.field, self.images, self.options = radiance_field, images, options
+        self.depth = depth
         self.held_out = held_out(len(images))
         self.fitted = np.setdiff1d(np.arange(len(images)), self.held_out)
         if len(self.fitted) == 0:
             raise InputError(f"images: {len(images)}; at least 2 are needed for a fit")
+        if min(images.camera.width, images.camera.height) < MIN_EDGE_PX:
+            raise InputError(
+                f"images: {images.camera.width} x {images.camera.height} px; SSIM "
+                f"takes at least {MIN_EDGE_PX} px each way"
+            )
+        if depth is not None and (depth <= 0).any():
+            raise InputError("depth: holds values of 0 or less; NaN says unknown")
         if options.exposure and images.images.shape[3] == 4:
             raise InputError("exposure: needs images without alpha, as of a camera")
         learn = [EXPOSURE] * options.exposure + [POSES] * options.poses
@@ -74,7 +83,8 @@ class Training:
         self.occupancy = RunningOccupancy(
             radiance_field, self._allowed(depth), options.seed
         )
-        source = BatchSource(bank, options.loss, radiance_field)
+        sky = options.sky and not bank.has_alpha
+        source = BatchSource(bank, options.loss, radiance_field, sky)
         self._march: MarchStep | PointStep = MarchStep(radiance_field, source)
         if isinstance(radiance_field, NGPField) and radiance_field.collects_points:
             room = options.samples
@@ -130,7 +140,7 @@ class Training:
             self.field.set_parameter(name, values[name])
 
     def do_step(self, rate: float) -> None:
-        """Draw rays, accumulate gradients and update; nothing is waited for.
+        """Draw rays, accumulate gradients and update.
 
         Args:
             rate: learning rate of the field; that of the cameras is a share of it.
@@ -181,7 +191,7 @@ class Training:
         It keeps the occupancy of the last steps: density in other cells has had no
         part in what was compared.
         """
-        self._install({k: dr.detach(v) for k, v in self.optimiser.items()})
+        self._install({k: dr.detach(self.optimiser[k]) for k in self._values()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
 

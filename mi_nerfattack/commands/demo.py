@@ -48,6 +48,10 @@ class Demo:
         files.make_folder(output.parent)
         field = output.parent / f"{output.name}-object.safetensors"
         Asset(
-            self.object, field, height_m=self.height_m, resolution=self.resolution
+            str(self.object),
+            field,
+            height_m=self.height_m,
+            resolution=self.resolution,
+            resume=True,  # of a demo that was interrupted
         ).run()
         return field

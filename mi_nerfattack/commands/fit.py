@@ -12,6 +12,8 @@ import tyro
 from mi_nerfattack.commands.compare_report import CompareArguments
 
 if TYPE_CHECKING:
+    from mi_nerfattack.capture.fit_options import FitOptions
+    from mi_nerfattack.capture.posed import PosedImages
     from mi_nerfattack.fields.ngp import NGPLayout
 
 
@@ -65,6 +67,8 @@ class Fit:
     """Marching step near the camera; a thousandth of the longest edge by default."""
     occupancy: int | None = None
     """Cells of the occupancy along the longest edge; 256 with depth, else 128."""
+    no_sky: bool = False
+    """Let no light come from behind the box, as in a room: every ray must end in it."""
     spread: float = 0.0
     """Weight of a penalty on fog, e.g. 0.003."""
     seed: int = 0
@@ -85,12 +89,40 @@ class Fit:
         given = {name: getattr(self, name) for name in names}
         return replace(base, **{k: v for k, v in given.items() if v is not None})
 
+    def _options(self, has_depth: bool) -> FitOptions:
+        from mi_nerfattack.capture.fit_loss import LossWeights
+        from mi_nerfattack.capture.fit_options import FitOptions
+
+        cells = 256 if has_depth else 128
+        return FitOptions(
+            steps=self.steps,
+            epochs=self.epochs,
+            patience=self.patience,
+            exposure=self.exposure,
+            poses=self.refine_poses,
+            sky=not self.no_sky,
+            budget_minutes=self.budget_minutes,
+            batch_rays=self.batch_rays,
+            seed=self.seed,
+            loss=LossWeights(spread=self.spread),
+            occupancy_resolution=cells if self.occupancy is None else self.occupancy,
+        )
+
+    def _provenance(self, images: PosedImages) -> dict[str, str]:
+        names = ("seed", "network", "budget_minutes", "exposure", "refine_poses")
+        return {
+            "source": self.folder.resolve().name,
+            "source_unit": images.unit,
+            "size_px": f"{images.camera.width} x {images.camera.height}",
+            **{name: str(getattr(self, name)) for name in (*names, "spread", "no_sky")},
+        }
+
     def run(self) -> int:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.fit import FitOptions, fit_ngp
+        from mi_nerfattack.capture.fit import fit_ngp
+        from mi_nerfattack.capture.fit_checkpoint import check_unfinished
         from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
-        from mi_nerfattack.capture.fit_loss import LossWeights
         from mi_nerfattack.capture.frames import read_images
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.compare_report import compare_file
@@ -100,51 +132,35 @@ class Fit:
         variant.ensure()
         self.against.check()
         if self.folder.suffix == ".safetensors":
+            if self.output is not None:
+                raise InputError(
+                    f"--output: {self.output}; {self.folder} is a field already, which "
+                    "is only compared (--compare), leave --output out"
+                )
             compare_file(self.folder, self.against, self.json)
             return 0
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
         check_output(self.output)
+        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
+        check_unfinished(checkpoint, self.resume)
         images = read_images(self.folder, self.long_edge, self.skip_missing)
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
-        options = FitOptions(
-            steps=self.steps,
-            epochs=self.epochs,
-            patience=self.patience,
-            exposure=self.exposure,
-            poses=self.refine_poses,
-            budget_minutes=self.budget_minutes,
-            batch_rays=self.batch_rays,
-            seed=self.seed,
-            loss=LossWeights(spread=self.spread),
-            occupancy_resolution=self.occupancy or (128 if depth is None else 256),
-        )
-        layout = self._layout()
-        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
         with StageBars() as bars:
             result = fit_ngp(
                 images,
                 lower,
                 upper,
-                layout,
-                options,
+                self._layout(),
+                self._options(depth is not None),
                 depth,
                 step_m=self.step_m,
                 progress=partial(show_fit, bars),
                 checkpoint=checkpoint,
                 resume=self.resume,
             )
-        provenance = {
-            "source": self.folder.name,
-            "source_unit": images.unit,
-            "size_px": f"{images.camera.width} x {images.camera.height}",
-            "seed": str(self.seed),
-            "network": self.network,
-            "budget_minutes": str(self.budget_minutes),
-            "exposure": str(self.exposure),
-            "refine_poses": str(self.refine_poses),
-            "spread": str(self.spread),
-        }
+        provenance = self._provenance(images)
         finish(result, images, self.output, provenance, self.json, depth, self.against)
+        checkpoint.unlink(missing_ok=True)
         return 0

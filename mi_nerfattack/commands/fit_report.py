@@ -85,6 +85,8 @@ def finish(
         {f"fit.{key}": value for key, value in provenance.items()}
         | {
             "fit.steps": str(result.steps),
+            "fit.held_out": "every 8th image, from the first",
+            "fit.frame": "that of the poses, right-handed",
             "fit.psnr_heldout_db": f"{result.psnr_heldout_db:.3f}",
             "fit.ssim_heldout": f"{result.ssim_heldout:.4f}",
         }
@@ -123,6 +125,7 @@ def write_cameras(path: Path, result: FitResult, images: PosedImages) -> None:
     from mi_nerfattack.render.conventions import opencv_to_opengl
 
     if result.exposure is None and result.poses is None:
+        path.unlink(missing_ok=True)  # of an earlier fit
         return
     skipped = set(held_out(len(images)).tolist())
     names = [name for i, name in enumerate(images.names) if i not in skipped]

@@ -225,12 +225,12 @@ class GridField(AbstractField):
         return {
             **self.info,
             **{k: str(v) for k, v in asdict(self.layout).items()},
-            **box_metadata(self),
+            **box_metadata(self, self.info),
             "density_scale": repr(self.density_scale),
         }
 
 
-def box_metadata(field: AbstractField) -> dict[str, str]:
+def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
     """Return the header entries that every kind of field file shares."""
     return {
         "kind": field.kind,
@@ -239,7 +239,7 @@ def box_metadata(field: AbstractField) -> dict[str, str]:
         "occupancy_shape": " ".join(str(n) for n in field.occupancy.shape),
         "step_m": repr(field.step_m),
         "cone": repr(field.cone),
-        "length_unit": "metre",
+        "length_unit": info.get("fit.source_unit", "metre"),
         "colour_space": "radiance = srgb_to_linear(sigmoid(raw)), linear Rec. 709",
     }
 

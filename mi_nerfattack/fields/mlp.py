@@ -8,7 +8,6 @@ these (BLAS) is two to three times faster than Dr.Jit's.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
+
+from mi_nerfattack.cores import cores
 
 BLOCK = 1 << 12  # points whose activations exist side by side, in a cache
 
@@ -137,7 +138,7 @@ def _each(work: Callable[[slice], Any], count: int) -> list[Any]:
     """Do work on blocks of rows, and return the results in order."""
     parts = (slice(s, min(s + BLOCK, count)) for s in range(0, count, BLOCK))
     if not _WORKERS:
-        pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
+        pool = ThreadPoolExecutor(cores())
         _WORKERS.append((pool, ThreadpoolController()))
     pool, libraries = _WORKERS[0]
     # products this small are faster side by side than each on several threads

@@ -300,7 +300,7 @@ class NGPField(AbstractField):
         return {
             **self.info,
             **{k: str(v) for k, v in asdict(self.layout).items()},
-            **box_metadata(self),
+            **box_metadata(self, self.info),
         }
 
     @property
