@@ -103,10 +103,15 @@ class TestTransforms:
 
     def test_missing_image(self, folder):
         (folder / "images" / "0001.png").unlink()
-        with pytest.raises(InputError, match="1 of 3 frames.*0001.png"):
+        with pytest.raises(
+            InputError, match=r"1 of 3 frames.*0001.png.*--skip-missing"
+        ):
             read_transforms(folder)
         read = read_transforms(folder, skip_missing=True)
         assert len(read) == 2 and read.missing == ("images/0001.png",)
+        edited(folder, lambda t: t["frames"][2].update(h=8.5))  # its index in the file
+        with pytest.raises(InputError, match=r"frames\[2\]: h: 8.5"):
+            read_transforms(folder, skip_missing=True)
 
     def test_damaged_image(self, folder):
         (folder / "images" / "0001.png").write_bytes(b"\x89PNG\r\n\x1a\n garbage")
@@ -115,7 +120,9 @@ class TestTransforms:
 
     def test_mixed_sizes(self, folder):
         files.write_image(folder / "images/0002.png", np.zeros((8, 10, 3), np.uint8))
-        with pytest.raises(InputError, match="0002.png: 10 x 8 px, but .*0000.png has 12 x 8 px"):
+        with pytest.raises(
+            InputError, match="0002.png: 10 x 8 px, but .*0000.png has 12 x 8 px"
+        ):
             read_transforms(folder)
 
     @pytest.mark.parametrize(
@@ -126,9 +133,19 @@ class TestTransforms:
             (lambda t: t.update(fl_x=-3.0), "fl_x, fl_y"),
             (lambda t: t.update(k3=0.1), "k3"),
             (lambda t: t.update(camera_model="OPENCV_FISHEYE"), "camera_model"),
+            (lambda t: t.update(camera_model=[]), r"camera_model: \[\]"),
+            (
+                lambda t: t["frames"][1].update(camera_model={}),
+                r"frames\[1\]: camera_model: \{\}",
+            ),
+            (lambda t: t["frames"][2].update(k1=-50.0), r"frames\[2\]: .*k1"),
+            (lambda t: t["frames"][1].update(cx="a"), r"frames\[1\]: cx: 'a'"),
             (lambda t: t.update(k1=-50.0), "k1"),
-            (lambda t: t["frames"][1].update(fl_x=0.0), "fl_x, fl_y: 0.0"),
-            (lambda t: t["frames"][1].update(h=8.5), "h: 8.5"),
+            (
+                lambda t: t["frames"][1].update(fl_x=0.0),
+                r"frames\[1\]: fl_x, fl_y: 0.0",
+            ),
+            (lambda t: t["frames"][1].update(h=8.5), r"frames\[1\]: h: 8.5"),
             (lambda t: t.update(distortion_params=[0.1]), "distortion_params"),
             (lambda t: t.update(distortion_params=[0, 0, 0.1, 0, 0, 0]), "k3"),
             (lambda t: t.update(frames=[]), "frames"),

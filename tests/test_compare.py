@@ -14,6 +14,9 @@ from sphere_views import sphere_views
 from mi_nerfattack import files
 from mi_nerfattack.capture.compare import (
     CompareOptions,
+    Comparison,
+    RouteComparison,
+    Station,
     compare_with_scene,
     depth_errors,
     quantile,
@@ -161,6 +164,33 @@ def test_ceiling_is_the_noise_of_the_reference(tmp_path, place):
     assert route.mean("ceiling_db") < 70
 
 
+def route_of(name: str, psnr: float, ceiling: float, depth: float) -> RouteComparison:
+    at = Station(0.0, psnr, ceiling, 0.9, depth, depth, 0.0, 0.0)
+    return RouteComparison(name, 10.0, (at,), depth, depth, depth, depth, 0.5, ())
+
+
+@pytest.mark.parametrize(
+    ("routes", "noise", "views"),
+    [
+        # a noise of 26 dB alone: without it the field has 29 dB
+        ([("a", 24.2, 26.0, 0.05)], True, False),
+        # noisy too, but the field would have 20.6 dB without
+        ([("a", 20.0, 29.0, 0.05)], False, True),
+        # the noise is that of a route that is good enough
+        ([("a", 20.0, 45.0, 0.05), ("b", 27.0, 30.0, 0.05)], False, True),
+        # depth has no noise
+        ([("a", 28.0, 30.0, 0.5)], False, True),
+        ([("a", 24.2, 26.0, 0.05), ("b", 20.0, 45.0, 0.05)], True, True),
+    ],
+)
+def test_advice_is_for_what_is_wrong(routes, noise, views):
+    compared = tuple(route_of(*route) for route in routes)
+    text = verdict(Comparison(compared, OPTIONS, 1.0))
+    assert "Not close enough on a" in text
+    assert ("more samples per pixel" in text) == noise
+    assert ("Capture more views" in text) == views
+
+
 def test_depth_errors_of_known_rays():
     shown = np.array([[1.0, np.inf], [9.0, 30.0]])
     depth = np.array([[1.5, 2.0], [10.0, np.inf]])
@@ -239,7 +269,7 @@ def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
     saved = load_field(output)
     assert isinstance(saved, GridField) and saved.info["fit.source"] == "x"
     finish(result, images, output, {}, False)
-    assert "good enough to test a policy in" in capsys.readouterr().out
+    assert "good enough as an object to attack" in capsys.readouterr().out
     assert (tmp_path / "wall.report" / "report.html").is_file()
 
 
@@ -257,5 +287,9 @@ def test_command_compares_a_field_file(place, tmp_path, capsys):
     line = capsys.readouterr().out.splitlines()[-1]
     assert json.loads(line)["compare"]["routes"]["ahead"]["frames"] == 5
     assert (tmp_path / "wall.compare" / "report.html").is_file()
+    for raw, kind in ((b"PK\3\4", "a zip archive"), (b"\x80\4\x95", "a pickle")):
+        path.write_bytes(raw + bytes(100))
+        assert main(["fit", str(path), *arguments, *small]) == 2
+        assert f"wall.safetensors: is {kind}" in capsys.readouterr().err
     assert main(["fit", str(tmp_path)]) == 2
     assert "--output" in capsys.readouterr().err

@@ -34,6 +34,10 @@ pytestmark = pytest.mark.usefixtures("variant")
 WALL_M = 2.5  # along the optical axis of every camera
 CAMERA = Camera(12, 8, 10.0, 11.0, 6.5, 3.75, k1=0.05, k2=-0.01, p1=1e-3, p2=2e-3)
 PINHOLE = Camera(12, 8, 10.0, 11.0, 6.5, 3.75)
+FOREIGN = [
+    (b"PK\3\4" + bytes(100), "zip archive"),
+    (b"\x80\4\x95" + bytes(100), "pickle"),
+]
 
 
 def write_depth_folder(folder: Path, camera: Camera, size=(8, 12)) -> Path:
@@ -116,6 +120,18 @@ def test_depth_that_cannot_be_read(tmp_path, name, message):
     edit(source, lambda f, i: f.update(depth_file_path=name))
     with pytest.raises(InputError, match=message):
         read_depth(source, read_images(source))
+
+
+@pytest.mark.parametrize(("raw", "kind"), FOREIGN)
+@pytest.mark.parametrize("key", ["depth_file", "points_file"])
+def test_archives_and_pickles_are_not_opened(tmp_path, raw, kind, key):
+    source = write_depth_folder(tmp_path, PINHOLE)
+    (tmp_path / "a.safetensors").write_bytes(raw)
+    images = read_images(source)
+    table = json.loads(source.read_text()) | {key: "a.safetensors"}
+    source.write_text(json.dumps(table))
+    with pytest.raises(InputError, match=f"a.safetensors: is a {kind}"):
+        read_depth(source, images) if key == "depth_file" else read_images(source)
 
 
 def test_images_of_another_folder(tmp_path):

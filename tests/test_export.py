@@ -132,6 +132,20 @@ class TestPaintedMesh:
         assert area == pytest.approx(source.area)
         assert error_of(mesh).mean() < 0.02 and error_of(mesh).max() < 0.08
 
+    @pytest.mark.parametrize("scale", [0.5, 0.9, 1.1])
+    def test_another_size(self, scale):
+        """As with --longest-m forgotten: smaller than the object, or larger."""
+        source = self.cube()
+        corners = zip(("lower", "upper"), source.bounds, strict=True)
+        info = {
+            f"provenance.object_{name}": " ".join(map(str, corner))
+            for name, corner in corners
+        }
+        field = solid_field(block, info=info)
+        assert len(painted_mesh(field, source).faces) > 100
+        with pytest.raises(InputError, match=r"block: reaches from .* object from"):
+            painted_mesh(field, source.transformed(scale, np.zeros(3)))
+
     def test_another_mesh(self):
         moved = self.cube().transformed(1.0, np.array([3.0, 0, 0]))
         with pytest.raises(InputError, match="block: reaches from"):

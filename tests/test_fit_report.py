@@ -22,9 +22,9 @@ from mi_nerfattack.capture.fit_options import FitProgress, FitResult
 from mi_nerfattack.capture.frames import PosedImages, held_out
 from mi_nerfattack.colour import linear_to_srgb_numpy
 from mi_nerfattack.render.camera import from_fov, look_at
-from mi_nerfattack.report.fit_page import summary, write_fit_report
+from mi_nerfattack.report.fit_page import judge_fit, summary, write_fit_report
 from mi_nerfattack.report.fit_plots import running_mean
-from mi_nerfattack.report.verdict import judge, pooled_db, verdict
+from mi_nerfattack.report.verdict import OBJECT, judge, pooled_db, verdict
 from mi_nerfattack.report.view_pictures import abs_difference
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -163,6 +163,7 @@ def test_report_of_an_ngp_without_depth(tmp_path):
     page = write_fit_report(tmp_path, result, images, None, "ngp")
     text = files.read_text(page)
     assert "there is no depth to compare with" in text
+    assert "good enough to test a policy in" in text
     assert mi.variant() == "llvm_ad_rgb"
     assert images.camera.width == SIZE
 
@@ -191,6 +192,17 @@ def test_verdict_names_what_is_not_met(psnr, fitted, hazy, failed):
     text = verdict(criteria)
     assert text.startswith("Not good enough" if failed else "Good enough")
     assert all(name in text for name in names)
+
+
+def test_an_object_is_judged_as_one():
+    """No poses to refine, no images to take: a grid comes from renders."""
+    result = a_result(solid_box()[0], grey_views([20] * 9))
+    text = verdict(judge_fit(result))
+    assert text.startswith("Not good enough as an object to attack: held-out views")
+    assert "--views" in text and "--resolution 128" in text
+    assert "policy" not in text and "pose" not in text
+    good = verdict(judge(scores_of([30.0] * 3), 31.0, OBJECT))
+    assert good.startswith("Good enough as an object to attack")
 
 
 def test_pooled_psnr_averages_squared_errors():

@@ -236,6 +236,13 @@ def test_pose_refuses_other_matrices(block: np.ndarray, message: str) -> None:
         Pose.from_matrix(matrix)
 
 
+def test_pose_refuses_a_transposed_matrix() -> None:
+    matrix = np.eye(4)
+    matrix[:3, 3] = [1, 2, 3]
+    with pytest.raises(ValueError, match=r"last row \[1.0, 2.0, 3.0, 1.0\]; must be"):
+        Pose.from_matrix(matrix.T)
+
+
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.inf, np.nan])
 def test_pose_refuses_other_scales(scale: float) -> None:
     with pytest.raises(ValueError, match="scale: .*must be positive and finite"):

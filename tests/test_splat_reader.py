@@ -90,7 +90,8 @@ BAD_VALUES = {
     "x of vertex 3 is nan": ("x", np.nan),
     "f_rest_5 of vertex 3 is inf": ("f_rest_5", np.inf),
     "opacity of vertex 3 is -inf": ("opacity", -np.inf),
-    "scale_1 of vertex 3 is 40; allowed is at most 15": ("scale_1", 40.0),
+    "scale_1 of vertex 3 is 40; allowed is -60 to 15": ("scale_1", 40.0),
+    "scale_2 of vertex 3 is -90; allowed is -60 to 15": ("scale_2", -90.0),
 }
 
 

@@ -96,7 +96,7 @@ def read_colmap(
         raise InputError(
             f"{where}: {len(missing)} of {len(records)} images are missing, first "
             f"{missing[0]!r} in {next(iter(found.values())).parent}; restore them or "
-            "leave them out (skip_missing)"
+            "leave them out (--skip-missing, or skip_missing=True)"
         )
     used = [record for record in records if record.name in found]
     images, reduced = load_images(

@@ -19,7 +19,8 @@ from mi_nerfattack.render.posed import PosedField
 
 _LONGEST_PX = 256
 _MAX_PX = 8192
-_INFO = ("provenance.object_lower", "provenance.object_upper")
+OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
+"""Header entries of the box of the object that a field was fitted to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ def object_box(field: GridField) -> tuple[np.ndarray, np.ndarray]:
     It stands in the header of fields that `asset` made; for others it is the field's.
     """
     corners = []
-    for name, default in zip(_INFO, (field.lower, field.upper), strict=True):
+    for name, default in zip(OBJECT_BOX, (field.lower, field.upper), strict=True):
         try:
             corner = np.array(field.info[name].split(), np.float64)
         except KeyError:
@@ -56,7 +57,7 @@ def object_box(field: GridField) -> tuple[np.ndarray, np.ndarray]:
     lower, upper = corners
     if lower.shape != (3,) or upper.shape != (3,) or not np.all(lower < upper):
         raise InputError(
-            f"header entries {', '.join(_INFO)}: {lower} to {upper}; no box"
+            f"header entries {', '.join(OBJECT_BOX)}: {lower} to {upper}; no box"
         )
     return lower, upper
 

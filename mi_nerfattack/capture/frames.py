@@ -128,15 +128,15 @@ def read_transforms(
         raise InputError(
             f"{source}: {len(missing)} of {len(frames)} frames have no image, first "
             f"{missing[0]!r}; restore the files or leave these frames out "
-            "(skip_missing)"
+            "(--skip-missing, or skip_missing=True)"
         )
     poses = np.stack([read_pose(source, i, frames[i]) for i, _ in found])
     first = files.read_image(found[0][1])
-    used = [frames[i] for i, _ in found]
+    used = {i: frames[i] for i, _ in found}
     cameras = read_cameras(source, table, used, first.shape)
     paths = [image for _, image in found]
     images, cameras = load_images(paths, cameras, source, long_edge_px)
-    names = tuple(str(frame["file_path"]) for frame in used)
+    names = tuple(str(frame["file_path"]) for frame in used.values())
     return PosedImages(
         images,
         poses,

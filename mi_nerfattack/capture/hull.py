@@ -122,9 +122,9 @@ def _inside(
         column, row, valid = _project(local, camera)
         seen[alive[valid]] += 1
         pixels = max(camera.fx, camera.fy) / factor * radius / local[valid, 2]
-        place = row[valid] // factor, column[valid] // factor
+        at = row[valid] // factor, column[valid] // factor
         outside = np.zeros(len(alive), bool)
-        outside[valid] = ~_touches(mask, *place, pixels)
+        outside[valid] = ~_touches(mask, *at, pixels)
         alive = alive[~outside]
     alive = alive[seen[alive] >= _SEEN_BY * len(chosen)]
     inside = np.zeros(len(points), bool)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,14 @@ from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.conventions import COLMAP_MODELS
 
 _NUMBERS = "w h fl_x fl_y cx cy camera_angle_x camera_angle_y k1 k2 p1 p2 k3 k4".split()
+_KEYS = (*_NUMBERS, "camera_model", "is_fisheye", "distortion_params")
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order, distortion_params
 
 
 def read_cameras(
     source: Path,
     table: Mapping[str, Any],
-    frames: Sequence[Mapping[str, Any]],
+    frames: Mapping[int, Mapping[str, Any]],
     image_shape: tuple[int, ...],
 ) -> tuple[Camera, ...]:
     """Build the cameras of all frames.
@@ -29,7 +30,7 @@ def read_cameras(
     Args:
         source: the JSON file, for messages.
         table: its content; a key in a frame takes precedence over the top level.
-        frames: the frames in use.
+        frames: those in use, in order, by their index in the file.
         image_shape: (height, width, ...) of the first image, for frames without size.
 
     Returns:
@@ -41,55 +42,58 @@ def read_cameras(
     """
     known: dict[tuple[float | None, ...], Camera] = {}
     cameras = []
-    for frame in frames:
+    for index, frame in frames.items():
+        is_own = any(key in frame for key in _KEYS)
+        where = f"{source}: frames[{index}]" if is_own else str(source)
         merged = {**table, **frame}
-        _check_model(source, merged)
-        values = _numbers(source, merged)
+        _check_model(where, merged)
+        values = _numbers(where, merged)
         if not cameras:
-            _check_first_size(source, values, image_shape)
+            _check_first_size(where, values, image_shape)
         key = tuple(values.values())
         if key not in known:
-            known[key] = _camera(source, values, image_shape)
+            known[key] = _camera(where, values, image_shape)
         cameras.append(known[key])
     return tuple(cameras)
 
 
-def _check_model(source: Path, merged: Mapping[str, Any]) -> None:
+def _check_model(where: str, merged: Mapping[str, Any]) -> None:
     model = merged.get("camera_model", "OPENCV")
-    if model not in COLMAP_MODELS or merged.get("is_fisheye"):
+    is_known = isinstance(model, str) and model in COLMAP_MODELS
+    if not is_known or merged.get("is_fisheye"):
         raise InputError(
-            f"{source}: camera_model: {model!r}, is_fisheye: "
+            f"{where}: camera_model: {model!r}, is_fisheye: "
             f"{merged.get('is_fisheye', False)!r}; only {', '.join(COLMAP_MODELS)} "
             "can be read; undistort the images first"
         )
 
 
-def _numbers(source: Path, merged: Mapping[str, Any]) -> dict[str, float | None]:
-    values = {key: _number(source, key, merged.get(key)) for key in _NUMBERS}
+def _numbers(where: str, merged: Mapping[str, Any]) -> dict[str, float | None]:
+    values = {key: _number(where, key, merged.get(key)) for key in _NUMBERS}
     lens = merged.get("distortion_params")
     if lens is not None:
         if not isinstance(lens, list) or len(lens) != len(_LENS):
             raise InputError(
-                f"{source}: distortion_params: {lens!r}; must be six numbers, "
+                f"{where}: distortion_params: {lens!r}; must be six numbers, "
                 f"{', '.join(_LENS)}"
             )
         for key, value in zip(_LENS, lens, strict=True):
-            values[key] = _number(source, f"distortion_params, {key}", value)
+            values[key] = _number(where, f"distortion_params, {key}", value)
     for key in ("k3", "k4"):
         if values[key]:
             raise InputError(
-                f"{source}: {key}: {values[key]}; only k1, k2, p1, p2 are supported; "
+                f"{where}: {key}: {values[key]}; only k1, k2, p1, p2 are supported; "
                 "calibrate with four coefficients or undistort the images"
             )
     return values
 
 
 def _camera(
-    source: Path, values: Mapping[str, float | None], image_shape: tuple[int, ...]
+    where: str, values: Mapping[str, float | None], image_shape: tuple[int, ...]
 ) -> Camera:
-    width = _size(source, "w", values["w"], image_shape[1])
-    height = _size(source, "h", values["h"], image_shape[0])
-    fl_x, fl_y = _focal_lengths(source, values, width, height)
+    width = _size(where, "w", values["w"], image_shape[1])
+    height = _size(where, "h", values["h"], image_shape[0])
+    fl_x, fl_y = _focal_lengths(where, values, width, height)
     try:
         return Camera(
             width,
@@ -101,16 +105,16 @@ def _camera(
             *(_or(values[key], 0.0) for key in ("k1", "k2", "p1", "p2")),
         )
     except InputError as error:
-        raise InputError(f"{source}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
 
 
 def _check_first_size(
-    source: Path, values: Mapping[str, float | None], shape: tuple[int, ...]
+    where: str, values: Mapping[str, float | None], shape: tuple[int, ...]
 ) -> None:
     size = _or(values["w"], shape[1]), _or(values["h"], shape[0])
     if size != (shape[1], shape[0]):
         raise InputError(
-            f"{source}: w, h: {size[0]:g} x {size[1]:g}, but the first image has "
+            f"{where}: w, h: {size[0]:g} x {size[1]:g}, but the first image has "
             f"{shape[1]} x {shape[0]} px; give the images that were calibrated, or "
             "scale the intrinsics"
         )
@@ -120,26 +124,26 @@ def _or(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-def _size(source: Path, key: str, value: float | None, default: int) -> int:
+def _size(where: str, key: str, value: float | None, default: int) -> int:
     if value is None:
         return default
     if value < 1 or value != int(value):
-        raise InputError(f"{source}: {key}: {value:g}; must be a whole number of px")
+        raise InputError(f"{where}: {key}: {value:g}; must be a whole number of px")
     return int(value)
 
 
-def _number(source: Path, key: str, value: Any) -> float | None:
+def _number(where: str, key: str, value: Any) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{source}: {key}: {value!r}; must be a number")
+        raise InputError(f"{where}: {key}: {value!r}; must be a number")
     if not math.isfinite(value):
-        raise InputError(f"{source}: {key}: {value}; must be finite")
+        raise InputError(f"{where}: {key}: {value}; must be finite")
     return float(value)
 
 
 def _focal_lengths(
-    source: Path, values: Mapping[str, float | None], width: int, height: int
+    where: str, values: Mapping[str, float | None], width: int, height: int
 ) -> tuple[float, float]:
     def focal(axis: str, size: int) -> float | None:
         angle = values[f"camera_angle_{axis}"]
@@ -147,16 +151,16 @@ def _focal_lengths(
             return values[f"fl_{axis}"]
         if not 0 < angle < math.pi:
             raise InputError(
-                f"{source}: camera_angle_{axis}: {angle}; must be in (0, pi) radians"
+                f"{where}: camera_angle_{axis}: {angle}; must be in (0, pi) radians"
             )
         return 0.5 * size / math.tan(0.5 * angle)
 
     fl_x, fl_y = focal("x", width), focal("y", height)
     if fl_x is None and fl_y is None:
         raise InputError(
-            f"{source}: fl_x: missing; give fl_x (pixels) or camera_angle_x (radians)"
+            f"{where}: fl_x: missing; give fl_x (pixels) or camera_angle_x (radians)"
         )
     fl_x, fl_y = (fl_y if fl_x is None else fl_x), (fl_x if fl_y is None else fl_y)
     if fl_x is None or fl_y is None or min(fl_x, fl_y) <= 0:
-        raise InputError(f"{source}: fl_x, fl_y: {fl_x}, {fl_y}; must be positive")
+        raise InputError(f"{where}: fl_x, fl_y: {fl_x}, {fl_y}; must be positive")
     return fl_x, fl_y

@@ -46,14 +46,16 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
             for y in glTF and OBJ, z in PLY.
 
     Raises:
-        InputError: unknown suffix, unreadable or damaged file, no triangle that has
-            an area, a value that is not finite, a missing texture, buffer or material
-            file, or a feature that is not supported.
+        InputError: no such file, unknown suffix, unreadable or damaged file, no
+            triangle that has an area, a value that is not finite, a missing texture,
+            buffer or material file, or a feature that is not supported.
     """
     import trimesh
 
     path = Path(path)
     suffix = path.suffix.lower()
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; check the path")
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: unknown suffix; use {', '.join(SUFFIXES)}")
     turn = up_matrix(up or ("z" if suffix == ".ply" else "y"))
@@ -237,7 +239,8 @@ def _check_materials(path: Path, data: bytes, resolver: Any) -> None:
 
 
 def _read_part(geometry: Any, base_colours: tuple[BaseColour, ...]) -> MeshPart:
-    # trimesh computes normals on demand; only those of the file are wanted
+    # trimesh computes normals on demand; only those of the file are wanted, and its
+    # cache alone tells which they are (its own glTF exporter asks there too)
     has_normals = "vertex_normals" in geometry._cache
     part = MeshPart(
         np.array(geometry.vertices, np.float64),

@@ -102,6 +102,7 @@ def read_views(
     placement: Placement,
     bounds: Sequence[float] | None = None,
     long_edge_px: int | None = None,
+    skip_missing: bool = False,
 ) -> ObjectViews:
     """Read a folder of RGBA images around an object.
 
@@ -113,12 +114,13 @@ def read_views(
         placement: size and pose; `up` is z if None.
         bounds: x0, y0, z0, x1, y1, z1 in the unit of the poses, metres.
         long_edge_px: reduce the images to this longer edge.
+        skip_missing: leave out frames without an image file.
 
     Raises:
         InputError: the folder cannot be read, its images have no alpha, or both
             `bounds` and a placement are given.
     """
-    images = read_images(folder, long_edge_px)
+    images = read_images(folder, long_edge_px, skip_missing)
     check_alpha(images, str(folder))
     if bounds is not None:
         if placement != Placement():

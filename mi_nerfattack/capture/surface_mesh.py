@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
+from mi_nerfattack.capture.cube_faces import OBJECT_BOX, object_box
 from mi_nerfattack.capture.mesh import TexturedMesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -23,6 +24,7 @@ _SURFACE_OVER, _NORMALS_OVER = 0.6, 1.5  # voxels, standard deviations of smooth
 _OUTSIDE, _BEHIND = 1.5, 4.0  # voxels that colours are looked at from, and beyond
 _FAINT = 1e-2
 _CHUNK = 1 << 20
+_BOX_OFF = 2.0  # voxels that a mesh's box may be off
 _MAX_TRIANGLES = 4_000_000
 
 
@@ -89,16 +91,10 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
         mesh: placed as it was for the fit.
 
     Raises:
-        InputError: the mesh does not lie in the field's box, or is too fine.
+        InputError: the mesh's box is not that of the object, or it is too fine.
     """
     voxel = _voxel(field)
-    low, high = mesh.bounds
-    if np.any(low < field.lower - voxel) or np.any(high > field.upper + voxel):
-        raise InputError(
-            f"{mesh.name}: reaches from {low.round(3)} to {high.round(3)} m, the field "
-            f"from {field.lower.round(3)} to {field.upper.round(3)} m; give the size "
-            "and axes that the field was made with"
-        )
+    _check_box(field, mesh, _BOX_OFF * voxel)
     corners = _divided(mesh, voxel)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -120,6 +116,23 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     inner = 0.9 * vertices + 0.1 * middle / count[:, None]
     colours = seen_colours(field, inner, side * normals)
     return ColouredMesh(vertices, faces, normals, colours)
+
+
+def _check_box(field: GridField, mesh: TexturedMesh, margin_m: float) -> None:
+    """Raise InputError unless the mesh has the box of the object.
+
+    A field whose header tells no object is larger than the mesh by an unknown amount.
+    """
+    (low, high), (lower, upper) = mesh.bounds, object_box(field)
+    beyond = np.concatenate([lower - low, high - upper])
+    if set(OBJECT_BOX) <= field.info.keys():
+        beyond = np.abs(beyond)
+    if beyond.max() > margin_m:
+        raise InputError(
+            f"{mesh.name}: reaches from {low.round(3)} to {high.round(3)} m, the "
+            f"field's object from {lower.round(3)} to {upper.round(3)} m; give the "
+            "size and axes that the field was made with"
+        )
 
 
 def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:

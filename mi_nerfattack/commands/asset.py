@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from mi_nerfattack.capture.fit_options import FitOptions
     from mi_nerfattack.capture.object_views import ObjectViews
 
+_SSIM_PX = 11
+
 
 @dataclass(frozen=True)
 class Asset:
@@ -30,7 +32,7 @@ class Asset:
 
     source: tyro.conf.Positional[str]
     """glTF (.glb, .gltf), OBJ or PLY; a folder with RGBA images and poses, as fit reads
-    it; or the word cube (./cube is a file)."""
+    it; or the word cube (a folder named so is ./cube)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Field file to write (.safetensors); a report of the fit lies beside it."""
     height_m: float | None = None
@@ -49,12 +51,15 @@ class Asset:
     """Box of a folder's object: x0 y0 z0 x1 y1 z1; found from the alpha if left out."""
     long_edge: int | None = None
     """Reduce a folder's images to this longer edge, pixels."""
-    ambient: float = 0.75
-    """Share of light from everywhere in renders; 1 bakes no shading into colours."""
+    skip_missing: bool = False
+    """Leave out a folder's frames whose image file is missing."""
+    ambient: float | None = None
+    """Share of light from everywhere in renders, 0.75 by default; 1 bakes no shading
+    into colours."""
     resolution: Literal[64, 128] = 64
     """Finest level of the grid: 64 for a hydrant, 128 for a car."""
-    views: int = 96
-    """Views rendered."""
+    views: int | None = None
+    """Views rendered; 96 by default."""
     size: int | None = None
     """Width and height of a render, pixels; about three for each cell by default."""
     steps: int | None = None
@@ -74,10 +79,13 @@ class Asset:
         """Render or read the views, fit, score and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.fit import fit_grid
+        from mi_nerfattack.capture.fit_checkpoint import check_unfinished
         from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
         from mi_nerfattack.fields.grid import GridLayout
 
         check_output(self.output)
+        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
+        check_unfinished(checkpoint, self.resume)
         variant.ensure()
         with StageBars() as bars:
             found = self._views(bars)
@@ -91,7 +99,7 @@ class Asset:
                 self._options(found.depth is not None),
                 found.depth,
                 progress=partial(show_fit, bars),
-                checkpoint=self.output.with_suffix(".checkpoint.safetensors"),
+                checkpoint=checkpoint,
                 resume=self.resume,
             )
         result.field.info.update(
@@ -106,6 +114,7 @@ class Asset:
             "seed": str(self.seed),
         }
         finish(result, found.images, self.output, provenance, self.json, found.depth)
+        checkpoint.unlink(missing_ok=True)
         return 0
 
     def _options(self, has_depth: bool) -> FitOptions:
@@ -132,29 +141,40 @@ class Asset:
         is_cube, is_folder = self.source == "cube", Path(self.source).is_dir()
         self._refuse_unused(is_cube, is_folder or self.source.endswith(".json"))
         if is_folder or self.source.endswith(".json"):
-            return read_views(self.source, placement, self.bounds, self.long_edge)
+            return read_views(
+                self.source, placement, self.bounds, self.long_edge, self.skip_missing
+            )
         if is_cube:
             mesh = placement.cube(self.edge_m, self.faces)
         else:
             mesh = placement.mesh(self.source)
         return render_views(
             mesh,
-            self.views,
-            self.size or 200 * self.resolution // 64,
+            96 if self.views is None else self.views,
+            200 * self.resolution // 64 if self.size is None else self.size,
             self.seed,
-            Lighting(self.ambient),
+            Lighting() if self.ambient is None else Lighting(self.ambient),
             partial(show_views, bars),
         )
 
     def _refuse_unused(self, is_cube: bool, is_folder: bool) -> None:
-        """Raise InputError for an option that the kind of source has no use for."""
+        """Raise InputError for an option that the source has no use for, or a size."""
         from mi_nerfattack.errors import InputError
 
+        if self.size is not None and self.size < _SSIM_PX:
+            raise InputError(
+                f"--size: {self.size}; at least {_SSIM_PX} pixels, the window of SSIM"
+            )
+        rendered = not is_folder, "meshes and the cube"
         for name, value, allowed, kind in (
             ("edge-m", self.edge_m, is_cube, "the cube"),
             ("faces", self.faces, is_cube, "the cube"),
             ("bounds", self.bounds, is_folder, "folders"),
             ("long-edge", self.long_edge, is_folder, "folders"),
+            ("skip-missing", self.skip_missing or None, is_folder, "folders"),
+            ("views", self.views, *rendered),
+            ("size", self.size, *rendered),
+            ("ambient", self.ambient, *rendered),
             ("height-m", self.height_m, not is_cube, "meshes and folders"),
             ("longest-m", self.longest_m, not is_cube, "meshes and folders"),
             ("up", self.up, not is_cube, "meshes and folders"),

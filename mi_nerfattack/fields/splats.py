@@ -18,6 +18,7 @@ from mi_nerfattack.errors import InputError
 MAX_BYTES = 1 << 31
 MAX_HEADER_BYTES = 1 << 16
 MAX_LOG_SCALE = 15.0  # a standard deviation of 3,000 km
+MIN_LOG_SCALE = -60.0  # below, its inverse overflows single precision
 REST_OF_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # numbers of f_rest_*
 
 _TYPES = {
@@ -244,11 +245,12 @@ def _columns(path: str | Path, rows: np.ndarray, names: tuple[str, ...]) -> np.n
 
 
 def _check_scales(path: str | Path, logarithms: np.ndarray) -> None:
-    if logarithms.max() > MAX_LOG_SCALE:
-        vertex, axis = np.argwhere(logarithms > MAX_LOG_SCALE)[0]
+    bad = (logarithms < MIN_LOG_SCALE) | (logarithms > MAX_LOG_SCALE)
+    if bad.any():
+        vertex, axis = np.argwhere(bad)[0]
         value = logarithms[vertex, axis]
         raise InputError(
-            f"{path}: scale_{axis} of vertex {vertex} is {value:g}; allowed is at most "
-            f"{MAX_LOG_SCALE:g}: scales are stored as natural logarithms of the "
-            "standard deviations"
+            f"{path}: scale_{axis} of vertex {vertex} is {value:g}; allowed is "
+            f"{MIN_LOG_SCALE:g} to {MAX_LOG_SCALE:g}: scales are stored as natural "
+            "logarithms of the standard deviations"
         )

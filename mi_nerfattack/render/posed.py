@@ -48,13 +48,16 @@ class Pose:
         """Split a 4x4 matrix into rotation, translation and uniform scale.
 
         Raises:
-            ValueError: the matrix shears, reflects or scales unequally.
+            ValueError: the matrix shears, reflects or scales unequally, or its last
+                row is not 0 0 0 1, as when it is transposed.
         """
         matrix = np.asarray(matrix, np.float64)
         volume = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
         scale = float(np.cbrt(abs(volume)))
         if not scale > 0:
             raise ValueError(f"{matrix.tolist()} is singular or not finite")
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+            raise ValueError(f"last row {matrix[3].tolist()}; must be 0 0 0 1")
         return Pose(matrix[:3, :3] / scale, matrix[:3, 3].copy(), scale)
 
     @staticmethod

@@ -21,7 +21,6 @@ from mi_nerfattack.report.view_pictures import ViewPair, write_colours, write_de
 
 MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
-_CLEAN_DB = 36.0  # from here on, noise takes less than half a decibel off 26
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 _PAGE = Template("""<!DOCTYPE html>
@@ -127,13 +126,20 @@ def verdict(comparison: Comparison) -> str:
     far = _far(comparison)
     if not far:
         return f"Close enough: {wanted}."
-    noisiest = min(route.mean("ceiling_db") for route in comparison.routes)
-    advice = "Capture more views where the frames are worst, and fit for longer."
-    if noisiest < _CLEAN_DB:
-        advice = "The scene's frames are noisy; compare with more samples per pixel."
+    noisy = [route.name for route in comparison.routes if _is_noise(route)]
+    advice = []
+    if noisy:
+        advice.append(
+            f"The scene's frames are too noisy on {', '.join(noisy)}; compare with "
+            "more samples per pixel."
+        )
+    if noisy != far:
+        advice.append(
+            "Capture more views where the frames are worst, and fit for longer."
+        )
     return (
         f"Not close enough on {', '.join(far)}: {wanted} are needed. What is found in "
-        f"the field may not hold in the scene. {advice}"
+        f"the field may not hold in the scene. {' '.join(advice)}"
     )
 
 
@@ -147,6 +153,16 @@ def _far(comparison: Comparison) -> list[str]:
 
 def _is_psnr_good(route: RouteComparison) -> bool:
     return route.mean("psnr_db") >= MIN_PSNR_DB
+
+
+def _is_noise(route: RouteComparison) -> bool:
+    """Whether the noise of the scene's frames is all that is wrong with a route."""
+    if _is_psnr_good(route) or not _is_depth_good(route):
+        return False
+    error, noise = (
+        10 ** (-0.1 * route.mean(name)) for name in ("psnr_db", "ceiling_db")
+    )
+    return error - noise <= 10 ** (-0.1 * MIN_PSNR_DB)
 
 
 def _is_depth_good(route: RouteComparison) -> bool:

@@ -19,9 +19,17 @@ from mi_nerfattack.capture.evaluation import (
 )
 from mi_nerfattack.capture.fit_options import FitProgress, FitResult
 from mi_nerfattack.capture.frames import PosedImages
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.report.elements import STYLE, figure, pairs, table
 from mi_nerfattack.report.fit_plots import write_curve, write_histogram
-from mi_nerfattack.report.verdict import Criterion, judge, pooled_db, verdict
+from mi_nerfattack.report.verdict import (
+    OBJECT,
+    PLACE,
+    Criterion,
+    judge,
+    pooled_db,
+    verdict,
+)
 from mi_nerfattack.report.view_pictures import (
     SOLID,
     ViewPair,
@@ -169,8 +177,12 @@ def view_entry(score: ViewScore) -> dict[str, Any]:
 
 
 def judge_fit(result: FitResult) -> list[Criterion]:
-    """Judge a fit by its held-out views and the rays it was fitted to."""
-    return judge(result.per_view, _fitted_db(result.history))
+    """Judge a fit by its held-out views and the rays it was fitted to.
+
+    A grid holds an object, any other field a place.
+    """
+    subject = OBJECT if isinstance(result.field, GridField) else PLACE
+    return judge(result.per_view, _fitted_db(result.history), subject)
 
 
 def _fitted_db(history: Sequence[FitProgress]) -> float | None:
