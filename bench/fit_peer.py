@@ -9,9 +9,10 @@ from typing import Any
 import torch
 
 from mi_nerfattack.bench.full_ngp import NGPData
-from mi_nerfattack.bench.sides import COUNTED_RAYS, AbstractTrainer, Clock, cores
+from mi_nerfattack.bench.sides import COUNTED_RAYS, AbstractTrainer, Clock
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
 from mi_nerfattack.bench.torch_fit import Pictures, Plan, TorchFit
+from mi_nerfattack.cores import cores
 
 GRIDS = {"plain": PlainHashGrid, "tuned": TunedHashGrid}
 

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from mi_nerfattack.bench.full_ngp import NGPData
-from mi_nerfattack.bench.sides import STOP, AbstractSide, cores, route_rays
+from mi_nerfattack.bench.sides import STOP, AbstractSide, route_rays
 from mi_nerfattack.bench.torch_encoding import PlainHashGrid, TunedHashGrid
 from mi_nerfattack.bench.torch_ngp import TorchNGP
+from mi_nerfattack.cores import cores
 
 GRIDS = {"plain": PlainHashGrid, "tuned": TunedHashGrid}
 CHUNKS = (1024, 4096, 16384)  # rays at once

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack import files, llvm
-from mi_nerfattack.bench.sides import cores
+from mi_nerfattack.cores import cores
 
 PACKAGES = ("mi-nerfattack", "mitsuba", "drjit", "torch", "numpy")
 
