@@ -164,6 +164,20 @@ class TestMaterials:
         found = seen_from(mesh, FRONT)[20:44, 4:60, 3].mean()
         assert found == pytest.approx(0.25, abs=5e-3)
 
+    def test_specular_glossiness_and_what_loses_only_gloss(self, tmp_path):
+        names = ["pbrSpecularGlossiness", "sheen", "ior", "unlit", "emissive_strength"]
+        gltf = plate()
+        gltf.tree["extensionsRequired"] = [f"KHR_materials_{name}" for name in names]
+        # the reflectance of a dielectric, so that all of the colour is diffuse
+        gloss = {"diffuseFactor": [0.6, 0.2, 0.4, 1.0], "specularFactor": [0.04] * 3}
+        gltf.material()["extensions"] = {f"KHR_materials_{names[0]}": gloss}
+        image = seen_from(load_mesh(gltf.write(tmp_path / "a.glb")), FRONT)
+        colour = image[20:44, 4:60, :3].mean((0, 1))
+        np.testing.assert_allclose(colour, [0.6, 0.2, 0.4], atol=3e-3)
+        texture = {"index": gltf.texture(four_colours())}
+        gloss |= {"diffuseTexture": texture, "diffuseFactor": [1.0] * 4}
+        np.testing.assert_allclose(front(gltf, tmp_path), CORNERS, atol=4)
+
 
 class TestNodes:
     def test_nested_with_scale_and_mirror(self, tmp_path):
@@ -292,6 +306,22 @@ class TestRefused:
         (tmp_path / "a.obj").write_text(text)
         with pytest.raises(InputError, match=r"a\.obj: all its triangles are degen"):
             load_mesh(tmp_path / "a.obj")
+
+    def test_meshes_without_triangles(self, tmp_path):
+        gltf = textured()
+        del gltf.tree["meshes"], gltf.tree["nodes"][0]["mesh"]
+        self.refuse(gltf, tmp_path / "a.glb", "contains no triangle")
+        gltf = textured()
+        gltf.tree["meshes"][0]["primitives"][0]["mode"] = 0
+        self.refuse(gltf, tmp_path / "a.glb", "contains no triangle")
+        text = (
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n"
+            "property float y\nproperty float z\nelement face 0\n"
+            "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+        )
+        (tmp_path / "a.ply").write_text(text)
+        with pytest.raises(InputError, match=r"a\.ply: contains no triangle"):
+            load_mesh(tmp_path / "a.ply")
 
     def test_material_that_no_library_defines(self, tmp_path):
         text = "usemtl Wood\nv 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n"

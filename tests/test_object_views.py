@@ -13,6 +13,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.capture.frames import PosedImages, write_transforms
 from mi_nerfattack.capture.hull import check_alpha, silhouette_bounds
 from mi_nerfattack.capture.object_views import Placement, read_views
+from mi_nerfattack.commands import bars
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.errors import InputError
 
@@ -95,6 +96,14 @@ class TestReadViews:
         np.testing.assert_allclose(new[:, 2], old[:, 0], atol=1e-12)
         np.testing.assert_allclose(new[:, 0], -old[:, 1], atol=1e-12)
 
+    def test_missing_images_are_left_out(self, tmp_path):
+        folder(tmp_path, count=16)
+        (tmp_path / "images/0003.png").unlink()
+        with pytest.raises(InputError, match="1 of 16 frames have no image"):
+            read_views(tmp_path, Placement())
+        found = read_views(tmp_path, Placement(), skip_missing=True)
+        assert len(found.images) == 15
+
     def test_given_bounds_move_nothing(self, tmp_path):
         before = folder(tmp_path, moved=(3.0, 0, 0))
         found = read_views(tmp_path, Placement(), (2, -1, -1, 4, 1, 1))
@@ -125,6 +134,8 @@ class TestCommand:
         (tmp_path / "box.obj").write_text(box)
         (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
         (tmp_path / "lost.obj").write_text("mtllib lost.mtl\nusemtl A\n" + box)
+        (tmp_path / "bare.mtl").write_text("newmtl A\nmap_Kd gone.png\n")
+        (tmp_path / "bare.obj").write_text("mtllib bare.mtl\nusemtl A\n" + box)
         out = tmp_path / "out.safetensors"
         before = set(tmp_path.iterdir())
         for arguments, message in (
@@ -134,6 +145,13 @@ class TestCommand:
             ((tmp_path / "empty.obj", "-o", out), "empty.obj: contains no triangle"),
             ((tmp_path / "flat.obj", "-o", out), "flat.obj: all its triangles are"),
             ((tmp_path / "lost.obj", "-o", out), "missing file 'lost.mtl'"),
+            ((tmp_path / "bare.obj", "-o", out), "missing file 'gone.png'"),
+            ((tmp_path / "box.obj", "-o", out, "--size", 0), "--size: 0; at least 11"),
+            (("cube", "-o", out, "--edge-m", 1, "--size", 10), "--size: 10; at least"),
+            (
+                (tmp_path / "box.obj", "-o", out, "--skip-missing"),
+                "--skip-missing: is for folders",
+            ),
             ((tmp_path / "box.obj", "-o", out, "--height-m", 0), "height_m: 0.0; must"),
             ((tmp_path / "box.obj", "-o", out, "--longest-m=-1"), "longest_m: -1.0; "),
             ((tmp_path / "box.obj", "-o", out, "--edge-m", 1), "--edge-m: is for the"),
@@ -146,16 +164,52 @@ class TestCommand:
             (("cube", "-o", out), "--edge-m: is missing"),
             (("cube", "-o", out, "--edge-m", 0), "edge_m: 0.0; must be positive"),
             (("cube", "-o", out, "--edge-m", 1, "--up", "x"), "--up: is for meshes"),
-            (("./cube", "-o", out), "cube: unknown suffix"),
+            (("./cube", "-o", out), "cube: does not exist"),
             ((opaque, "-o", out), "opaque: its images have no alpha"),
-            ((tmp_path / "gone", "-o", out), "gone: unknown suffix"),
+            ((tmp_path / "gone", "-o", out), "gone: does not exist"),
             ((views, "-o", out, "--height-m=-3"), "height_m: -3.0; must be positive"),
             ((views, "-o", out, "--edge-m", 1), "--edge-m: is for the cube, not for"),
+            ((views, "-o", out, "--views", 8), "--views: is for meshes and the cube"),
+            ((views, "-o", out, "--size", 99), "--size: is for meshes and the cube"),
+            ((views, "-o", out, "--ambient", 1), "--ambient: is for meshes and the"),
         ):
             code, error = self.call(capsys, *arguments)
             assert code == 2, error
             assert message in error and error.count("\n") == 1, error
             assert set(tmp_path.iterdir()) == before, arguments
+
+    def test_unfinished_fit_is_told_before_anything_is_read(self, tmp_path, capsys):
+        (tmp_path / "a.checkpoint.safetensors").write_text("")
+        source, out = tmp_path / "none.glb", tmp_path / "a.safetensors"
+        code, error = self.call(capsys, source, "-o", out)
+        assert code == 2 and "a.checkpoint.safetensors: an unfinished fit" in error
+        code, error = self.call(capsys, source, "-o", out, "--resume")
+        assert code == 2 and "none.glb: does not exist" in error
+
+    @pytest.mark.slow
+    def test_interrupted_fit_to_a_mesh_is_resumed(self, tmp_path, monkeypatch, capsys):
+        """It is accepted only if the mesh is rendered to the same bytes again."""
+
+        def interrupt(self, stage, *state):
+            if stage == "fitting":
+                raise KeyboardInterrupt
+
+        box = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+        (tmp_path / "box.obj").write_text(box)
+        out = tmp_path / "box.safetensors"
+        settings = {"views": 9, "size": 24, "steps": 30, "batch_rays": 64}
+        with monkeypatch.context() as patch:
+            patch.setattr(bars.StageBars, "show", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                Asset(str(tmp_path / "box.obj"), out, **settings).run()
+        kept = tmp_path / "box.checkpoint.safetensors"
+        assert kept.is_file() and not out.exists()
+        source = str(tmp_path / "box.obj")
+        with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*: fit is"):
+            Asset(source, out, resume=True, **settings | {"turn_deg": 1.0}).run()
+        assert Asset(source, out, resume=True, **settings).run() == 0
+        assert out.is_file() and not kept.exists()
+        assert "30 steps" in capsys.readouterr().out
 
     @pytest.mark.slow
     def test_a_folder_becomes_an_object(self, tmp_path, capsys):

@@ -26,7 +26,26 @@ _GLB, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _FLOAT, _UBYTE, _USHORT, _UINT = 5126, 5121, 5123, 5125
-_SUPPORTED = frozenset({"KHR_texture_transform", "EXT_texture_webp"})
+_SUPPORTED = frozenset(
+    {
+        "EXT_texture_webp",
+        "KHR_materials_pbrSpecularGlossiness",
+        "KHR_texture_transform",
+        # without these gloss, light or choices are lost, but no diffuse colour
+        "KHR_lights_punctual",
+        "KHR_materials_anisotropy",
+        "KHR_materials_clearcoat",
+        "KHR_materials_dispersion",
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_iridescence",
+        "KHR_materials_sheen",
+        "KHR_materials_specular",
+        "KHR_materials_unlit",
+        "KHR_materials_variants",
+        "KHR_xmp_json_ld",
+    }
+)
 _WHITE = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
 
 
