@@ -224,3 +224,16 @@ class TestAsset:
         expected = linear_to_uint8(np.array([0.1, 0.6, 0.2]))
         assert np.abs(colour[:, :3].astype(int) - expected).max() <= 3
         assert np.all(colour[:, 3] == 255)
+
+
+def test_demo_renders_the_mesh_that_it_is_given(tmp_path, monkeypatch):
+    from mi_nerfattack.commands.demo import Demo
+
+    def reached(mesh, *settings):
+        raise RuntimeError(f"{mesh.name}, {float(np.ptp(mesh.bounds[:, 2])):.2f} m")
+
+    path = tmp_path / "box.glb"
+    trimesh.creation.box((1, 2, 1)).export(path)
+    monkeypatch.setattr("mi_nerfattack.capture.object_views.render_views", reached)
+    with pytest.raises(RuntimeError, match=r"box\.glb, 0\.90 m"):
+        Demo(tmp_path / "run", path, height_m=0.9).run()
