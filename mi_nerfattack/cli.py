@@ -19,7 +19,7 @@ import tyro
 
 import mi_nerfattack
 from mi_nerfattack.commands import COMMANDS
-from mi_nerfattack.errors import NerfAttackError
+from mi_nerfattack.errors import NerfAttackError, is_interrupt
 
 PROG = "mi-nerfattack"
 EXIT_INPUT = 2
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except RuntimeError as err:
         # Dr.Jit wraps whatever is raised while it records a loop
-        if not _is_interrupt(err):
+        if not is_interrupt(err):
             raise
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except BrokenPipeError:
@@ -76,14 +76,6 @@ def _run(arguments: list[str]) -> int:
     except SystemExit as stop:  # help printed, or wrong usage reported
         return stop.code if isinstance(stop.code, int) else EXIT_INPUT
     return command.run()
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
 
 
 def _fail(message: str, code: int, debug: bool) -> int:

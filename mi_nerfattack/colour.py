@@ -69,6 +69,22 @@ def srgb_to_linear_numpy(value: np.ndarray) -> np.ndarray:
     ).astype(value.dtype)
 
 
+def straight_rgba(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Encode premultiplied linear colours with alpha as 8-bit sRGB, not premultiplied.
+
+    Args:
+        premultiplied: (height, width, 3), linear; black where alpha is 0.
+        alpha: (height, width, 1), in [0, 1].
+
+    Returns:
+        (height, width, 4), uint8.
+    """
+    colour = np.zeros_like(premultiplied)
+    np.divide(premultiplied, alpha, out=colour, where=alpha > 0)
+    opacity = np.round(255 * alpha).astype(np.uint8)
+    return np.concatenate([linear_to_uint8(colour), opacity], axis=2)
+
+
 def linear_to_uint8(value: np.ndarray) -> np.ndarray:
     """Encode linear values as 8-bit sRGB, rounded to nearest.
 

@@ -18,3 +18,12 @@ class InputError(NerfAttackError, ValueError):
 
 class SetupError(NerfAttackError, RuntimeError):
     """Report a machine or an installation that cannot do what is asked."""
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Tell Ctrl-C and SIGTERM, also where Dr.Jit has wrapped them."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -37,6 +37,7 @@ MAX_IMAGE_BYTES = 1 << 28
 MAX_IMAGE_PIXELS = 1 << 27
 MAX_TENSOR_BYTES = 1 << 33
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of what `read_image` reads
 _IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 _TENSOR_REMEDY = "only .safetensors files are read"
 

@@ -6,7 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout
+from mi_nerfattack.fields import (
+    GridField,
+    GridLayout,
+    NGPField,
+    NGPLayout,
+    Occupancy,
+)
 from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import Pose, PosedField
 
@@ -184,3 +190,18 @@ def arguments(
     numbers = [mi.Float(t_max), mi.Float(jitter)]
     dr.make_opaque(numbers)
     return (posed, origin, direction, *numbers, mi.Bool(True))
+
+
+def half_occupied() -> tuple[GridField, mi.Point3f, mi.Vector3f]:
+    """Make [-1, 1]^3, occupied below z = 0, and three rays along -z.
+
+    With steps of 0.25 m the first, from z = 1, meets 4 samples, the second, from
+    within, 2, and the third, beside the box, none.
+    """
+    cells = np.zeros((8, 8, 8), bool)
+    cells[:, :, :4] = True
+    field = GridField(
+        GridLayout(1, 4, 4), -ONES, ONES, occupancy=Occupancy(cells), step_m=0.25
+    )
+    origin = mi.Point3f([0, 0, 3], [0, 0, 0], [1, -0.5, 1])
+    return field, origin, mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])

@@ -12,7 +12,8 @@ from sphere_views import BOX, RADIUS, directions, sphere_views
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.evaluation import compare, evaluate
-from mi_nerfattack.capture.fit import FitOptions, fit_grid, fit_ngp, unpack
+from mi_nerfattack.capture.fit import FitOptions, fit_grid, fit_ngp
+from mi_nerfattack.capture.fit_training import unpack
 from mi_nerfattack.capture.frames import held_out, write_transforms
 from mi_nerfattack.colour import linear_to_srgb_numpy
 from mi_nerfattack.errors import InputError

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import small_fields as small
 from sphere_views import RADIUS, SIZE, sphere_views, world_rays, write_folder
 
 from mi_nerfattack.capture.fit_cells import (
@@ -20,7 +21,6 @@ from mi_nerfattack.capture.fit_rays import RayBank, RayBatch
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera import from_fov, look_at
 from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import PosedField
@@ -206,18 +206,7 @@ def test_depth_that_does_not_fit_is_an_error(tmp_path, fault):
 
 
 def test_samples_are_counted_by_the_cells_that_rays_cross():
-    # occupied below z = 0: a vertical ray from z = 1 meets 4 steps of 0.25 m
-    cells = np.zeros((8, 8, 8), bool)
-    cells[:, :, :4] = True
-    grid = GridField(
-        GridLayout(1, 4, 4),
-        np.full(3, -1.0),
-        np.full(3, 1.0),
-        occupancy=Occupancy(cells),
-        step_m=0.25,
-    )
-    origin = mi.Point3f([0, 0, 3], [0, 0, 0], [1, -0.5, 1])
-    direction = mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])
+    grid, origin, direction = small.half_occupied()
     posed, far = PosedField(grid), mi.Float(dr.inf)
     count = sample_count(posed, origin, direction, far, mi.Float(0.5))
     assert count.numpy().tolist() == [4, 2, 0]

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import small_fields as small
 from sphere_views import BOX, sphere_views
 
 from mi_nerfattack.capture.fit_batch import BatchSource
@@ -106,18 +107,7 @@ def test_rays_beyond_the_room_for_samples_are_left_out(rng):
 
 
 def test_listed_samples_are_those_that_rays_cross(rng):
-    # occupied below z = 0: a vertical ray from z = 1 meets 4 steps of 0.25 m
-    cells = np.zeros((8, 8, 8), bool)
-    cells[:, :, :4] = True
-    grid = GridField(
-        GridLayout(1, 4, 4),
-        np.full(3, -1.0),
-        np.full(3, 1.0),
-        occupancy=Occupancy(cells),
-        step_m=0.25,
-    )
-    origin = mi.Point3f([0, 0, 3], [0, 0, 0], [1, -0.5, 1])
-    direction = mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])
+    grid, origin, direction = small.half_occupied()
     rays = Rays(
         origin, direction, dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, 0.5)
     )

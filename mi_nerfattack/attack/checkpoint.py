@@ -4,26 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-import mi_nerfattack
 from mi_nerfattack import files
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.versions import versions
 
 FORMAT = "mi_nerfattack attack checkpoint 1"
-
-
-def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
-    return {
-        "mi_nerfattack": mi_nerfattack.__version__,
-        "mitsuba": str(mi.__version__),
-        "drjit": str(dr.__version__),
-        "variant": str(mi.variant()),
-    }
 
 
 def save_checkpoint(path: str | Path, attack: GradientAttack, digest: str) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack import files
-from mi_nerfattack.attack.checkpoint import versions
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.world import World, object_footprints
 from mi_nerfattack.fields import save_field
@@ -21,6 +20,7 @@ from mi_nerfattack.report.page import write_report
 from mi_nerfattack.report.strip import first_person_strip
 from mi_nerfattack.report.table import write_steps
 from mi_nerfattack.rollout.loop import to_state
+from mi_nerfattack.versions import versions
 
 STRIP_FRAMES = 6
 EXR_FRAMES = 3

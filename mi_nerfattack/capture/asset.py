@@ -14,7 +14,7 @@ import numpy as np
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.capture.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.views import iterate_views
-from mi_nerfattack.colour import linear_to_uint8
+from mi_nerfattack.colour import straight_rgba
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import (
     Camera,
@@ -155,7 +155,7 @@ def render_asset(
     depth = np.empty((n_views, size_px, size_px), np.float32)
     views = iterate_views(scene, camera, poses, spp, seed, integrator)
     for i, view in enumerate(views):
-        images[i] = _straight_rgba(view.rgb, view.alpha)
+        images[i] = straight_rgba(view.rgb, view.alpha[..., None])
         depth[i] = view.depth if is_solid else _solid_depth(scene, camera, poses[i])
         progress(i + 1, n_views)
     names = tuple(f"{mesh.name}:{i:04d}" for i in range(n_views))
@@ -179,10 +179,3 @@ def _solid_depth(scene: Any, camera: Camera, pose: np.ndarray) -> np.ndarray:
         if not dr.any(active):
             break
     return depth.numpy().reshape(camera.height, camera.width)
-
-
-def _straight_rgba(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    weight = alpha[..., None]
-    colour = np.divide(rgb, weight, out=np.zeros_like(rgb), where=weight > 0)
-    opacity = np.round(255 * weight).astype(np.uint8)
-    return np.concatenate([linear_to_uint8(colour), opacity], axis=2)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.mesh import CUBE_FACES
-from mi_nerfattack.colour import linear_to_uint8
+from mi_nerfattack.colour import straight_rgba
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.march import march
@@ -144,9 +144,8 @@ def _render(
             half,
             mi.Bool(True),
         )
-        clear = seen.opacity > 0
-        colour = seen.radiance / dr.select(clear, seen.opacity, 1)
-        dr.eval(colour, seen.opacity)
-    rgb = linear_to_uint8(colour.numpy().T.reshape(height, width, 3))
-    alpha = np.round(255 * seen.opacity.numpy().reshape(height, width, 1))
-    return np.concatenate([rgb, alpha.astype(np.uint8)], axis=2)
+        dr.eval(seen)
+    return straight_rgba(
+        seen.radiance.numpy().T.reshape(height, width, 3),
+        seen.opacity.numpy().reshape(height, width, 1),
+    )

@@ -24,13 +24,13 @@ from mi_nerfattack.capture.fit_options import (
     ProgressCallback,
     no_progress,
 )
-from mi_nerfattack.capture.fit_training import Training, unpack
+from mi_nerfattack.capture.fit_training import Training
 from mi_nerfattack.capture.frames import PosedImages
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 
-__all__ = ["FitOptions", "FitProgress", "FitResult", "fit_grid", "fit_ngp", "unpack"]
+__all__ = ["FitOptions", "FitProgress", "FitResult", "fit_grid", "fit_ngp"]
 
 _REPORT_EVERY = 25
 _BLACK = -30.0  # raw value of a colour
@@ -92,7 +92,7 @@ def fit_ngp(
     if images.images.shape[3] == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
-    return _start(training, progress, checkpoint, resume)
+    return _run(training, progress, checkpoint, resume)
 
 
 def fit_grid(
@@ -139,20 +139,14 @@ def fit_grid(
         layout or GridLayout(), low, high, density_scale=1 / float((high - low).max())
     )
     training = Training(grid, images, options, depth, box_only=True)
-    return _start(training, progress, checkpoint, resume)
-
-
-def _start(
-    training: Training, progress: ProgressCallback, path: Path | None, resume: bool
-) -> FitResult:
-    checkpoint = None if path is None else FitCheckpoint(path, training, resume)
-    return _run(training, progress, checkpoint)
+    return _run(training, progress, checkpoint, resume)
 
 
 def _run(
-    training: Training, progress: ProgressCallback, checkpoint: FitCheckpoint | None
+    training: Training, progress: ProgressCallback, path: Path | None, resume: bool
 ) -> FitResult:
     """Do steps until the fit is done; interrupted, keep its state."""
+    checkpoint = None if path is None else FitCheckpoint(path, training, resume)
     clock = _Clock(training, checkpoint)
     try:
         while not clock.is_over():
@@ -166,7 +160,7 @@ def _run(
         if clock.has_news:
             progress(clock.report())
     except BaseException as error:
-        if checkpoint is not None and _is_interrupt(error):
+        if checkpoint is not None and is_interrupt(error):
             training.collect()
             checkpoint.save(clock.elapsed, clock.history)
         raise
@@ -266,12 +260,3 @@ class _Clock:
             return False
         losses = [at.loss for at in self.history[-2 * span :]]
         return sum(losses[span:]) > _PROGRESS * sum(losses[:span])
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    """Tell an interrupt, also where Dr.Jit has wrapped it."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False

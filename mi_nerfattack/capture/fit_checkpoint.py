@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from dataclasses import astuple, fields, replace
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-import mi_nerfattack
 from mi_nerfattack import files
 from mi_nerfattack.capture.fit_options import FitProgress
 from mi_nerfattack.capture.fit_training import Training
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.versions import versions
 
 FORMAT = "mi_nerfattack fit checkpoint 1"
 _EVERY_S = 30.0
@@ -44,7 +42,7 @@ class FitCheckpoint:
         self.path, self.training = path, training
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
-        self._header = {"format": FORMAT, **_versions(), "fit": _digest(training)}
+        self._header = {"format": FORMAT, **versions(), "fit": _digest(training)}
         check_unfinished(path, resume)
         if path.exists():
             self._load()
@@ -106,15 +104,6 @@ def check_unfinished(path: Path, resume: bool) -> None:
             f"{path}: an unfinished fit; continue it (--resume), or delete the file "
             "to start again"
         )
-
-
-def _versions() -> dict[str, str]:
-    return {
-        "mi_nerfattack": mi_nerfattack.__version__,
-        "mitsuba": str(mi.__version__),
-        "drjit": str(dr.__version__),
-        "variant": str(mi.variant()),
-    }
 
 
 def _digest(training: Training) -> str:

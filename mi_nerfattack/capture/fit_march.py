@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.capture.fit_batch import BatchSource, Draw, Score, mean_samples
+from mi_nerfattack.capture.fit_batch import BatchSource, Draw, Score
 from mi_nerfattack.capture.fit_count import sample_count
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.batched import march_gradient
@@ -62,10 +62,6 @@ class MarchStep:
         self._backward(draw, sorted_rays, found, pick_rays(cotangent, order), order)
         score.listed = score.kept = dr.sum(count)
         return score, random
-
-    def samples_per_ray(self, seed: int) -> float:
-        """Return how many samples a ray has on average if it does not end early."""
-        return mean_samples(self.posed, self.source, seed)
 
     def _backward(
         self, draw: Draw, rays: Rays, found: March, cotangent: March, order: mi.UInt32

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.capture.fit_batch import BatchSource, Draw, Score, mean_samples
+from mi_nerfattack.capture.fit_batch import BatchSource, Draw, Score
 from mi_nerfattack.capture.fit_samples import (
     Samples,
     Spread,
@@ -90,10 +90,6 @@ class PointStep:
         add_gradients(self.field, nets.backward(rows(slopes, 4), self._slopes.view))
         self._scatter(draw, samples, self._slopes.array)
         return score, random
-
-    def samples_per_ray(self, seed: int) -> float:
-        """Return how many samples a ray has on average if it does not end early."""
-        return mean_samples(self.posed, self.source, seed)
 
     def _state(self, *arguments: Any) -> list[Any]:
         return [self, self.posed.state(), self.field.parameters(), self.source.state()]

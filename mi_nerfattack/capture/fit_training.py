@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.capture.evaluation import MIN_EDGE_PX
-from mi_nerfattack.capture.fit_batch import BatchSource, Score
+from mi_nerfattack.capture.fit_batch import BatchSource, Score, mean_samples
 from mi_nerfattack.capture.fit_cameras import EXPOSURE, POSES, CameraCorrections
 from mi_nerfattack.capture.fit_cells import (
     cells_near_surfaces,
@@ -103,7 +103,7 @@ class Training:
         self._total = Score()
         self.random = mi.PCG32(options.batch_rays, options.seed + 1)
         dr.make_opaque(self.random)
-        self.limit = self._size(self._march.samples_per_ray(options.seed))
+        self.limit = self._size(mean_samples(self._march.posed, source, options.seed))
 
     def _allowed(self, depth: np.ndarray | None) -> np.ndarray:
         lower, upper = self.field.lower, self.field.upper

@@ -29,7 +29,6 @@ from mi_nerfattack.render.conventions import opencv_to_opengl, opengl_to_opencv
 
 FILE_NAMES = ("transforms.json", "transforms_train.json")
 """What the JSON file of a folder may be called; the first that is there is read."""
-_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp")
 
 __all__ = [
     "FILE_NAMES",
@@ -75,7 +74,7 @@ def _nothing_found(folder: Path) -> str:
         item
         for sub in (folder, folder / "images")
         for item in (sub.iterdir() if sub.is_dir() else ())
-        if item.suffix.lower() in _SUFFIXES[1:]
+        if item.suffix.lower() in files.IMAGE_SUFFIXES
     ]
     advice = (
         f"it holds {len(photographs)} photographs: estimate their poses with "
@@ -256,7 +255,7 @@ def _find_image(source: Path, index: int, frame: Any) -> Path | None:
     if not isinstance(name, str) or not name:
         raise InputError(f"{source}: frames[{index}].file_path: {name!r}; needs a path")
     base = str(source.parent / name.replace("\\", "/"))
-    for suffix in _SUFFIXES:
+    for suffix in ("", *files.IMAGE_SUFFIXES):
         candidate = Path(base + suffix)
         if candidate.is_file():
             return candidate

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack import files
-from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy
+from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy, straight_rgba
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
 
@@ -204,9 +204,7 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     alpha = image[..., 3:].astype(np.float32) / 255
     weight = _box_filter(alpha, width, height)
     colour = _box_filter(linear * alpha, width, height)
-    colour = np.divide(colour, weight, out=np.zeros_like(colour), where=weight > 0)
-    opacity = np.round(255 * weight).astype(np.uint8)
-    return np.concatenate([linear_to_uint8(colour), opacity], axis=2)
+    return straight_rgba(colour, weight)
 
 
 def _box_filter(image: np.ndarray, width: int, height: int) -> np.ndarray:

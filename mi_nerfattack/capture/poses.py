@@ -24,7 +24,6 @@ from mi_nerfattack.capture.structure import (
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
 
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 _LEAST = 3
 _LEAST_UP = 0.2  # length of the mean of unit vectors
 
@@ -133,10 +132,13 @@ def estimate_poses(
 def _list(root: Path) -> list[str]:
     if not root.is_dir():
         raise InputError(f"{root}: is not a folder; give the folder of the photographs")
-    names = sorted(p.name for p in root.iterdir() if p.suffix.lower() in _SUFFIXES)
+    names = sorted(
+        p.name for p in root.iterdir() if p.suffix.lower() in files.IMAGE_SUFFIXES
+    )
     if len(names) < _LEAST:
         raise InputError(
-            f"{root}: {len(names)} photographs ({', '.join(_SUFFIXES)}); at least "
+            f"{root}: {len(names)} photographs "
+            f"({', '.join(files.IMAGE_SUFFIXES)}); at least "
             f"{_LEAST} are needed, 20 or more are better"
         )
     return names

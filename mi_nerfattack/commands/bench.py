@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
@@ -37,7 +38,6 @@ class BenchRender:
 
         from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
             render,
-            results,
         )
 
         sizes = _read_sizes(self.sizes)
@@ -46,11 +46,8 @@ class BenchRender:
             settings = render.Settings.quick(sizes, self.repeats)
         else:
             settings = render.Settings(sizes, sizes[-1], repeats=self.repeats)
-        document = self._measure(settings)
-        document = results.stamp(document, self._command())
-        if self.output is not None:
-            path = results.write(self.output, "render", document)
-            print(f"written to {path}", file=sys.stderr)
+        document = _measure(render.run, settings)
+        document = _publish("render", document, self._command(), self.output)
         if self.json:
             print(json.dumps(document, allow_nan=False))
         else:
@@ -61,19 +58,6 @@ class BenchRender:
         command = ["mi-nerfattack", "bench", "render", "--sizes", *self.sizes]
         command += ["--repeats", str(self.repeats)]
         return [*command, "--quick"] if self.quick else command
-
-    def _measure(self, settings: Any) -> dict[str, Any]:
-        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
-            render,
-        )
-        from mi_nerfattack.commands.bars import StageBars
-
-        with StageBars() as bars:
-
-            def show(stage: str, done: int, total: int, remark: str) -> None:
-                bars.show(stage, done, total, f"{done}/{total} {remark}")
-
-            return render.run(settings, show)
 
 
 @dataclass(frozen=True)
@@ -150,9 +134,7 @@ class BenchFit:
 
         from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
             fit,
-            results,
         )
-        from mi_nerfattack.commands.bars import StageBars
 
         _check_repeats(self.repeats)
         settings = fit.Settings(repeats=self.repeats)
@@ -161,16 +143,8 @@ class BenchFit:
         settings = dataclasses.replace(
             settings, folder=self.folder, long_edge=self.long_edge
         )
-        with StageBars() as bars:
-
-            def show(stage: str, done: int, total: int, remark: str) -> None:
-                bars.show(stage, done, total, f"{done}/{total} {remark}")
-
-            document = fit.run(settings, show)
-        document = results.stamp(document, self._command())
-        if self.output is not None:
-            path = results.write(self.output, "fit", document)
-            print(f"written to {path}", file=sys.stderr)
+        document = _measure(fit.run, settings)
+        document = _publish("fit", document, self._command(), self.output)
         if self.json:
             print(json.dumps(document, allow_nan=False))
         else:
@@ -184,6 +158,33 @@ class BenchFit:
         if self.long_edge is not None:
             command += ["--long-edge", str(self.long_edge)]
         return [*command, "--quick"] if self.quick else command
+
+
+def _measure(run: Callable[..., dict[str, Any]], settings: Any) -> dict[str, Any]:
+    """Run a benchmark, and show how far it is."""
+    from mi_nerfattack.commands.bars import StageBars
+
+    with StageBars() as bars:
+
+        def show(stage: str, done: int, total: int, remark: str) -> None:
+            bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+        return run(settings, show)
+
+
+def _publish(
+    kind: str, document: dict[str, Any], command: list[str], output: Path | None
+) -> dict[str, Any]:
+    """Return a result with machine, versions and date, and write it if asked to."""
+    from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+        results,
+    )
+
+    document = results.stamp(document, command)
+    if output is not None:
+        path = results.write(output, kind, document)
+        print(f"written to {path}", file=sys.stderr)
+    return document
 
 
 _Chosen = tyro.conf.OmitArgPrefixes[

@@ -6,7 +6,6 @@ import html
 import math
 from dataclasses import asdict
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from matplotlib.lines import Line2D
@@ -15,7 +14,7 @@ from mi_nerfattack import files
 from mi_nerfattack.capture.compare import ComparedFrame, Comparison, RouteComparison
 from mi_nerfattack.capture.evaluation import HAZY
 from mi_nerfattack.report.charts import chart
-from mi_nerfattack.report.elements import STYLE, figure, table
+from mi_nerfattack.report.elements import STYLE, figure, page, table
 from mi_nerfattack.report.fit_page import finite
 from mi_nerfattack.report.view_pictures import ViewPair, write_colours, write_depths
 
@@ -23,30 +22,15 @@ MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-<header>
-<h1>$title</h1>
-<p>$verdict</p>
-</header>
-<main>
-<h2>Routes</h2>
+_PAGE = page(
+    "<p>$verdict</p>",
+    """<h2>Routes</h2>
 <div class="scroll">$routes</div>
 <p>$settings</p>
 <h2>Along the routes</h2>
 $along
-$frames
-</main>
-</body>
-</html>
-""")
+$frames""",
+)
 
 
 def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Path:

@@ -7,6 +7,7 @@ import html
 import io
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from PIL import Image
@@ -42,6 +43,36 @@ pre { background: var(--tint); border: 1px solid var(--rule); border-radius: 6px
   "DejaVu Sans Mono", monospace; }
 @media print { body { max-width: none; } figure, tr { break-inside: avoid; } }
 """
+
+_FRAME = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>$style</style>
+</head>
+<body>
+<header>
+<h1>$title</h1>
+{lead}
+</header>
+<main>
+{main}
+</main>
+</body>
+</html>
+"""
+
+
+def page(lead: str, main: str) -> Template:
+    """Return a page to be filled in, with the places ``title`` and ``style`` as well.
+
+    Args:
+        lead: HTML below the title.
+        main: HTML of the content; both with places of their own, ``$name``.
+    """
+    return Template(_FRAME.format(lead=lead, main=main))
 
 
 def pairs(values: Mapping[str, Any]) -> str:

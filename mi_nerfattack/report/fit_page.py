@@ -6,7 +6,6 @@ import html
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from mi_nerfattack.capture.evaluation import (
 from mi_nerfattack.capture.fit_options import FitProgress, FitResult
 from mi_nerfattack.capture.frames import PosedImages
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.report.elements import STYLE, figure, pairs, table
+from mi_nerfattack.report.elements import STYLE, figure, page, pairs, table
 from mi_nerfattack.report.fit_plots import write_curve, write_histogram
 from mi_nerfattack.report.verdict import (
     OBJECT,
@@ -40,21 +39,9 @@ from mi_nerfattack.report.view_pictures import (
 
 _SHOWN_VIEWS = 4
 
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-<header>
-<h1>$title</h1>
-<p>$verdict</p>
-</header>
-<main>
-<h2>Criteria</h2>
+_PAGE = page(
+    "<p>$verdict</p>",
+    """<h2>Criteria</h2>
 <div class="scroll">$criteria</div>
 <h2>Summary</h2>
 <div class="scroll">$summary</div>
@@ -69,11 +56,8 @@ $curve
 $histogram
 <div class="scroll">$views</div>
 <h2>Settings</h2>
-<div class="scroll">$settings</div>
-</main>
-</body>
-</html>
-""")
+<div class="scroll">$settings</div>""",
+)
 
 
 def write_fit_report(

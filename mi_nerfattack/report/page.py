@@ -5,28 +5,15 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from mi_nerfattack import files
-from mi_nerfattack.report.elements import STYLE, figure, pairs
+from mi_nerfattack.report.elements import STYLE, figure, page, pairs
 
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-<header>
-<h1>$title</h1>
-<p>Seed $seed. Distances are measured from the lane centre. A step departs when the
-car touches the edge of its lane.</p>
-</header>
-<main>
-<h2>Metrics</h2>
+_PAGE = page(
+    """<p>Seed $seed. Distances are measured from the lane centre. A step departs when
+the car touches the edge of its lane.</p>""",
+    """<h2>Metrics</h2>
 <div class="scroll">$metrics</div>
 $figures
 <h2>Cost</h2>
@@ -34,11 +21,8 @@ $figures
 <h2>Versions</h2>
 <div class="scroll">$versions</div>
 <h2>Scenario</h2>
-<pre>$scenario</pre>
-</main>
-</body>
-</html>
-""")
+<pre>$scenario</pre>""",
+)
 
 _COLUMNS = {
     "n": "runs",
