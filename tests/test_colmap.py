@@ -30,7 +30,10 @@ POINTS = ((0.0, 0.1, 0.2), (1.0, -1.0, 0.5), (-0.25, 0.5, 2.0))
 
 def write_text_model(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    join = lambda values: " ".join(map(repr, values))  # noqa: E731
+
+    def join(values) -> str:
+        return " ".join(map(repr, values))
+
     (folder / "cameras.txt").write_text(
         "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
         f"1 OPENCV {WIDTH} {HEIGHT} {join(OPENCV)}\n"
