@@ -5,20 +5,66 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import torch
 
 from mi_nerfattack.errors import InputError
 
+#: What a policy carries from one control period to the next: arrays of its own kind.
+Memory = tuple[Any, ...]
+
 
 class AbstractPolicy(ABC):
     """Map from images to controls with a vector-Jacobian product.
 
     Images and controls are Dr.Jit arrays, so that the closed loop needs to know no
-    other library. A call starts by waiting for the images.
+    other library. A call starts by waiting for the images. The closed loop calls
+    `step` and its derivatives; those here are of policies without memory.
+
+    Attributes:
+        differentiable: whether derivatives exist; gradient methods refuse others.
     """
+
+    differentiable: ClassVar[bool] = True
+
+    def initial_memory(self, count: int) -> Memory:
+        """Return the memory of `count` vehicles before their first image."""
+        del count
+        return ()
+
+    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+        """Evaluate the policy and its next memory.
+
+        Args:
+            image: as for `control`.
+            goal: as for `control`.
+            memory: from `initial_memory` or the step before; left unchanged.
+
+        Returns:
+            The control, as `control` gives it, and the memory for the next step.
+        """
+        return self.control(image, goal), memory
+
+    def step_vjp(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Multiply cotangents by the derivative of `step`.
+
+        Args:
+            image: as given to `step`.
+            goal: likewise.
+            memory: likewise.
+            cotangent: row (n,), derivative of the objective by the control.
+            d_memory: derivative of the objective by the memory that `step`
+                returned, of its structure; ``()`` after the last step.
+
+        Returns:
+            Derivatives of the objective by the image and by `memory`.
+        """
+        del memory, d_memory
+        return self.vjp(image, goal, cotangent)[1], ()
 
     @abstractmethod
     def control(self, image: Any, goal: Any) -> Any:

@@ -1,0 +1,89 @@
+"""What a drive costs: the interface between the closed loop and its objectives."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+
+@dataclass(frozen=True)
+class StateHistory:
+    """All states of a batch of drives but the initial ones, as one wide array.
+
+    Attributes:
+        rows: (m, n T): entry ``i T + t - 1`` is the state of vehicle i after t control
+            periods, t = 1 to T; its first three rows are px, py (metres), theta
+            (radians).
+        count: n.
+        horizon: T.
+        dt: control period, seconds.
+    """
+
+    rows: Any
+    count: int
+    horizon: int
+    dt: float
+
+    @property
+    def time(self) -> Any:
+        """Seconds since the start, (n T,)."""
+        index = dr.arange(dr.uint32_array_t(self._row), self.count * self.horizon)
+        return self.dt * (self._row(index % self.horizon) + 1)
+
+    def total(self, values: Any) -> Any:
+        """Sum values (n T,) over the time of each drive: (n,)."""
+        return dr.block_reduce(dr.ReduceOp.Add, values, self.horizon)
+
+    def running(self, values: Any) -> Any:
+        """Sum values (n T,) from the start of each drive up to each time: (n T,)."""
+        return dr.block_prefix_reduce(
+            dr.ReduceOp.Add, values, self.horizon, exclusive=False
+        )
+
+    def spread(self, weights: Any) -> Any:
+        """Repeat one number a control period, (T,), for all drives: (n T,)."""
+        values = np.tile(np.asarray(weights, np.float64), self.count)
+        result = self._row(values)
+        dr.make_opaque(result)
+        return result
+
+    @property
+    def _row(self) -> Any:
+        return dr.detached_t(type(self.rows[0]))
+
+
+class AbstractObjective(ABC):
+    """Cost of a drive. Gradient methods make it smaller.
+
+    Members are written in Dr.Jit operations; derivatives follow from automatic
+    differentiation. Cost: one launch forward and one backward a drive.
+    """
+
+    @abstractmethod
+    def evaluate(self, states: StateHistory) -> Any:
+        """Evaluate one cost a drive, (n,), differentiable in `states.rows`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageSum(AbstractObjective):
+    """``sum_t w_t C(x_t)`` over t = 1 to T.
+
+    Attributes:
+        cost: C, maps states (m, k) to (k,), in Dr.Jit operations.
+        weights: (T,) w; ones when left out.
+    """
+
+    cost: Callable[[Any], Any]
+    weights: np.ndarray | None = None
+
+    def evaluate(self, states: StateHistory) -> Any:
+        """See :meth:`AbstractObjective.evaluate`."""
+        values = self.cost(states.rows)
+        if self.weights is not None:
+            values = values * states.spread(self.weights)
+        return states.total(values)
