@@ -103,14 +103,15 @@ def test_residual_of_a_step_is_zero(integrator, dynamics):
     x = integrator.step(dynamics, x_prev, u, 0.05)
     residual = integrator.residual(dynamics, x_prev, x, u, 0.05)
     assert np.abs(residual.numpy()).max() < 1e-13
+    integrator.check(dynamics, x_prev, x, u, 0.05)
     assert integrator.explicit != isinstance(integrator, ImplicitMidpoint)
 
 
 def test_midpoint_reports_divergence():
+    start, u = array64([[2.0], [9.0], [0.0]]), row64([0.0])
     with pytest.raises(InputError, match=r"dt = 3.0 s.*smaller dt"):
-        ImplicitMidpoint(1).step(
-            Spring(), array64([[2.0], [9.0], [0.0]]), row64([0.0]), 3.0
-        )
+        end = ImplicitMidpoint(1).step(Spring(), start, u, 3.0)
+        ImplicitMidpoint(1).check(Spring(), start, end, u, 3.0)
     with pytest.raises(InputError, match="iterations"):
         ImplicitMidpoint(0)
 

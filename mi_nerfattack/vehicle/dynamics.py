@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
+import numpy as np
 
 from mi_nerfattack.errors import InputError
 
@@ -54,7 +55,30 @@ class AbstractDynamics(ABC):
 
     Write your own by giving `derivative` and `saturate` in Dr.Jit operations; every
     derivative that the adjoint needs follows from automatic differentiation.
+
+    Attributes:
+        recordable: whether `derivative` consists of Dr.Jit operations alone, so that
+            `drjit.freeze` can record it; false where it calls another library.
     """
+
+    recordable: ClassVar[bool] = True
+
+    @property
+    def state_size(self) -> int:
+        """Number m of rows of a state; the first three are px, py, theta."""
+        return 3
+
+    def extend(self, poses: np.ndarray) -> np.ndarray:
+        """Complete poses to states at rest in all other rows.
+
+        Args:
+            poses: (n, 3), metres and radians.
+
+        Returns:
+            (n, m), zeros appended.
+        """
+        poses = np.atleast_2d(np.asarray(poses, np.float64))
+        return np.pad(poses, ((0, 0), (0, self.state_size - poses.shape[1])))
 
     @abstractmethod
     def derivative(self, state: Any, control: Any) -> Any:

@@ -47,6 +47,16 @@ class AbstractIntegrator(ABC):
     ) -> Any:
         """Evaluate G (3, n), in the state's units, zero where `x` is the step."""
 
+    def check(
+        self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
+    ) -> None:
+        """Raise `InputError` unless `x` is the step from `x_prev`.
+
+        Only an implicit step can fail; this waits for its result, so call it outside
+        of anything that is recorded by `drjit.freeze`.
+        """
+        del dynamics, x_prev, x, u, dt
+
 
 @dataclass(frozen=True)
 class ExplicitEuler(AbstractIntegrator):
@@ -90,9 +100,9 @@ class RK4(AbstractIntegrator):
 class ImplicitMidpoint(AbstractIntegrator):
     """`x = x_prev + dt f((x_prev + x)/2, u)`: second order, A-stable, symmetric.
 
-    Newton's method with a fixed number of iterations, recorded as one kernel; the
-    remaining residual is then checked, which waits for the device once a step. Not
-    worth its cost for a Dubins car; meant for stiff models of your own.
+    Newton's method with a fixed number of iterations, recorded as one kernel; `check`
+    looks at the remaining residual, which waits for the device. Not worth its cost for
+    a Dubins car; meant for stiff models of your own.
 
     Args:
         iterations: Newton iterations; the error squares with each.
@@ -108,18 +118,13 @@ class ImplicitMidpoint(AbstractIntegrator):
             )
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
-        """Advance (3, n) by dt seconds.
-
-        Raises:
-            InputError: Newton's method has not converged to rounding error.
-        """
+        """Advance (3, n) by dt seconds; call `check` with the result."""
         x_prev, control = dr.detach(x), dr.detach(u)
         x_next = type(x_prev)(x_prev)  # an Euler step overshoots in stiff models
         for _ in range(self.iterations):
             defect = self.residual(dynamics, x_prev, x_next, control, dt)
             columns = self._jacobian(dynamics, x_prev, x_next, control, dt)
             x_next = x_next - solve_columns(columns, defect)
-        self._check(dynamics, x_prev, x_next, control, dt)
         if not dr.grad_enabled(x, u):
             return x_next
         # One more iteration with a constant Jacobian: the value stays, and its
@@ -147,10 +152,11 @@ class ImplicitMidpoint(AbstractIntegrator):
             for unit, slope in zip(identity, slopes, strict=True)
         ]
 
-    def _check(
+    def check(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> None:
         """Raise `InputError` unless the residual is a rounding error."""
+        x_prev, x, u = dr.detach(x_prev), dr.detach(x), dr.detach(u)
         scale = 1 + dr.max(dr.abs(x_prev)) + dr.max(dr.abs(x))
         epsilon = dr.epsilon(dr.value_t(type(x)))
         defect = dr.max(dr.abs(self.residual(dynamics, x_prev, x, u, dt)))
