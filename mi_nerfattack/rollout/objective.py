@@ -10,6 +10,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.errors import InputError
+
 
 @dataclass(frozen=True)
 class StateHistory:
@@ -35,6 +37,14 @@ class StateHistory:
         index = dr.arange(dr.uint32_array_t(self._row), self.count * self.horizon)
         return self.dt * (self._row(index % self.horizon) + 1)
 
+    @property
+    def final(self) -> Any:
+        """State of each vehicle after the last control period, (m, n)."""
+        vehicle = dr.arange(dr.uint32_array_t(self._row), self.count)
+        index = vehicle * self.horizon + (self.horizon - 1)
+        rows = [self.rows[i] for i in range(len(self.rows))]
+        return type(self.rows)([dr.gather(type(row), row, index) for row in rows])
+
     def total(self, values: Any) -> Any:
         """Sum values (n T,) over the time of each drive: (n,)."""
         return dr.block_reduce(dr.ReduceOp.Add, values, self.horizon)
@@ -46,8 +56,18 @@ class StateHistory:
         )
 
     def spread(self, weights: Any) -> Any:
-        """Repeat one number a control period, (T,), for all drives: (n T,)."""
-        values = np.tile(np.asarray(weights, np.float64), self.count)
+        """Repeat one number a control period, (T,), for all drives: (n T,).
+
+        Raises:
+            InputError: not T numbers.
+        """
+        weights = np.asarray(weights, np.float64)
+        if weights.shape != (self.horizon,):
+            raise InputError(
+                f"weights: shape {weights.shape}; expected ({self.horizon},), one "
+                "number a control period"
+            )
+        values = np.tile(weights, self.count)
         result = self._row(values)
         dr.make_opaque(result)
         return result
@@ -87,3 +107,38 @@ class StageSum(AbstractObjective):
         if self.weights is not None:
             values = values * states.spread(self.weights)
         return states.total(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Terminal(AbstractObjective):
+    """``C(x_T)``: what counts is where the drive ends.
+
+    Attributes:
+        cost: C, maps states (m, n) to (n,), in Dr.Jit operations.
+    """
+
+    cost: Callable[[Any], Any]
+
+    def evaluate(self, states: StateHistory) -> Any:
+        """See :meth:`AbstractObjective.evaluate`."""
+        return self.cost(states.final)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedSum(AbstractObjective):
+    """``sum_k a_k J_k`` of other objectives; mind that their units differ.
+
+    Attributes:
+        terms: pairs of a weight a_k and an objective J_k, at least one.
+    """
+
+    terms: tuple[tuple[float, AbstractObjective], ...]
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise InputError("WeightedSum.terms: empty; give at least one objective")
+
+    def evaluate(self, states: StateHistory) -> Any:
+        """See :meth:`AbstractObjective.evaluate`."""
+        costs = [weight * term.evaluate(states) for weight, term in self.terms]
+        return sum(costs[1:], costs[0])

@@ -1,4 +1,8 @@
-"""How the costs of a batch of drives become the one number that is minimised."""
+"""How the costs of a batch of drives become the one number that is minimised.
+
+The largest cost is that of the initial pose on which an attack does least, so that
+`CVaR` and `Worst` ask for an attack that works from all of them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+
+from mi_nerfattack.errors import InputError
 
 
 class AbstractReduction(ABC):
@@ -24,3 +30,56 @@ class Mean(AbstractReduction):
     def reduce(self, costs: Any) -> Any:
         """See :meth:`AbstractReduction.reduce`."""
         return dr.mean(costs)
+
+
+@dataclass(frozen=True)
+class CVaR(AbstractReduction):
+    """Conditional value at risk: the mean of the worst fraction f of the drives.
+
+    With costs sorted downwards, the first ``floor(f n)`` count fully and the next one,
+    at the quantile, with the rest of ``f n``; the sum is divided by ``f n``. A fraction
+    of 1 gives the mean; one of 1/n or less gives the largest cost. Drives of equal
+    cost share their weight equally, which is one of the subgradients.
+
+    Source: Rockafellar and Uryasev 2002, proposition 8.
+
+    Attributes:
+        fraction: f, in (0, 1].
+    """
+
+    fraction: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fraction <= 1:
+            raise InputError(f"CVaR.fraction: {self.fraction!r}; above 0, at most 1")
+
+    def reduce(self, costs: Any) -> Any:
+        """See :meth:`AbstractReduction.reduce`."""
+        return _tail_mean(costs, self.fraction * dr.width(costs))
+
+
+@dataclass(frozen=True)
+class Worst(AbstractReduction):
+    """The largest cost; equally large ones share the derivative equally."""
+
+    def reduce(self, costs: Any) -> Any:
+        """See :meth:`AbstractReduction.reduce`."""
+        return _tail_mean(costs, 1.0)
+
+
+def _tail_mean(costs: Any, mass: float) -> Any:
+    """Average the `mass` largest of n costs; compares all pairs, n^2 entries."""
+    count, values = dr.width(costs), dr.detach(costs)
+    pair = dr.arange(dr.uint32_array_t(type(values)), count * count)
+    own = dr.gather(type(values), values, pair // count)
+    other = dr.gather(type(values), values, pair % count)
+    greater = _count(other > own, own, count)
+    equal = _count(other == own, own, count)  # itself included
+    weight = dr.clip(mass - greater, 0, equal) / (equal * mass)
+    return dr.sum(weight * costs)
+
+
+def _count(mask: Any, like: Any, block: int) -> Any:
+    return dr.block_reduce(
+        dr.ReduceOp.Add, dr.select(mask, type(like)(1), type(like)(0)), block
+    )
