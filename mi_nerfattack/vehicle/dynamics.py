@@ -1,9 +1,9 @@
-"""Kinematic vehicle models with a state of position and heading.
+"""Vehicle models: their interface, and two whose state is position and heading.
 
-A state is a Dr.Jit array of three rows, `(px, py, theta)` in metres and radians,
+A state is a Dr.Jit array of m rows, `(px, py, theta, ...)` in metres and radians,
 theta counter-clockwise from +x; each row holds the n vehicles of a batch. Any
-floating-point type of any backend works (`Array3f`, `Array3f64`, LLVM or CUDA,
-with or without derivatives). A control is one such row, (n,).
+floating-point type of any backend works (`Array3f`, `Array3f64`, for m > 3 `ArrayXf64`;
+LLVM or CUDA, with or without derivatives). A control is one such row, (n,).
 """
 
 from __future__ import annotations
@@ -40,6 +40,13 @@ def soft_limit(value: Any, limit: float) -> Any:
     small = dr.select(inside, ratio, 1 / dr.select(inside, 1, ratio))
     scale = 1 / dr.sqrt(dr.sqrt(dr.sqrt(1 + dr.square(dr.square(dr.square(small))))))
     return limit * scale * dr.select(inside, ratio, dr.sign(ratio))
+
+
+def require_steer(owner: str, max_steer: float) -> None:
+    """Raise `InputError` unless a steering limit, radians, is between 0 and pi/2."""
+    require_positive(owner, max_steer=max_steer)
+    if max_steer >= dr.pi / 2:
+        raise InputError(f"{owner}.max_steer: {max_steer!r} rad; it must be below pi/2")
 
 
 def require_positive(owner: str, **values: float) -> None:
@@ -85,16 +92,23 @@ class AbstractDynamics(ABC):
         """Compute the time derivative of the state.
 
         Args:
-            state: (3, n), metres and radians.
+            state: (m, n), metres and radians.
             control: (n,), within its limits: call `saturate` before.
 
         Returns:
-            (3, n), metres per second and radians per second.
+            (m, n), metres per second and radians per second.
         """
 
     @abstractmethod
     def saturate(self, control: Any) -> Any:
         """Limit a commanded control (n,) smoothly to what the vehicle can do."""
+
+    def check(self, state: Any) -> None:
+        """Raise `InputError` where a state (m, n) shows that the model has failed.
+
+        Models of ours cannot; for others this waits for the device.
+        """
+        del state
 
 
 @dataclass(frozen=True)
@@ -145,16 +159,8 @@ class Ackermann(AbstractDynamics):
     max_steer: float = 0.6
 
     def __post_init__(self) -> None:
-        require_positive(
-            "Ackermann",
-            speed=self.speed,
-            wheelbase=self.wheelbase,
-            max_steer=self.max_steer,
-        )
-        if self.max_steer >= dr.pi / 2:
-            raise InputError(
-                f"Ackermann.max_steer: {self.max_steer!r} rad; it must be below pi/2"
-            )
+        require_positive("Ackermann", speed=self.speed, wheelbase=self.wheelbase)
+        require_steer("Ackermann", self.max_steer)
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""

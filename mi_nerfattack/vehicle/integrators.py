@@ -15,6 +15,7 @@ import drjit as dr
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+from mi_nerfattack.vehicle.linear import solve_columns
 
 
 @dataclass(frozen=True)
@@ -33,29 +34,30 @@ class AbstractIntegrator(ABC):
 
         Args:
             dynamics: vehicle model.
-            x: (3, n) state, metres and radians.
+            x: (m, n) state, metres and radians, m the model's `state_size`.
             u: (n,) control held over the step, already saturated.
             dt: seconds.
 
         Returns:
-            (3, n) state; derivatives with respect to `x` and `u` are tracked.
+            (m, n) state; derivatives with respect to `x` and `u` are tracked.
         """
 
     @abstractmethod
     def residual(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> Any:
-        """Evaluate G (3, n), in the state's units, zero where `x` is the step."""
+        """Evaluate G (m, n), in the state's units, zero where `x` is the step."""
 
     def check(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> None:
         """Raise `InputError` unless `x` is the step from `x_prev`.
 
-        Only an implicit step can fail; this waits for its result, so call it outside
-        of anything that is recorded by `drjit.freeze`.
+        An explicit step fails only where the model does (`AbstractDynamics.check`).
+        May wait for the result: call it outside of what `drjit.freeze` records.
         """
-        del dynamics, x_prev, x, u, dt
+        del x_prev, u, dt
+        dynamics.check(x)
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class ExplicitEuler(AbstractIntegrator):
     explicit: ClassVar[bool] = True
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
-        """Advance (3, n) by dt seconds."""
+        """Advance (m, n) by dt seconds."""
         return x + dt * dynamics.derivative(x, u)
 
     def residual(
@@ -82,7 +84,7 @@ class RK4(AbstractIntegrator):
     explicit: ClassVar[bool] = True
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
-        """Advance (3, n) by dt seconds."""
+        """Advance (m, n) by dt seconds."""
         k1 = dynamics.derivative(x, u)
         k2 = dynamics.derivative(x + 0.5 * dt * k1, u)
         k3 = dynamics.derivative(x + 0.5 * dt * k2, u)
@@ -118,7 +120,7 @@ class ImplicitMidpoint(AbstractIntegrator):
             )
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
-        """Advance (3, n) by dt seconds; call `check` with the result."""
+        """Advance (m, n) by dt seconds; call `check` with the result."""
         x_prev, control = dr.detach(x), dr.detach(u)
         x_next = type(x_prev)(x_prev)  # an Euler step overshoots in stiff models
         for _ in range(self.iterations):
@@ -144,23 +146,22 @@ class ImplicitMidpoint(AbstractIntegrator):
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> list[Any]:
         """Compute the columns of dG/dx = 1 - dt/2 df/dx at the midpoint."""
-        midpoint = 0.5 * (x_prev + x)
-        identity = ([1, 0, 0], [0, 1, 0], [0, 0, 1])
-        slopes = state_jacobian(dynamics, midpoint, u)
-        return [
-            type(x)(*unit) - 0.5 * dt * slope
-            for unit, slope in zip(identity, slopes, strict=True)
-        ]
+        columns = state_jacobian(dynamics, 0.5 * (x_prev + x), u)
+        for j, column in enumerate(columns):
+            column *= -0.5 * dt
+            column[j] += 1
+        return columns
 
     def check(
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> None:
         """Raise `InputError` unless the residual is a rounding error."""
+        dynamics.check(x)
         x_prev, x, u = dr.detach(x_prev), dr.detach(x), dr.detach(u)
-        scale = 1 + dr.max(dr.abs(x_prev)) + dr.max(dr.abs(x))
-        epsilon = dr.epsilon(dr.value_t(type(x)))
-        defect = dr.max(dr.abs(self.residual(dynamics, x_prev, x, u, dt)))
-        dr.eval(x, defect, scale)  # one launch for the step and its check
+        defect = self.residual(dynamics, x_prev, x, u, dt)
+        defect, scale = dr.abs(defect), 1 + dr.abs(x_prev) + dr.abs(x)
+        defect, scale = dr.max(defect, axis=0), dr.max(scale, axis=0)
+        epsilon = dr.epsilon(type(defect))
         if dr.all(defect <= 32 * epsilon * scale):  # false for NaN, too
             return
         worst = dr.max(defect)[0]
@@ -175,44 +176,22 @@ def state_jacobian(dynamics: AbstractDynamics, state: Any, control: Any) -> list
 
     Args:
         dynamics: vehicle model.
-        state: (3, n), treated as a constant.
+        state: (m, n), treated as a constant.
         control: (n,), treated as a constant.
 
     Returns:
-        Three columns, each (3, n): column j is df/dx_j, detached.
+        m columns, each (m, n): column j is df/dx_j, detached.
     """
+    size = len(state)
     columns = []
     # A model need not depend on every row: Dubins ignores the position. Nor may the
     # input's gradient be cleared, for a result can be an input, as in `dx/dt = v`.
     flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-    for row in range(3):
+    for row in range(size):
         with dr.resume_grad():
-            rows = [type(state[0])(dr.detach(state[i])) for i in range(3)]
+            rows = [type(state[0])(dr.detach(state[i])) for i in range(size)]
             dr.enable_grad(rows[row])
             slope = dynamics.derivative(type(state)(*rows), dr.detach(control))
             dr.set_grad(rows[row], 1)
             columns.append(dr.detach(dr.forward_to(slope, flags=flags)))
     return columns
-
-
-def solve_columns(columns: list[Any], right: Any) -> Any:
-    """Solve a batch of 3x3 systems given by columns, by Cramer's rule.
-
-    Args:
-        columns: three (3, n) columns of a matrix that is not near singular.
-        right: (3, n).
-
-    Returns:
-        (3, n); differentiable in all arguments.
-    """
-    first, second, third = columns
-    normal = dr.cross(second, third)
-    determinant = dr.dot(first, normal)
-    return (
-        type(right)(
-            dr.dot(right, normal),
-            dr.dot(first, dr.cross(right, third)),
-            dr.dot(first, dr.cross(second, right)),
-        )
-        / determinant
-    )

@@ -1,0 +1,144 @@
+"""The user's own vehicle model, given as a function in Dr.Jit operations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
+
+
+@dataclass(frozen=True)
+class FunctionDynamics(AbstractDynamics):
+    """Vehicle model `dx/dt = function(state, control)`.
+
+    Example, a car that speeds up with the fourth row as its speed:
+
+    >>> import drjit as dr
+    >>> def car(state, control):
+    ...     _, _, theta, speed = state
+    ...     return speed * dr.cos(theta), speed * dr.sin(theta), control, 8 - speed
+    >>> FunctionDynamics(car, size=4, limit=1.5, rest=(5.0,)).state_size
+    4
+
+    Args:
+        function: maps a state (m, n) and a control (n,), within its limit, to the
+            m rows of the derivative, in Dr.Jit operations: an array of the state's
+            type, or a list or tuple of rows. It treats each vehicle alone.
+        size: m, at least 3; the first rows are px, py, theta.
+        limit: of |control|, in its unit; applied by `soft_limit`.
+        rest: initial values of the m - 3 rows after theta; zeros if left out.
+    """
+
+    function: Callable[[Any, Any], Any]
+    size: int = 3
+    limit: float = 1.0
+    rest: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_model("FunctionDynamics", self.size, self.limit, self.rest)
+
+    @property
+    def name(self) -> str:
+        """Class and function, as errors call them."""
+        return f"FunctionDynamics({describe_function(self.function)})"
+
+    @property
+    def state_size(self) -> int:
+        """Number of rows m."""
+        return self.size
+
+    def extend(self, poses: np.ndarray) -> np.ndarray:
+        """Append `rest` to poses (n, 3): (n, m)."""
+        return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
+
+    def derivative(self, state: Any, control: Any) -> Any:
+        """Call the function.
+
+        Raises:
+            InputError: it returned something else than m rows, one entry a vehicle,
+                or rows that do not depend on the control by Dr.Jit operations.
+        """
+        result = self._rows(self.function(state, control), state)
+        if dr.grad_enabled(control) and not dr.grad_enabled(result):
+            raise InputError(
+                f"{self.name}: what it returned has no derivative by the control; "
+                "write it in Dr.Jit operations, without NumPy and dr.detach"
+            )
+        return result
+
+    def saturate(self, control: Any) -> Any:
+        """Limit the control (n,) with `soft_limit`."""
+        return soft_limit(control, self.limit)
+
+    def check(self, state: Any) -> None:
+        """Raise `InputError` where a state (m, n) is not finite."""
+        require_finite(self.name, state.numpy().T)
+
+    def _rows(self, value: Any, state: Any) -> Any:
+        """Bring what the function returned into the type of the state."""
+        kind, row = type(state), type(state[0])
+        array = dr.is_array_v(value) and not dr.is_tensor_v(value)
+        if not (array and dr.depth_v(value) == 2 or isinstance(value, list | tuple)):
+            shape = getattr(value, "shape", None)
+            found = type(value).__name__ + (f" of shape {shape}" if shape else "")
+            raise InputError(self._expected(found))
+        if len(value) != self.size:
+            raise InputError(self._expected(f"{len(value)} rows"))
+        try:
+            rows = [row(item) for item in value]
+        except (TypeError, RuntimeError) as err:
+            kinds = ", ".join(type(item).__name__ for item in value)
+            raise InputError(self._expected(f"rows ({kinds})")) from err
+        widths = [dr.width(item) for item in rows]
+        if any(width not in (1, dr.width(state)) for width in widths):
+            raise InputError(self._expected(f"rows of {widths} entries"))
+        return kind(*rows)
+
+    def _expected(self, found: str) -> str:
+        return (
+            f"{self.name}: returned {found}; {self.size} rows are needed, one number "
+            "for each vehicle"
+        )
+
+
+def require_model(owner: str, size: int, limit: float, rest: tuple[float, ...]) -> None:
+    """Check what describes a model of the user's own; raise `InputError` if wrong."""
+    if size < 3:
+        raise InputError(f"{owner}.size: {size!r}; at least 3 rows: px, py, theta")
+    if not 0 < limit < float("inf"):
+        raise InputError(f"{owner}.limit: {limit!r} is not a positive number")
+    if len(rest) not in (0, size - 3) or not np.isfinite(rest).all():
+        raise InputError(
+            f"{owner}.rest: {rest!r}; {size - 3} finite numbers are needed, one for "
+            f"each row after theta of a state of {size}"
+        )
+
+
+def describe_function(function: Callable[..., Any]) -> str:
+    """Name a function by its module and name, other callables by their class."""
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    module = getattr(function, "__module__", None)
+    return name if module in (None, "__main__") else f"{module}.{name}"
+
+
+def append_rows(poses: np.ndarray, rest: tuple[float, ...]) -> np.ndarray:
+    """Append the same values to every pose: (n, 3) to (n, 3 + len(rest))."""
+    poses = np.atleast_2d(np.asarray(poses, np.float64))
+    return np.hstack([poses, np.broadcast_to(rest, (len(poses), len(rest)))])
+
+
+def require_finite(owner: str, values: np.ndarray) -> None:
+    """Raise `InputError` where states or derivatives (n, m) are not finite."""
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        vehicle = int(np.flatnonzero(~finite)[0])
+        raise InputError(
+            f"{owner}: gave {values[vehicle].tolist()} for vehicle {vehicle}; finite "
+            "numbers are needed: check the function, or take a smaller time step"
+        )
