@@ -1,0 +1,1 @@
+"""Parts of the closed loop that are shared with PyTorch."""
