@@ -23,12 +23,15 @@ from mi_nerfattack.sections import (
     CameraSection,
     DeploymentSection,
     DriveSection,
+    ObjectiveSection,
     ObjectSection,
     PolicySection,
     SceneSection,
     Section,
+    TermSection,
     VehicleSection,
 )
+from mi_nerfattack.user_code import split_reference
 
 BUNDLED = "bundled:"
 
@@ -44,6 +47,7 @@ class Scenario(Section):
     camera: CameraSection = CameraSection()
     vehicle: VehicleSection = VehicleSection()
     drive: DriveSection = DriveSection()
+    objective: ObjectiveSection = ObjectiveSection()
     attack: AttackSection = AttackSection()
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSection = DeploymentSection()
@@ -58,12 +62,15 @@ class Scenario(Section):
             16 hexadecimal digits; equal where the results are, wherever the files lie.
         """
         data = self.model_dump(mode="json")
+        objective = data["objective"]
         sections = (data["scene"], data["policy"], *data["objects"])
-        for section in sections:
-            for key in ("field", "deployment", "routes", "file"):
-                if key in section:
-                    raw = resolve(section[key], base).read_bytes()
-                    section[key] = hashlib.sha256(raw).hexdigest()
+        for section in (*sections, objective, *objective["terms"]):
+            for key in ("field", "deployment", "routes", "file", "target"):
+                if section.get(key):
+                    section[key] = _hash(section[key], base)
+            if section.get("function"):
+                file, name = split_reference(section["function"])
+                section["function"] = f"{_hash(file, base)}:{name}"
         text = json.dumps(data, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -123,7 +130,7 @@ def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenari
 
 def portable_text(text: str, base: str | Path) -> str:
     """Make the relative paths in a scenario's text absolute, to replay it anywhere."""
-    keys = "field|deployment|routes|file"
+    keys = "field|deployment|routes|file|target|function"
     line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)(["\'])((?:(?!\2)[^\n])+)\2')
 
     def absolute(match: re.Match[str]) -> str:
@@ -135,14 +142,21 @@ def portable_text(text: str, base: str | Path) -> str:
     return line.sub(absolute, text)
 
 
+def _hash(name: str, base: str | Path) -> str:
+    return hashlib.sha256(resolve(name, base).read_bytes()).hexdigest()
+
+
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:
     problems = []
     for error in err.errors():
         location = [part for part in error["loc"]]
+        if error["type"] == "keys":  # of a section: two keys that do not go together
+            location.append(error.get("ctx", {})["key"])
         key = ".".join(str(part) for part in location) or "(file)"
         line = _line_of(text, location)
         where = f"{path}:{line}" if line else f"{path}"
-        value = "" if error["type"] == "missing" else f" (is {error['input']!r})"
+        told = error["type"] in ("missing", "keys")
+        value = "" if told else f" (is {error['input']!r})"
         message = error["msg"][0].lower() + error["msg"][1:]
         if error["type"] == "extra_forbidden":
             message = f"unknown key; allowed: {', '.join(_allowed(location))}"
@@ -152,12 +166,13 @@ def _describe(path: str | Path, text: str, err: ValidationError) -> str:
 
 
 def _allowed(location: list[Any]) -> list[str]:
+    items = {"objects": ObjectSection, "terms": TermSection}
     model: Any = Scenario
     for part in location[:-1]:
         if isinstance(part, int):
             continue
         annotation = model.model_fields[part].annotation
-        model = ObjectSection if part == "objects" else annotation
+        model = items.get(part, annotation)
     return list(model.model_fields)
 
 
@@ -167,20 +182,21 @@ def _line_of(text: str, location: list[Any]) -> int | None:
         location = location[:-1]
     tables = [part for part in location[:-1] if isinstance(part, str)]
     index = next((part for part in location if isinstance(part, int)), 0)
-    name, current, seen = str(location[-1]), "", -1
-    header_line = None
+    name, current, header_line = str(location[-1]), "", None
+    seen: dict[str, int] = {}  # items of each array of tables so far
     for number, line in enumerate(text.splitlines(), 1):
         header = re.match(r"\s*\[\[?\s*([^\]]+?)\s*\]\]?", line)
         if header:
             current = header.group(1)
-            seen = seen + 1 if "[[" in line else seen
+            if "[[" in line:
+                seen[current] = seen.get(current, -1) + 1
             if current == ".".join(tables or [name]):
-                header_line = number
+                header_line = number if seen.get(current, 0) <= index else header_line
             continue
         in_table = current == ".".join(tables)
         if line.lstrip().startswith("#") or not in_table:
             continue
-        if tables == ["objects"] and seen != index:
+        if seen.get(current, index) != index:
             continue
         if re.match(rf"\s*[\"']?{re.escape(name)}[\"']?\s*=", line):
             return number

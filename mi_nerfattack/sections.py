@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -103,3 +104,99 @@ class DeploymentSection(Section):
     """The path-traced scene."""
 
     spp: Count = 16
+
+
+class AbstractTerm(Section):
+    """One part of the objective; which keys belong together is checked."""
+
+    kind: Literal[
+        "cross_track",
+        "absolute_cross_track",
+        "heading",
+        "departure_time",
+        "target_path",
+        "function",
+    ] = "cross_track"
+    at: Literal["all_times", "end"] = "all_times"
+    weights: Literal["uniform", "linear", "last", "discount", "listed"] = "uniform"
+    last_s: Positive | None = None
+    discount_per_s: Annotated[float, Field(gt=0, le=1)] | None = None
+    listed_weights: tuple[Finite, ...] | None = None  # one a control period
+    rounding_m: Positive = 0.05
+    rounding_deg: Positive = 1.0
+    limit_m: Positive | None = None  # half of what the lane is wider than the car
+    softness_m: Positive = 0.25
+    target: str | None = None  # JSON of routes
+    target_route: str | None = None
+    function: Annotated[str, Field(pattern=r"\.py:[A-Za-z_]\w*$")] | None = None
+    weight: Finite = 1.0
+
+    @model_validator(mode="after")
+    def _check_keys(self) -> Any:
+        """Refuse keys that do not go together."""
+        for key, other, values in _TERM_KEYS:
+            _check_pair(self, key, other, values)
+        return self
+
+
+class TermSection(AbstractTerm):
+    """A further part of the objective."""
+
+
+class ObjectiveSection(AbstractTerm):
+    """What the attack makes smaller: the sum of this term and further ones."""
+
+    reduction: Literal["mean", "cvar", "worst"] = "mean"  # over the poses
+    cvar_fraction: Annotated[float, Field(gt=0, le=1)] | None = None
+    terms: tuple[TermSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_reduction(self) -> Any:
+        """Refuse a fraction without its reduction, and the other way round."""
+        _check_pair(self, "cvar_fraction", "reduction", ("cvar",))
+        return self
+
+
+_SUMMED = ("cross_track", "absolute_cross_track", "heading", "target_path", "function")
+#: Keys of a term that belong to some values of another key alone.
+_TERM_KEYS = (
+    ("target", "kind", ("target_path",)),
+    ("target_route", "kind", ("target_path",)),
+    ("function", "kind", ("function",)),
+    ("limit_m", "kind", ("departure_time",)),
+    ("softness_m", "kind", ("departure_time",)),
+    ("rounding_m", "kind", ("cross_track", "target_path")),
+    ("rounding_deg", "kind", ("heading",)),
+    ("at", "kind", _SUMMED),
+    ("weights", "kind", _SUMMED),
+    ("weights", "at", ("all_times",)),
+    ("last_s", "weights", ("last",)),
+    ("discount_per_s", "weights", ("discount",)),
+    ("listed_weights", "weights", ("listed",)),
+)
+_OPTIONAL = ("limit_m",)
+
+
+def _check_pair(term: Section, key: str, other: str, values: tuple[str, ...]) -> None:
+    """Raise unless `key` is given exactly where `other` has one of `values`.
+
+    Keys with a default may be left out where they belong; a default is the same as
+    nothing where they do not.
+    """
+    default = type(term).model_fields[key].default
+    value, chosen = getattr(term, key), getattr(term, other)
+    if chosen not in values and value != default:
+        allowed = " or ".join(f'"{name}"' for name in values)
+        raise PydanticCustomError(
+            "keys",
+            'has no meaning with {other} = "{chosen}"; leave it out, or set '
+            "{other} to {allowed}",
+            {"key": key, "other": other, "chosen": chosen, "allowed": allowed},
+        )
+    required = default is None and key not in _OPTIONAL
+    if chosen in values and value is None and required:
+        raise PydanticCustomError(
+            "keys",
+            'is missing; {other} = "{chosen}" needs it',
+            {"key": key, "other": other, "chosen": chosen},
+        )

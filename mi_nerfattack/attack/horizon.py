@@ -70,9 +70,9 @@ def listed(horizon: int, values: Sequence[float]) -> np.ndarray:
     weights = np.asarray(values, np.float64)
     if weights.shape != (horizon,):
         raise InputError(
-            f"weights: {weights.size} numbers for a horizon of {horizon}; give one a "
-            "control period"
+            f"listed_weights: {weights.size} numbers for a horizon of {horizon}; give "
+            "one a control period"
         )
     if not np.isfinite(weights).all() or not weights.any():
-        raise InputError("weights: must be finite and not all zero")
+        raise InputError("listed_weights: must be finite and not all zero")
     return weights

@@ -12,6 +12,9 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 
+#: Maps states (m, k) to their costs (k,), in Dr.Jit operations.
+StageCost = Callable[[Any], Any]
+
 
 @dataclass(frozen=True)
 class StateHistory:
@@ -98,7 +101,7 @@ class StageSum(AbstractObjective):
         weights: (T,) w; ones when left out.
     """
 
-    cost: Callable[[Any], Any]
+    cost: StageCost
     weights: np.ndarray | None = None
 
     def evaluate(self, states: StateHistory) -> Any:
@@ -117,7 +120,7 @@ class Terminal(AbstractObjective):
         cost: C, maps states (m, n) to (n,), in Dr.Jit operations.
     """
 
-    cost: Callable[[Any], Any]
+    cost: StageCost
 
     def evaluate(self, states: StateHistory) -> Any:
         """See :meth:`AbstractObjective.evaluate`."""
