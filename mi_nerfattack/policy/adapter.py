@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
-import drjit as dr
 import torch
+from torch.autograd import forward_ad
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.policy.checks import (
+    check_hidden,
+    check_images,
+    expand_goals,
+    steering,
+)
+from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal
+from mi_nerfattack.policy.preprocess import Preprocess
+from mi_nerfattack.policy.tensors import to_row, to_tensor, to_torch
 
 #: What a policy carries from one control period to the next: arrays of its own kind.
 Memory = tuple[Any, ...]
@@ -124,69 +134,211 @@ class AbstractPolicy(ABC):
 class TorchPolicy(AbstractPolicy):
     """Policy given by a torch module; memory is shared, not copied, both ways.
 
+    The module is called as ``module(image, *goal, *hidden)`` and returns the control,
+    or a tuple of the control and the hidden states for the next image; it changes
+    nothing in place. The memory is the frame stack, where there is one, and the
+    hidden states.
+
     Args:
-        module: maps an image (n, 3, height, width), sRGB in [0, 1], and a goal (n,)
-            int64 to a control (n,), changing neither in place. It is switched to
-            evaluation mode, its parameters are frozen, and it is moved to the
-            device of the images.
-        goals: number of goals; `module.goals` unless given.
+        module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
+            height, width), sRGB in [0, 1], unless told otherwise, and gives controls
+            (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
+            evaluation mode, its parameters are frozen, and it is moved to the device
+            of the images.
+        goal: how the goal is passed; ``IntegerGoal(module.goals)`` unless given.
+        preprocess: from the camera's image to the network's.
+        recurrent: shapes of the hidden states, zero at first, with -1 for the number
+            of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.
+        control_scale: factor from the module's unit and sign to the vehicle's.
+        output: column of the control, needed where there are several.
+        name: for messages; the module's class unless given.
     """
 
-    def __init__(self, module: torch.nn.Module, goals: int | None = None) -> None:
+    def __init__(
+        self,
+        module: torch.nn.Module,
+        goal: AbstractGoal | None = None,
+        preprocess: Preprocess | None = None,
+        recurrent: Sequence[Sequence[int]] = (),
+        control_scale: float = 1.0,
+        output: int | None = None,
+        name: str | None = None,
+    ) -> None:
         """Take over `module`."""
-        self.module = module.eval().requires_grad_(False)
-        count = getattr(module, "goals", None) if goals is None else goals
-        if not isinstance(count, int) or count < 1:
-            raise InputError(f"TorchPolicy.goals: {count!r}; an integer of at least 1")
-        self.goals = count
+        self.module = module.eval()
+        for parameter in module.parameters():  # a ScriptModule has no requires_grad_
+            parameter.requires_grad_(False)
+        self.goal = _own_goal(module) if goal is None else goal
+        self.preprocess = preprocess or Preprocess()
+        self.recurrent = check_hidden(recurrent)
+        self.control_scale, self.output = float(control_scale), output
+        self.name = name or type(module).__name__
 
     def control(self, image: Any, goal: Any) -> Any:
-        """Evaluate the module without recording a graph."""
-        with torch.no_grad():
-            return to_row(self._evaluate(to_torch(image), goal), image)
+        """Evaluate the module on first images, without recording a graph."""
+        return self.step(image, goal, self.initial_memory(len(image)))[0]
 
     def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
-        """Evaluate the module and its reverse derivative, one graph at a time."""
-        leaf = to_torch(image).detach().requires_grad_(True)
+        """Evaluate the module and its reverse derivative on first images."""
+        memory = self.initial_memory(len(image))
+        control, (d_image, *_) = self._pull_back(image, goal, memory, cotangent, ())
+        return to_row(control, image), to_tensor(d_image, image)
+
+    def initial_memory(self, count: int) -> Memory:
+        """Return an empty frame stack, where there is one, and zeros."""
+        like = self._precision()
+        stack = (torch.zeros(count, 0, 0, 0, 0, dtype=like),)
+        hidden = (
+            torch.zeros([count if size < 0 else size for size in shape], dtype=like)
+            for shape in self.recurrent
+        )
+        return (*(stack if self.preprocess.history else ()), *hidden)
+
+    def memory_bytes(self, memory: Memory) -> int:
+        """Return the size of all tensors, bytes."""
+        return sum(part.numel() * part.element_size() for part in memory)
+
+    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+        """Evaluate the module without recording a graph."""
+        with torch.no_grad():
+            control, after = self._evaluate(to_torch(image), goal, memory)
+        return to_row(control, image), after
+
+    def step_vjp(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Evaluate the module again and its reverse derivative, one graph at a time."""
+        _, (d_image, *rest) = self._pull_back(image, goal, memory, cotangent, d_memory)
+        return to_tensor(d_image, image), tuple(rest)
+
+    def step_jvp(
+        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Evaluate the module on dual numbers."""
+        primals = (to_torch(image), *memory)
+        tangents = (to_torch(t_image), *(t_memory or map(torch.zeros_like, memory)))
+        with torch.no_grad(), forward_mode():
+            duals = [
+                forward_ad.make_dual(primal, tangent.to(primal))
+                for primal, tangent in zip(primals, tangents, strict=True)
+            ]
+            control, after = self._evaluate(duals[0], goal, tuple(duals[1:]))
+            t_control, *t_after = [_tangent(value) for value in (control, *after)]
+        return to_row(t_control, image), tuple(t_after)
+
+    def _pull_back(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """Return the control, and derivatives by the image and each part of memory."""
+        leaves = [
+            part.detach().requires_grad_(True) for part in (to_torch(image), *memory)
+        ]
         with torch.enable_grad():
-            control = self._evaluate(leaf, goal)
+            control, after = self._evaluate(leaves[0], goal, tuple(leaves[1:]))
         weight = to_torch(cotangent).to(control)
         if weight.shape != control.shape:
             raise InputError(
                 f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
             )
-        (gradient,) = torch.autograd.grad(control, leaf, weight)
-        return to_row(control, image), to_tensor(gradient, image)
+        weights = (weight, *(d_memory or map(torch.zeros_like, after)))
+        pairs = zip((control, *after), weights, strict=True)
+        used = [(value, weight) for value, weight in pairs if value.requires_grad]
+        gradients: Sequence[torch.Tensor | None] = [None]
+        if used:
+            values, weights = zip(*used, strict=True)
+            gradients = torch.autograd.grad(values, leaves, weights, allow_unused=True)
+        if gradients[0] is None:
+            raise InputError(
+                f"{self.name}: its control has no derivative by the image; it must "
+                "not detach the image or leave torch"
+            )
+        filled = [
+            torch.zeros_like(leaf) if gradient is None else gradient
+            for leaf, gradient in zip(leaves, gradients, strict=True)
+        ]
+        return control, tuple(filled)
 
-    def _evaluate(self, image: torch.Tensor, goal: Any) -> torch.Tensor:
+    def _evaluate(
+        self, image: torch.Tensor, goal: Any, memory: Memory
+    ) -> tuple[torch.Tensor, Memory]:
         """Apply the module to (n, height, width, 3), in the module's precision."""
-        if image.ndim != 4 or image.shape[3] != 3:
-            raise InputError(
-                f"image: shape {tuple(image.shape)}; (n, height, width, 3) is needed"
-            )
+        check_images(image)
         self.module.to(image.device)
-        parameter = next(self.module.parameters(), image)
-        planes = image.permute(0, 3, 1, 2).to(parameter.dtype)
-        control = self.module(planes, self._goals(goal, image))
-        if control.shape != image.shape[:1]:
+        image = image.to(self._precision() or image.dtype)
+        memory = tuple(part.to(image) for part in memory)
+        planes = self.preprocess.stage(image)
+        past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
+        network_image, past = self.preprocess.stack(planes, past)
+        hidden = memory[1:] if self.preprocess.history else memory
+        goals = self.goal.arguments(expand_goals(goal, image), image)
+        outputs = self._call(network_image, *goals, *hidden)
+        control = steering(outputs[0], len(image), self.output, self.name)
+        after = outputs[1:]
+        shapes = [tuple(part.shape) for part in after]
+        if shapes != [tuple(part.shape) for part in hidden]:
             raise InputError(
-                f"policy: controls {tuple(control.shape)} for {len(image)} images; "
-                "the module must return one number for each image"
+                f"{self.name}: hidden states {shapes} come out where "
+                f"{[tuple(part.shape) for part in hidden]} went in; declare their "
+                "shapes as policy.recurrent"
             )
-        return control
+        stack = (past,) if self.preprocess.history else ()
+        return self.control_scale * control, (*stack, *after)
 
-    def _goals(self, goal: Any, image: torch.Tensor) -> torch.Tensor:
-        """Expand and check goals, (n,) int64 on the image's device."""
-        if dr.is_array_v(goal):
-            goal = to_torch(goal)
-        values = torch.as_tensor(goal).to(image.device, torch.int64)
-        if values.shape not in (torch.Size([]), image.shape[:1]):
+    def _call(self, image: torch.Tensor, *rest: torch.Tensor) -> tuple[Any, ...]:
+        """Call the module; what goes wrong in it is told with the input's shape."""
+        try:
+            result = self.module(image, *rest)
+        except (InputError, torch.OutOfMemoryError):
+            raise
+        except (RuntimeError, TypeError, ValueError, IndexError) as err:
+            if is_interrupt(err):
+                raise
+            shapes = [tuple(part.shape) for part in (image, *rest)]
             raise InputError(
-                f"goal: shape {tuple(values.shape)} for {len(image)} images"
-            )
-        if ((values < 0) | (values >= self.goals)).any():
-            raise InputError(f"goal: {goal}; at least 0 and below {self.goals}")
-        return values.expand(len(image))
+                f"{self.name}: fails on an input of shape {shapes[0]}, with goal and "
+                f"hidden states {shapes[1:]}: {err}; declare policy.preprocess, goal "
+                "and recurrent as the network needs them"
+            ) from err
+        return tuple(result) if isinstance(result, (tuple, list)) else (result,)
+
+    def _precision(self) -> torch.dtype | None:
+        """Return the type of the module's parameters and buffers, if it has any."""
+        tensors = (*self.module.parameters(), *self.module.buffers())
+        return next((t.dtype for t in tensors if t.is_floating_point()), None)
+
+
+@contextmanager
+def forward_mode() -> Iterator[None]:
+    """Open a level of torch's forward mode.
+
+    The fused kernels of cuDNN and oneDNN have no forward derivative of recurrent
+    layers and are not used. Switching them, and opening the level, warns of nothing
+    that a caller could change.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+        warnings.filterwarnings("ignore", "TF32 acceleration on top", UserWarning)
+        with (
+            torch.backends.mkldnn.flags(enabled=False),
+            torch.backends.cudnn.flags(enabled=False),
+            forward_ad.dual_level(),
+        ):
+            yield
+
+
+def _tangent(value: torch.Tensor) -> torch.Tensor:
+    tangent = forward_ad.unpack_dual(value).tangent
+    return torch.zeros_like(value) if tangent is None else tangent
+
+
+def _own_goal(module: torch.nn.Module) -> AbstractGoal:
+    count = getattr(module, "goals", None)
+    if not isinstance(count, int):
+        raise InputError(
+            f"{type(module).__name__}.goals: {count!r}; an integer of at least 1, or "
+            "pass goal=NoGoal()"
+        )
+    return IntegerGoal(count)
 
 
 @contextmanager
@@ -198,35 +350,3 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def to_torch(array: Any) -> torch.Tensor:
-    """View a Dr.Jit array or tensor, detached, as torch's; waits until it is there."""
-    values = dr.detach(array)
-    dr.eval(values)
-    dr.sync_thread()
-    if dr.backend_v(values) == dr.JitBackend.CUDA:
-        return values.torch()
-    # DLPack runs Python inside of C++ that drops a Ctrl-C; NumPy's memory does not
-    return torch.from_numpy(values.numpy())
-
-
-def to_tensor(value: torch.Tensor, like: Any) -> Any:
-    """Make a Dr.Jit tensor of the type of `like`; evaluated, never a literal."""
-    return type(like)(_settled(value, like))
-
-
-def to_row(value: torch.Tensor, like: Any) -> Any:
-    """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
-    return dr.array_t(like)(_settled(value, like))
-
-
-def _settled(value: torch.Tensor, like: Any) -> Any:
-    """Bring a result into the scalar type of `like` and wait for its device."""
-    scalar = torch.float64 if dr.type_v(like) == dr.VarType.Float64 else torch.float32
-    value = value.detach().to(scalar).contiguous()
-    if not value.is_cuda:
-        return value.numpy()  # see `to_torch`
-    # Dr.Jit has a stream of its own
-    torch.cuda.current_stream(value.device).synchronize()
-    return value
