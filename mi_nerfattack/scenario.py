@@ -34,6 +34,17 @@ from mi_nerfattack.sections import (
 from mi_nerfattack.user_code import split_reference
 
 BUNDLED = "bundled:"
+#: Keys that name files, in any section.
+FILE_KEYS = (
+    "field",
+    "deployment",
+    "routes",
+    "file",
+    "weights_file",
+    "target",
+    "function",
+)
+_REFERENCE = re.compile(r"\.py:\w+$")
 
 
 class Scenario(Section):
@@ -65,12 +76,9 @@ class Scenario(Section):
         objective = data["objective"]
         sections = (data["scene"], data["policy"], *data["objects"])
         for section in (*sections, objective, *objective["terms"]):
-            for key in ("field", "deployment", "routes", "file", "target"):
+            for key in FILE_KEYS:
                 if section.get(key):
                     section[key] = _hash(section[key], base)
-            if section.get("function"):
-                file, name = split_reference(section["function"])
-                section["function"] = f"{_hash(file, base)}:{name}"
         text = json.dumps(data, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -130,7 +138,7 @@ def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenari
 
 def portable_text(text: str, base: str | Path) -> str:
     """Make the relative paths in a scenario's text absolute, to replay it anywhere."""
-    keys = "field|deployment|routes|file|target|function"
+    keys = "|".join(FILE_KEYS)
     line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)(["\'])((?:(?!\2)[^\n])+)\2')
 
     def absolute(match: re.Match[str]) -> str:
@@ -142,8 +150,15 @@ def portable_text(text: str, base: str | Path) -> str:
     return line.sub(absolute, text)
 
 
-def _hash(name: str, base: str | Path) -> str:
-    return hashlib.sha256(resolve(name, base).read_bytes()).hexdigest()
+def _hash(value: str, base: str | Path) -> str:
+    """Hash the content of ``FILE`` or ``FILE.py:NAME``, and the name."""
+    file, name = (value, "") if not _REFERENCE.search(value) else split_reference(value)
+    path = resolve(file, base)
+    try:
+        raw = path.read_bytes()
+    except OSError as err:
+        raise InputError(f"{path}: {err.strerror}; check the path") from err
+    return hashlib.sha256(raw).hexdigest() + name
 
 
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -11,6 +11,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
+Whole = Annotated[int, Field(ge=0)]
+Part = Annotated[float, Field(ge=0, lt=1)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Matrix = tuple[Row, Row, Row, Row]
 
@@ -42,10 +44,68 @@ class ObjectSection(Section):
     scale: Positive = 1.0
 
 
+class PreprocessSection(Section):
+    """From the camera's image to the policy's input, in the order of the keys."""
+
+    crop_px: tuple[Whole, Whole, Whole, Whole] | None = None  # see crop_fraction
+    crop_fraction: tuple[Part, Part, Part, Part] | None = None  # top bottom left right
+    resize_px: tuple[Count, Count] | None = None  # width, height
+    filter: Literal["antialias", "bilinear", "area"] = "antialias"
+    colour: Literal["srgb", "linear", "yuv", "grey", "bgr"] = "srgb"
+    scale: Positive = 1.0  # of values in [0, 1]
+    mean: Annotated[tuple[Finite, ...], Field(min_length=1)] = (0.0,)
+    std: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
+    frames: Count = 1  # in the stack
+    stride: Count = 1  # control periods between them
+    layout: Literal["NCHW", "NHWC", "NTCHW", "NTHWC"] = "NCHW"
+
+    @model_validator(mode="after")
+    def _check_crops(self) -> Any:
+        """Refuse two crops."""
+        if self.crop_px is not None and self.crop_fraction is not None:
+            _refuse("crop_fraction", "stands beside crop_px; give one of them")
+        return self
+
+
 class PolicySection(Section):
     """The policy under test."""
 
-    file: str  # PilotNet, safetensors
+    kind: (
+        Literal[
+            "pilotnet",
+            "module",
+            "exported",
+            "torchscript",
+            "onnx",
+            "drjit",
+            "callable",
+            "http",
+        ]
+        | None
+    ) = None  # told by the suffix of the file: .safetensors .py .pt2 .pt .onnx
+    file: str | None = None  # or FILE.py:NAME
+    weights_file: str | None = None  # of a module: .safetensors, or a state dict .pt
+    url: str | None = None
+    timeout_s: Positive = 10.0  # of an answer from the URL
+    retries: Whole = 2
+    goal: Literal["integer", "one_hot", "none"] | None = None  # PilotNet's own, or none
+    goals: Count | None = None
+    recurrent: tuple[tuple[int, ...], ...] = ()  # shapes, -1 for the vehicles
+    batch: Literal[1] | None = None  # where it takes one image at a time
+    output: Whole | None = None  # column of the control, where there are several
+    control_scale: Finite = 1.0  # to rad/s (dubins) or rad, positive to the left
+    preprocess: PreprocessSection = PreprocessSection()
+
+    @model_validator(mode="after")
+    def _check_source(self) -> Any:
+        """Refuse anything but one source, and goals without their number."""
+        if (self.file is None) == (self.url is None):
+            _refuse("file", "give either file or url")
+        if self.goal in ("integer", "one_hot") and self.goals is None:
+            _refuse("goals", f'is missing; goal = "{self.goal}" needs it')
+        if self.goal not in ("integer", "one_hot") and self.goals is not None:
+            _refuse("goals", 'needs goal = "integer" or "one_hot"')
+        return self
 
 
 class CameraSection(Section):
@@ -200,3 +260,8 @@ def _check_pair(term: Section, key: str, other: str, values: tuple[str, ...]) ->
             'is missing; {other} = "{chosen}" needs it',
             {"key": key, "other": other, "chosen": chosen},
         )
+
+
+def _refuse(key: str, reason: str) -> NoReturn:
+    """Raise an error of a key that a check of the whole section found."""
+    raise PydanticCustomError("keys", "{reason}", {"key": key, "reason": reason})
