@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -328,3 +330,21 @@ target_route = "verge"
     assert digest() not in (first, second)
     write(text.replace("squared", "slope"))
     assert digest() not in (first, second)
+
+
+def test_examples_of_the_manual(write, tmp_path):
+    """The scenario and the function in docs/attack.md work as they are written."""
+    manual = (Path(__file__).parents[1] / "docs" / "attack.md").read_text("utf-8")
+    section = manual[manual.index("## The objective") :]
+    [toml] = re.findall(r"```toml\n(.*?)```", section, re.S)[:1]
+    objective = build(write(toml))
+    assert [weight for weight, _ in objective.terms] == [1.0, 0.1]
+    blocks = re.findall(r"```python\n(.*?)```", section, re.S)
+    (tmp_path / "manual.py").write_text(blocks[0])
+    function = "manual.py:leave_to_the_right"
+    objective = build(write(f'[objective]\nkind = "function"\nfunction = "{function}"'))
+    state = dr.llvm.ad.Array3f64([0, 0], [1, -7], [0, 0])
+    assert objective.cost(state).numpy().tolist() == [7, 0]
+    names = {"route": ROUTE, "weights": np.ones(4)}
+    exec(blocks[1], names)
+    assert len(names["objective"].terms) == 2
