@@ -263,6 +263,23 @@ def test_history_of_time(rng):
     np.testing.assert_array_equal(found.final.numpy().T, states[:, -1])
 
 
+def test_no_kernel_is_compiled_twice(rng):
+    """Other states, as in the next iteration of an attack, run the same kernels."""
+    weighted = StageSum(AbsoluteDeviation(ROUTE), linear(5))
+    objective = WeightedSum(((1.0, CASES["sum"][0]), (2.0, weighted)))
+    misses = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for _ in range(3):
+            dr.kernel_history_clear()
+            leaf = history(drives(rng, 4, 5))
+            dr.enable_grad(leaf.rows)
+            dr.backward(CVaR(0.3).reduce(objective.evaluate(leaf)))
+            dr.eval(dr.grad(leaf.rows))
+            entries = dr.kernel_history([dr.KernelType.JIT])
+            misses.append(sum(not entry["cache_hit"] for entry in entries))
+    assert misses[1:] == [0, 0]
+
+
 # --- weights of the horizon -----------------------------------------------------------
 
 
