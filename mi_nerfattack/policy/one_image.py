@@ -1,0 +1,44 @@
+"""Networks that take one image at a time, as many exported ones do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+
+class OneImage(torch.nn.Module):
+    """Call a network once for each vehicle and put its answers side by side.
+
+    Costs n calls where another network costs one of n images.
+
+    Args:
+        network: takes batches of one.
+        recurrent: shapes of its hidden states, -1 for the number of vehicles.
+    """
+
+    def __init__(
+        self, network: torch.nn.Module, recurrent: Sequence[Sequence[int]] = ()
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.axes = [tuple(shape).index(-1) for shape in recurrent]
+
+    def forward(
+        self, image: torch.Tensor, *rest: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Return the control and the hidden states of all vehicles."""
+        goals = len(rest) - len(self.axes)
+        axes = [0] * (1 + goals) + self.axes
+        answers = []
+        for i in range(len(image)):
+            one = [
+                part.narrow(axis, i, 1)
+                for part, axis in zip((image, *rest), axes, strict=True)
+            ]
+            result = self.network(*one)
+            result = result if isinstance(result, (tuple, list)) else (result,)
+            answers.append((result[0].reshape(1, -1), *result[1:]))
+        columns = zip(*answers, strict=True)
+        joined = zip(columns, [0, *self.axes], strict=False)
+        return tuple(torch.cat(parts, axis) for parts, axis in joined)

@@ -1,0 +1,436 @@
+"""The interpreter of ONNX graphs against onnxruntime, and its derivatives."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.adapter import TorchPolicy
+from mi_nerfattack.policy.goals import NoGoal, OneHotGoal
+
+onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+runtime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+
+from mi_nerfattack.policy.onnx_network import OnnxNetwork, load_onnx  # noqa: E402
+
+FLOAT, INT64 = TensorProto.FLOAT, TensorProto.INT64
+
+
+def model(nodes, inputs, outputs, constants=None, opset=17):
+    """Make a model; inputs and outputs are names with (type, shape)."""
+    graph = helper.make_graph(
+        nodes,
+        "test",
+        [helper.make_tensor_value_info(n, *v) for n, v in inputs.items()],
+        [helper.make_tensor_value_info(n, *v) for n, v in outputs.items()],
+        [numpy_helper.from_array(v, n) for n, v in (constants or {}).items()],
+    )
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8
+    )
+
+
+def both(made, *arguments):
+    """Run a model in onnxruntime and here; return both lists of outputs."""
+    options = runtime.SessionOptions()
+    options.log_severity_level = 3
+    session = runtime.InferenceSession(
+        made.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+    names = [item.name for item in session.get_inputs()]
+    expected = session.run(None, dict(zip(names, arguments, strict=True)))
+    with torch.no_grad():
+        actual = OnnxNetwork(made, "net.onnx")(*map(torch.from_numpy, arguments))
+    return expected, [value.numpy() for value in actual]
+
+
+def check(made, *arguments, tolerance=1e-5):
+    expected, actual = both(made, *arguments)
+    assert len(expected) == len(actual)
+    for one, other in zip(expected, actual, strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(other, one, rtol=tolerance, atol=tolerance)
+
+
+def single(operator, x, constants=(), opset=17, extra=(), **attributes):
+    """Check one operator on an input x with constant further inputs."""
+    names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
+    values = dict(zip(names, constants, strict=True))
+    values.pop("", None)
+    node = helper.make_node(operator, ["x", *names], ["y", *extra], **attributes)
+    kind = helper.np_dtype_to_tensor_dtype(x.dtype)
+    outputs = {name: (kind, None) for name in ("y", *extra)}
+    check(model([node], {"x": (kind, x.shape)}, outputs, values, opset), x)
+
+
+def integers(*values):
+    return np.array(values, np.int64)
+
+
+UNARY = [
+    ("Relu", {}),
+    ("Elu", {"alpha": 0.7}),
+    ("LeakyRelu", {"alpha": 0.2}),
+    ("LeakyRelu", {}),
+    ("Selu", {}),
+    ("Sigmoid", {}),
+    ("HardSigmoid", {"alpha": 0.3}),
+    ("HardSwish", {}),
+    ("Tanh", {}),
+    ("Softplus", {}),
+    ("Softsign", {}),
+    ("Abs", {}),
+    ("Neg", {}),
+    ("Exp", {}),
+    ("Erf", {}),
+    ("Sin", {}),
+    ("Cos", {}),
+    ("Identity", {}),
+    ("Dropout", {}),
+    ("Flatten", {}),
+    ("Flatten", {"axis": 2}),
+    ("Flatten", {"axis": 0}),
+    ("Transpose", {"perm": [0, 2, 3, 1]}),
+    ("Transpose", {}),
+    ("Softmax", {}),
+    ("Softmax", {"axis": 1}),
+    ("ReduceMean", {"axes": [2, 3]}),
+    ("ReduceMean", {"keepdims": 0}),
+    ("ReduceMax", {"axes": [1], "keepdims": 0}),
+    ("GlobalAveragePool", {}),
+    ("GlobalMaxPool", {}),
+    ("MaxPool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
+    ("MaxPool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2], "dilations": [1, 2]}),
+    ("MaxPool", {"kernel_shape": [2, 2], "strides": [2, 2], "ceil_mode": 1}),
+    ("AveragePool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
+    ("AveragePool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2]}),
+    (
+        "AveragePool",
+        {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "count_include_pad": 1},
+    ),
+    (
+        "AveragePool",
+        {"kernel_shape": [2, 2], "strides": [2, 2], "auto_pad": "SAME_LOWER"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("operator", "attributes"), UNARY)
+def test_one_input(operator, attributes, rng):
+    single(operator, rng.normal(size=(2, 3, 5, 7)).astype("f4"), **attributes)
+
+
+@pytest.mark.parametrize(
+    ("operator", "opset", "attributes"),
+    [
+        ("Softmax", 11, {"axis": 1}),
+        ("Clip", 9, {"min": -0.5, "max": 0.25}),
+        ("Slice", 9, {"starts": [1, 0], "ends": [5, -1], "axes": [3, 2]}),
+        ("Pad", 9, {"pads": [0, 0, 1, 2, 0, 0, 0, 3], "value": 0.5}),
+        ("Unsqueeze", 11, {"axes": [0, 2]}),
+        ("Split", 11, {"axis": 3, "split": [3, 4], "extra": ["z"]}),
+        ("Split", 17, {"axis": 2, "extra": ["z", "a", "b", "c"]}),
+        ("ReduceSum", 11, {"axes": [1, 2]}),
+        ("Gelu", 20, {}),
+    ],
+)
+def test_other_versions(operator, opset, attributes, rng):
+    x = rng.normal(size=(2, 3, 5, 7)).astype("f4")
+    single(operator, x, opset=opset, **attributes)
+
+
+@pytest.mark.parametrize("operator", ["Add", "Sub", "Mul", "Div", "Max", "Min"])
+def test_two_inputs(operator, rng):
+    x = rng.normal(size=(2, 3, 5, 7)).astype("f4")
+    single(operator, x, [rng.normal(size=(3, 1, 7)).astype("f4")])
+    whole = rng.integers(-9, 9, (2, 5))
+    single(operator, whole, [integers(3)])
+
+
+@pytest.mark.parametrize("operator", ["Log", "Sqrt", "Reciprocal"])
+def test_positive_numbers(operator, rng):
+    single(operator, rng.uniform(0.5, 2, (2, 3)).astype("f4"))
+
+
+CONSTANTS = [
+    ("Pow", [np.float32(2.0)], {}),
+    ("PRelu", [np.full((3, 1, 1), 0.3, "f4")], {}),
+    ("Clip", [np.float32(-0.5), np.float32(0.25)], {}),
+    ("Clip", [None, np.float32(0.25)], {}),
+    ("Reshape", [integers(2, -1)], {}),
+    ("Reshape", [integers(0, 0, -1)], {}),
+    ("Squeeze", [integers(0)], {}),
+    ("Unsqueeze", [integers(-1, 1)], {}),
+    ("Expand", [integers(2, 1, 1, 1)], {}),
+    ("Gather", [integers(2, 0, -1)], {"axis": 1}),
+    ("Gather", [np.array(1)], {"axis": 3}),
+    ("Slice", [integers(1), integers(100), integers(2)], {}),
+    ("Slice", [integers(-1), integers(-9), integers(3), integers(-2)], {}),
+    ("Slice", [integers(0, 1), integers(1, -1)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1), np.float32(2.5)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "reflect"}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "edge"}),
+    ("Split", [integers(2, 5)], {"axis": 3, "extra": ["z"]}),
+    (
+        "Resize",
+        [None, None, integers(2, 3, 9, 4)],
+        {"mode": "linear", "coordinate_transformation_mode": "half_pixel"},
+    ),
+    (
+        "Resize",
+        [None, np.array([1, 1, 2, 3], "f4")],
+        {"mode": "linear", "coordinate_transformation_mode": "align_corners"},
+    ),
+    (
+        "Resize",
+        [None, np.array([1, 1, 2, 3], "f4")],
+        {
+            "mode": "nearest",
+            "coordinate_transformation_mode": "asymmetric",
+            "nearest_mode": "floor",
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize(("operator", "constants", "attributes"), CONSTANTS)
+def test_constant_inputs(operator, constants, attributes, rng):
+    count = 1 if operator in ("Squeeze", "Expand") else 2
+    x = rng.normal(size=(count, 3, 5, 7)).astype("f4")
+    single(operator, x, constants, **attributes)
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {},
+        {"strides": [2, 1], "pads": [1, 0, 2, 3]},
+        {"dilations": [1, 2], "pads": [0, 1, 1, 0]},
+        {"strides": [3, 2], "auto_pad": "SAME_UPPER"},
+        {"strides": [2, 3], "auto_pad": "SAME_LOWER"},
+        {"auto_pad": "VALID"},
+    ],
+)
+def test_convolution(attributes, rng):
+    x = rng.normal(size=(2, 4, 8, 11)).astype("f4")
+    weight = rng.normal(size=(6, 4, 3, 3)).astype("f4")
+    single("Conv", x, [weight, np.arange(6, dtype="f4")], **attributes)
+    single("Conv", x, [weight[:, :2]], group=2, **attributes)
+    single("Conv", x[:, :, 0], [weight[:, :, 0]])
+
+
+@pytest.mark.parametrize("axis", [-1, 0, 1])
+def test_one_hot(axis):
+    goals = integers(2, 0, -1)
+    constants = [integers(3), np.array([0.5, 2.0], "f4")]
+    node = helper.make_node("OneHot", ["x", "depth", "values"], ["y"], axis=axis)
+    made = model(
+        [node],
+        {"x": (INT64, [3])},
+        {"y": (FLOAT, None)},
+        dict(zip(("depth", "values"), constants, strict=True)),
+    )
+    check(made, goals)
+
+
+def test_products_and_norms(rng):
+    x, b = rng.normal(size=(4, 5)).astype("f4"), rng.normal(size=(5, 3)).astype("f4")
+    c = rng.normal(size=3).astype("f4")
+    single("MatMul", x, [b])
+    single("MatMul", rng.normal(size=(2, 3, 4, 5)).astype("f4"), [b])
+    single("Gemm", x, [b, c])
+    single("Gemm", x, [b.T.copy(), c], transB=1, alpha=0.5, beta=2.0)
+    single("Gemm", x.T.copy(), [b], transA=1)
+    image = rng.normal(size=(2, 3, 4, 5)).astype("f4")
+    scale, bias, mean = (rng.normal(size=3).astype("f4") for _ in range(3))
+    variance = rng.uniform(0.5, 2, 3).astype("f4")
+    single("BatchNormalization", image, [scale, bias, mean, variance], epsilon=1e-3)
+    row = rng.normal(size=5).astype("f4")
+    single("LayerNormalization", image, [row, row[::-1].copy()], epsilon=1e-4)
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse", "bidirectional"])
+@pytest.mark.parametrize(
+    ("operator", "gates", "attributes"),
+    [
+        ("LSTM", 4, {}),
+        ("GRU", 3, {}),
+        ("GRU", 3, {"linear_before_reset": 1}),
+    ],
+)
+def test_recurrent_layers(operator, gates, attributes, direction, rng):
+    count, size = 2 if direction == "bidirectional" else 1, 3
+    x = rng.normal(size=(4, 2, 5)).astype("f4")
+    constants = [
+        rng.normal(size=(count, gates * size, 5)).astype("f4"),
+        rng.normal(size=(count, gates * size, size)).astype("f4"),
+        rng.normal(size=(count, 2 * gates * size)).astype("f4"),
+        None,
+        rng.normal(size=(count, 2, size)).astype("f4"),
+    ]
+    extra = ["h", "c"] if operator == "LSTM" else ["h"]
+    attributes = {"hidden_size": size, "direction": direction, **attributes}
+    single(operator, x, constants[:2], extra=extra, **attributes)
+    if operator == "LSTM":
+        constants.append(rng.normal(size=(count, 2, size)).astype("f4"))
+    single(operator, x, constants, extra=extra, **attributes)
+
+
+def test_shapes_computed_in_the_graph(rng):
+    """Flatten as exporters write it: Shape, Gather, Unsqueeze, Concat, Reshape."""
+    nodes = [
+        helper.make_node("Shape", ["x"], ["shape"]),
+        helper.make_node("Constant", [], ["zero"], value_int=0),
+        helper.make_node("Gather", ["shape", "zero"], ["count"]),
+        helper.make_node("Unsqueeze", ["count", "axis"], ["counts"]),
+        helper.make_node("Concat", ["counts", "rest"], ["target"], axis=0),
+        helper.make_node("Reshape", ["x", "target"], ["flat"]),
+        helper.make_node("ConstantOfShape", ["target2"], ["zeros"]),
+        helper.make_node("Cast", ["count"], ["factor"], to=FLOAT),
+        helper.make_node("Mul", ["flat", "factor"], ["scaled"]),
+        helper.make_node("Add", ["scaled", "zeros"], ["added"]),
+        helper.make_node("Less", ["added", "half"], ["below"]),
+        helper.make_node("Where", ["below", "half", "added"], ["y"]),
+    ]
+    constants = {
+        "axis": integers(0),
+        "rest": integers(-1),
+        "target2": integers(1, 12),
+        "half": np.float32(0.5),
+    }
+    made = model(nodes, {"x": (FLOAT, ["n", 3, 4])}, {"y": (FLOAT, None)}, constants)
+    check(made, rng.normal(size=(5, 3, 4)).astype("f4"))
+
+
+def driving_network(rng, batch="n"):
+    """Convolution, pooling, batch norm, a one-hot goal, ELU, tanh."""
+
+    def normal(*shape):
+        return rng.normal(0, 0.2, shape).astype("f4")
+
+    nodes = [
+        helper.make_node("Conv", ["image", "w0", "b0"], ["a"], strides=[2, 2]),
+        helper.make_node("BatchNormalization", ["a", "s", "s", "b0", "s"], ["b"]),
+        helper.make_node("Elu", ["b"], ["c"]),
+        helper.make_node("AveragePool", ["c"], ["d"], kernel_shape=[2, 2]),
+        helper.make_node("Flatten", ["d"], ["e"]),
+        helper.make_node("Concat", ["e", "goal"], ["f"], axis=1),
+        helper.make_node("Gemm", ["f", "w1"], ["g"]),
+        helper.make_node("Tanh", ["g"], ["control"]),
+    ]
+    constants = {
+        "w0": normal(4, 3, 3, 3),
+        "b0": normal(4),
+        "s": rng.uniform(0.5, 1, 4).astype("f4"),
+        "w1": normal(4 * 2 * 3 + 2, 1),
+    }
+    inputs = {"image": (FLOAT, [batch, 3, 8, 10]), "goal": (FLOAT, [batch, 2])}
+    return model(nodes, inputs, {"control": (FLOAT, [batch, 1])}, constants)
+
+
+def test_a_driving_network_and_its_derivatives(rng, variant, tmp_path):
+    made = driving_network(rng)
+    path = tmp_path / "net.onnx"
+    onnx.save(made, path)
+    network = load_onnx(path)
+    assert network.batch is None and not list(network.parameters())
+    image = rng.random((3, 8, 10, 3)).astype("f4")
+    goal = np.float32([[1, 0], [0, 1], [0, 1]])
+    check(made, image.transpose(0, 3, 1, 2).copy(), goal)
+    policy = TorchPolicy(network, OneHotGoal(2))
+    weight = mi.Float(1.0, -2.0, 0.5)
+    control, gradient = policy.vjp(mi.TensorXf(image), [0, 1, 1], weight)
+    expected, _ = both(made, image.transpose(0, 3, 1, 2).copy(), goal)
+    np.testing.assert_allclose(control, expected[0][:, 0], atol=1e-6)
+    policy = TorchPolicy(network.double(), OneHotGoal(2))
+    direction = rng.normal(size=image.shape)
+
+    def objective(step):
+        moved = torch.from_numpy(image + step * direction).permute(0, 3, 1, 2)
+        with torch.no_grad():
+            result = network(moved, torch.from_numpy(goal))[0][:, 0]
+        return float(result @ torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
+
+    numeric = (objective(1e-5) - objective(-1e-5)) / 2e-5
+    products = gradient.numpy() * direction
+    near = pytest.approx(numeric, abs=1e-6 * np.abs(products).sum())
+    assert np.sum(products) == near
+    tangent = mi.TensorXf(direction.astype("f4"))
+    t_control, _ = policy.step_jvp(mi.TensorXf(image), [0, 1, 1], (), tangent, ())
+    forward = float(np.dot(t_control.numpy(), weight.numpy()))
+    assert forward == near
+
+
+def refused(made, tmp_path, match):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(made.SerializeToString())
+    with pytest.raises(InputError, match=match):
+        load_onnx(path)
+
+
+def test_unsupported_operators_are_named(tmp_path):
+    node = helper.make_node("Hardmax", ["x"], ["z"])
+    other = helper.make_node("Det", ["z"], ["y"])
+    made = model([node, other], {"x": (FLOAT, [1, 3, 3])}, {"y": (FLOAT, [1])})
+    refused(made, tmp_path, r"net.onnx: operators Det, Hardmax.*Conv")
+
+
+def test_unsupported_attributes_are_named(rng):
+    made = model(
+        [helper.make_node("Resize", ["x", "", "s"], ["y"], mode="cubic", name="up")],
+        {"x": (FLOAT, [1, 1, 4, 4])},
+        {"y": (FLOAT, None)},
+        {"s": np.array([1, 1, 2, 2], "f4")},
+    )
+    with pytest.raises(InputError, match=r"net.onnx: node up: Resize: mode 'cubic'"):
+        OnnxNetwork(made, "net.onnx")(torch.rand(1, 1, 4, 4))
+
+
+def test_damaged_files_are_refused(tmp_path, rng):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(b"no model at all")
+    with pytest.raises(InputError, match=r"net.onnx: is no ONNX model"):
+        load_onnx(path)
+    with pytest.raises(InputError, match="absent.onnx.*does not exist"):
+        load_onnx(tmp_path / "absent.onnx")
+    whole = driving_network(rng).SerializeToString()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"net.onnx: is no ONNX model"):
+        load_onnx(path)
+
+
+def test_weights_in_other_files_are_refused(tmp_path, rng):
+    path = tmp_path / "net.onnx"
+    onnx.save(driving_network(rng), path, save_as_external_data=True, size_threshold=0)
+    with pytest.raises(InputError, match="'w0' in another file"):
+        load_onnx(path)
+
+
+def test_wrong_inputs_are_named(rng):
+    network = OnnxNetwork(driving_network(rng), "net.onnx")
+    goal = torch.eye(2)
+    with pytest.raises(InputError, match=r"\['image', 'goal'\].*are 1: set policy.go"):
+        network(torch.rand(2, 3, 8, 10))
+    with pytest.raises(InputError, match=r"\['any', 3, 8, 10\].*\[2, 3, 9, 10\]"):
+        network(torch.rand(2, 3, 9, 10), goal)
+    assert OnnxNetwork(driving_network(rng, 1), "net.onnx").batch == 1
+
+
+def test_a_policy_without_goal(rng, variant):
+    made = model(
+        [
+            helper.make_node("ReduceMean", ["x"], ["y"], axes=[1, 2, 3], keepdims=0),
+        ],
+        {"x": (FLOAT, ["n", 3, 4, 5])},
+        {"y": (FLOAT, ["n"])},
+    )
+    policy = TorchPolicy(OnnxNetwork(made, "net.onnx"), NoGoal())
+    image = mi.TensorXf(rng.random((2, 4, 5, 3), dtype=np.float32))
+    _, gradient = policy.vjp(image, 0, mi.Float(1, 2))
+    np.testing.assert_allclose(gradient.numpy()[1], 2 / 60, rtol=1e-6)
