@@ -42,7 +42,7 @@ def history(states):
     """Upload states (n, T, m) as a history and return it."""
     count, horizon, size = states.shape
     kind = dr.llvm.ad.Array3f64 if size == 3 else dr.llvm.ad.ArrayXf64
-    rows = kind(np.ascontiguousarray(states.reshape(-1, size).T))
+    rows = kind(states.reshape(-1, size).T.tolist())
     return StateHistory(rows, count, horizon, DT)
 
 

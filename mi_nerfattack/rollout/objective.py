@@ -71,7 +71,8 @@ class StateHistory:
                 "number a control period"
             )
         values = np.tile(weights, self.count)
-        result = self._row(values)
+        # a list: memory from NumPy has an alignment of its own, and so its own kernels
+        result = self._row(values.tolist())
         dr.make_opaque(result)
         return result
 

@@ -239,8 +239,8 @@ class _DevicePath:
         """Upload `route` as arrays of the type of the row `like`."""
         self.real: Any = dr.detached_t(type(like))
         self.integer: Any = dr.uint32_array_t(self.real)
-        self.x = self.real(route.points[:, 0])
-        self.y = self.real(route.points[:, 1])
+        # lists: memory from NumPy has an alignment of its own, and so its own kernels
+        self.x, self.y = (self.real(column) for column in route.points.T.tolist())
         self.count = dr.opaque(self.integer, len(route.points) - 1)
 
     def point(self, index: Any) -> tuple[Any, Any]:
