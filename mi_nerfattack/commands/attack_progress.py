@@ -29,22 +29,23 @@ def run_scenario(
     from mi_nerfattack.attack.job import Job
     from mi_nerfattack.commands.bars import StageBars
     from mi_nerfattack.errors import InputError
-    from mi_nerfattack.policy.adapter import TorchPolicy, one_thread
-    from mi_nerfattack.policy.pilotnet import PilotNet
+    from mi_nerfattack.policy.adapter import one_thread
+    from mi_nerfattack.policy.load import load_differentiable, policy_kind
     from mi_nerfattack.report.table import metrics_table
-    from mi_nerfattack.scenario import load_scenario, replace_objects, resolve
+    from mi_nerfattack.scenario import load_scenario, replace_objects
 
     scenario, text = load_scenario(path)
     if object_field is not None:
         scenario, text = replace_objects(scenario, text, object_field)
-    if scenario.vehicle.model == "ackermann":
+    model = scenario.vehicle.model
+    if model != "dubins" and policy_kind(scenario.policy) == "pilotnet":
         raise InputError(
-            f"{path}: vehicle.model: ackermann takes a steering angle in radians, "
-            "PilotNet gives a heading rate in rad/s; use dubins, or drive your own "
-            "policy from Python"
+            f"{path}: vehicle.model: {model} takes a steering angle in radians, "
+            "PilotNet gives a heading rate in rad/s; use dubins, or a policy of "
+            "another kind"
         )
     variant.ensure()
-    policy = TorchPolicy(PilotNet.load(resolve(scenario.policy.file, path.parent)))
+    policy = load_differentiable(scenario.policy, path.parent)
     with StageBars() as bars, one_thread():
 
         def show(stage: str, done: int, total: int, remark: str) -> None:

@@ -12,7 +12,7 @@ import torch
 from mi_nerfattack import files
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.policy.adapter import AbstractPolicy, TorchPolicy
-from mi_nerfattack.policy.black_box import CallablePolicy
+from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported import load_exported, load_torchscript
 from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal, NoGoal, OneHotGoal
@@ -80,6 +80,21 @@ def load_policy(section: PolicySection, base: str | Path) -> AbstractPolicy:
     kind = policy_kind(section)
     _check_keys(section, kind)
     return _LOADERS[kind](section, base)
+
+
+def load_differentiable(section: PolicySection, base: str | Path) -> AbstractPolicy:
+    """Make the policy of a scenario for a gradient method.
+
+    Raises:
+        InputError: as `load_policy`, or the policy is a black box.
+    """
+    policy = load_policy(section, base)
+    if not policy.differentiable:
+        raise InputError(
+            f"policy: {section.file or section.url}: is a black box, which has no "
+            f"derivatives; a gradient attack takes the kinds {DIFFERENTIABLE_KINDS}"
+        )
+    return policy
 
 
 def policy_kind(section: PolicySection) -> str:
