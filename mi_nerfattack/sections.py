@@ -122,14 +122,55 @@ class CameraSection(Section):
 class VehicleSection(Section):
     """The vehicle and its time step."""
 
-    model: Literal["dubins", "ackermann"] = "dubins"
+    model: Literal["dubins", "ackermann", "ackermann_rate", "bicycle", "custom"] = (
+        "dubins"
+    )
     integrator: Literal["euler", "rk4", "implicit_midpoint"] = "rk4"
     speed_ms: Positive = 5.0
-    dt_s: Positive = 0.1
+    dt_s: Positive = 0.1  # control period
+    substeps: Count = 1  # integration steps a control period
+    delay_steps: Annotated[int, Field(ge=0)] = 0  # integration steps
     width_m: Positive = 1.8
     wheelbase_m: Positive = 2.7
+    front_axle_m: Positive = 1.35  # from the centre of gravity
+    rear_axle_m: Positive = 1.35
     max_heading_rate: Positive = 1.5
     max_steer_deg: Annotated[float, Field(gt=0, lt=90)] = 34.0
+    max_steer_rate_deg_s: Positive = 40.0
+    steer_time_s: Positive = 0.1  # time constant of the steering's lag
+    function: Annotated[str, Field(pattern=r"^.+:[A-Za-z_]\w*$")] | None = None
+    framework: Literal["drjit", "torch"] = "drjit"  # of the function
+    state_size: Annotated[int, Field(ge=3, le=16)] = 3
+    control_limit: Positive | None = None  # in the unit of the function's control
+    rest_state: tuple[Finite, ...] = ()  # initial values of the rows after theta
+
+    @model_validator(mode="after")
+    def _check_keys(self) -> Any:
+        """Refuse keys that do not go together, and steps that oscillate."""
+        for key in _CUSTOM_KEYS:
+            _check_pair(self, key, "model", ("custom",))
+        if len(self.rest_state) not in (0, self.state_size - 3):
+            _refuse(
+                "rest_state",
+                f"has {len(self.rest_state)} numbers; state_size = {self.state_size} "
+                f"needs {self.state_size - 3} or none",
+            )
+        ratio = self.dt_s / self.substeps / self.steer_time_s
+        limit = _STABLE_RATIO[self.integrator]
+        if self.model == "ackermann_rate" and ratio >= limit:
+            _refuse(
+                "steer_time_s",
+                f"integration steps of dt_s / substeps = {self.dt_s / self.substeps:g} "
+                f"s diverge with {self.integrator}: they must be below {limit:g} x "
+                f"{self.steer_time_s:g} s; raise substeps",
+            )
+        return self
+
+
+#: Keys of a vehicle that belong to a function of the user's own.
+_CUSTOM_KEYS = ("function", "framework", "state_size", "control_limit", "rest_state")
+#: Ratio of step and time constant at which the integration of a lag diverges.
+_STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 
 
 class DriveSection(Section):
@@ -147,8 +188,16 @@ class AttackSection(Section):
     iterations: Count = 20
     learning_rate: Positive = 0.3
     poses: Count = 1  # initial poses of an iteration; the first is nominal
+    parameters: Literal["texture", "pose", "both"] = "texture"  # what may change
+    pose_learning_rate: Positive = 0.02  # metres and radians
+    pose_axes: Annotated[
+        tuple[Literal["x", "y", "z", "roll", "pitch", "yaw"], ...], Field(min_length=1)
+    ] = ("x", "y", "yaw")  # world axes
+    pose_limit_m: Positive = 1.0  # along each axis
+    pose_limit_deg: Positive = 30.0  # about each axis
+    adjoint: Literal["replay", "kept_backgrounds", "checkpointed"] = "replay"
+    segment: Count = 16  # control periods between the checkpoints of an adjoint
     attached: bool = False
-    keep_frames: bool = False
     jitter: bool = False
     checkpoint_every: Count = 10
 

@@ -224,7 +224,7 @@ def test_attached_gradient_through_the_interleaved_composite(toy):
     from dataclasses import replace
 
     from mi_nerfattack.render.interleaved import InterleavedComposite
-    from mi_nerfattack.rollout.sensor import FieldSensor
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
 
     loop, item = toy.make_loop()
     old = loop.sensor

@@ -154,7 +154,7 @@ def test_what_needs_a_density_or_a_camera_path_refuses_by_name() -> None:
         InterleavedComposite().render(layers, rays, 0.0)
     seen = DepthComposite().render(layers, rays, 0.0)
     with pytest.raises(InputError, match="splats: .* keep the camera detached"):
-        DepthComposite().backward_rays(layers, rays, seen, March(), 0.0)
+        DepthComposite().backward_rays(layers, rays, seen, March(), 0.0, [0])
 
 
 # The sensor
@@ -167,7 +167,7 @@ def loop() -> Any:
 
     import toy_loop as toy
 
-    from mi_nerfattack.rollout.sensor import FieldSensor
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
 
     loop, item = toy.make_loop()
     rng = np.random.default_rng(3)
@@ -205,8 +205,9 @@ def test_the_sensor_differentiates_objects_among_splats(loop, rng) -> None:
 def test_nothing_is_compiled_after_the_first_steps(loop) -> None:
     import toy_loop as toy
 
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
+    from mi_nerfattack.rollout.function import Rollout
+    from mi_nerfattack.rollout.loop import to_state
+    from mi_nerfattack.rollout.objective import StageSum
 
     start = np.array([[0.0, 0.35, 0.02]])
     drive = simulate(loop[0], to_state(start), 3)
@@ -222,7 +223,7 @@ def test_nothing_is_compiled_after_the_first_steps(loop) -> None:
 
 
 def test_a_sensor_refuses_to_merge_splats(loop) -> None:
-    from mi_nerfattack.rollout.sensor import FieldSensor
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
 
     old = loop[0].sensor
     with pytest.raises(InputError, match="set composite to depth"):

@@ -1,4 +1,4 @@
-"""Attack by gradient: Adam on the textures, through the closed loop."""
+"""Attack by gradient: Adam on textures and poses, through the closed loop."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from mi_nerfattack.attack.parameters import Freedom
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.rollout.adjoint import StageCost, replay_gradient
-from mi_nerfattack.rollout.loop import ClosedLoop, Trajectory, simulate
+from mi_nerfattack.rollout.cost import Cost
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import Trajectory, simulate
+from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route import Route
+
+OFFSETS = "offsets"
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class IterationRecord:
 
     Attributes:
         iteration: from 0.
-        objective: mean over poses of the summed deviation, metre-steps.
+        objective: the cost that is minimised, reduced over the poses.
         cross_track_mean_m: mean |e| over steps and poses, metres.
         cross_track_max_m: largest |e|, metres.
     """
@@ -36,53 +40,52 @@ class IterationRecord:
 
 
 class GradientAttack:
-    """Maximise the deviation of a closed loop by its objects' textures.
+    """Minimise a cost of the closed loop by its objects' textures and poses.
 
-    Holds the textures, Adam's moments, the history and the best textures so far;
-    everything is in :meth:`tensors`, so that an interrupted attack can go on.
+    Holds the parameters, Adam's moments, the history and the best parameters so far;
+    everything is in :meth:`tensors`, so that an interrupted attack can go on. No
+    random numbers are drawn.
 
-    Cost of an iteration: one drive forward and its replay backward.
+    Cost of an iteration: one drive forward and one backward; see the adjoint.
 
     Args:
-        loop: closed loop with a differentiable sensor.
-        fields: the grid fields of the sensor's objects, whose textures are attacked.
+        rollout: the loop, its objective and its adjoint.
         route: the lane centre, for the record.
-        cost: stage cost that is minimised.
-        initial: (3, n) initial states.
-        horizon: steps of the drive.
-        learning_rate: Adam's, in units of the raw colours.
-        attached: keep the derivative of the observation by the state.
-        keep_frames: keep all frames of a drive, so that they are rendered once, not
-            twice; see :func:`simulate` for the memory.
+        initial: (m, n) initial states.
+        freedom: what may change.
+
+    Attributes:
+        history: a record an iteration.
+        best: textures of the iteration with the least objective.
+        best_offsets: (k, 6) object offsets of the same.
+        best_mean_m: mean |e| of the same, metres.
     """
 
     def __init__(
         self,
-        loop: ClosedLoop,
-        fields: list[GridField],
+        rollout: Rollout,
         route: Route,
-        cost: StageCost,
         initial: Any,
-        horizon: int,
-        learning_rate: float,
-        attached: bool = False,
-        keep_frames: bool = False,
+        freedom: Freedom | None = None,
     ) -> None:
-        self.loop = loop
-        self.fields = fields
+        self.rollout = rollout
         self.route = route
-        self.cost = cost
         self.initial = initial
-        self.horizon = horizon
-        self.attached = attached
-        self.keep_frames = keep_frames
+        self.freedom = freedom or Freedom()
+        self.sensor = differentiable(rollout.loop)
         self.history: list[IterationRecord] = []
-        self.best_mean_m = -1.0
-        self.best = [field.texture.numpy().copy() for field in fields]
-        self.optimiser = Adam(
-            lr=learning_rate,
-            params={str(i): field.texture for i, field in enumerate(fields)},
-        )
+        self.best_objective = np.inf
+        self.best_mean_m = 0.0
+        self.best = self._textures()
+        self.optimiser = Adam(lr=self.freedom.texture_rate or self.freedom.pose_rate)
+        if self.freedom.texture_rate is not None:
+            for i, texture in enumerate(self.sensor.textures()):
+                self.optimiser[str(i)] = texture
+        self.best_offsets = np.zeros((len(self.best), 6))
+        if self.freedom.pose_rate is not None:
+            self.best_offsets = self.sensor.offsets()
+            self.optimiser[OFFSETS] = _tensor(self.best_offsets)
+            self.optimiser.set_learning_rate({OFFSETS: self.freedom.pose_rate})
 
     @property
     def iteration(self) -> int:
@@ -93,58 +96,82 @@ class GradientAttack:
         """Do one iteration.
 
         Args:
-            on_step: called after each of the 2 x horizon time steps.
+            on_step: called after each of the 2 x horizon control periods.
 
         Raises:
             InputError: the gradient is not finite; nothing is updated.
         """
         self._install()
-        drive = simulate(
-            self.loop, self.initial, self.horizon, on_step, self.keep_frames
-        )
-        record = self._record(drive)
-        gradient = replay_gradient(self.loop, drive, self.cost, self.attached, on_step)
-        for i, value in enumerate(gradient.textures):
-            if not np.isfinite(value.numpy()).all():
-                raise InputError(
-                    f"attack iteration {record.iteration}: the gradient of object {i} "
-                    "is not finite; check policy and field for NaN"
-                )
-            dr.set_grad(self.optimiser[str(i)], value)
-        self.optimiser.step()
+        evaluation = self.rollout.run(self.initial, on_step)
+        record = self._record(evaluation.trajectory, evaluation.value)
+        moved = self.freedom.pose_rate is not None
+        gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
+        self._update(gradient, record.iteration)
         self.history.append(record)
         return record
 
     def measure(self) -> IterationRecord:
-        """Drive with the present textures, so that the last update counts too."""
+        """Drive with the present parameters, so that the last update counts too."""
         self._install()
-        return self._record(simulate(self.loop, self.initial, self.horizon))
-
-    def _install(self) -> None:
-        for i, field in enumerate(self.fields):
-            field.set_parameter("texture", dr.detach(self.optimiser[str(i)]))
+        rollout = self.rollout
+        drive = simulate(rollout.loop, self.initial, rollout.horizon)
+        value, _ = Cost(rollout.objective, rollout.reduction).of(drive)
+        return self._record(drive, value)
 
     def restore_best(self) -> None:
-        """Give the fields the textures of the iteration with the largest error."""
-        for field, texture in zip(self.fields, self.best, strict=True):
-            field.set_parameter("texture", texture)
+        """Give the objects the parameters of the iteration with the least objective."""
+        self.sensor.set_textures(self.best)
+        if self.freedom.pose_rate is not None:
+            self.sensor.set_offsets(self.best_offsets)
+
+    def _update(self, gradient: Gradient, iteration: int) -> None:
+        values = {str(i): value for i, value in enumerate(gradient.textures)}
+        if gradient.offsets is not None:
+            values[OFFSETS] = _tensor(gradient.offsets * self.freedom.mask)
+        values = {key: values[key] for key in self.optimiser}
+        for key, value in values.items():
+            if not np.isfinite(value.numpy()).all():
+                what = "the poses" if key == OFFSETS else f"object {key}"
+                raise InputError(
+                    f"attack iteration {iteration}: the gradient of {what} is not "
+                    "finite; check policy and field for NaN"
+                )
+        for key, value in values.items():
+            dr.set_grad(self.optimiser[key], value)
+        self.optimiser.step()
+        if OFFSETS in values:
+            moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
+            self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
+
+    def _install(self) -> None:
+        """Give the sensor the optimiser's parameters."""
+        if self.freedom.texture_rate is not None:
+            keys = map(str, range(len(self.best)))
+            self.sensor.set_textures([dr.detach(self.optimiser[key]) for key in keys])
+        if self.freedom.pose_rate is not None:
+            offsets = dr.detach(self.optimiser[OFFSETS])
+            self.sensor.set_offsets(np.array(offsets, np.float64))
+
+    def _textures(self) -> list[np.ndarray]:
+        return [texture.numpy().copy() for texture in self.sensor.textures()]
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
+        rows = [list(asdict(record).values()) for record in self.history]
         result: dict[str, np.ndarray] = {
-            "history": np.array(
-                [list(asdict(record).values()) for record in self.history], np.float64
-            ).reshape(-1, 4),
+            "history": np.array(rows, np.float64).reshape(-1, 4),
             "best_mean_m": np.array([self.best_mean_m]),
+            "best_objective": np.array([self.best_objective]),
+            "best_offsets": self.best_offsets,
         }
-        for i in range(len(self.fields)):
-            value, _, _, (count, first, second, _) = self.optimiser.state[str(i)]
-            result[f"texture.{i}"] = value.numpy().copy()
-            result[f"count.{i}"] = np.array([_scalar(count)], np.int64)
-            result[f"best.{i}"] = self.best[i]
+        result |= {f"best.{i}": best for i, best in enumerate(self.best)}
+        for key in self.optimiser:
+            value, _, _, (count, first, second, _) = self.optimiser.state[key]
+            result[f"texture.{key}"] = value.numpy().copy()
+            result[f"count.{key}"] = np.array([_scalar(count)], np.int64)
             if first is not None:
-                result[f"first.{i}"] = _numpy(first, value.shape)
-                result[f"second.{i}"] = _numpy(second, value.shape)
+                result[f"first.{key}"] = _numpy(first, value.shape)
+                result[f"second.{key}"] = _numpy(second, value.shape)
         return result
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
@@ -158,28 +185,35 @@ class GradientAttack:
             for row in tensors["history"]
         ]
         self.best_mean_m = float(tensors["best_mean_m"][0])
-        for i in range(len(self.fields)):
-            key = str(i)
-            self.best[i] = np.array(tensors[f"best.{i}"])
-            self.optimiser[key] = mi.TensorXf(np.array(tensors[f"texture.{i}"]))
+        self.best_objective = float(tensors["best_objective"][0])
+        self.best_offsets = np.array(tensors["best_offsets"])
+        self.best = [np.array(tensors[f"best.{i}"]) for i in range(len(self.best))]
+        for key in list(self.optimiser):
+            self.optimiser[key] = mi.TensorXf(np.array(tensors[f"texture.{key}"]))
             value, promoted, rate, extra = self.optimiser.state[key]
-            if f"first.{i}" in tensors:
-                count = type(extra[0])([int(tensors[f"count.{i}"][0])])
-                first = _like(extra[1], value, tensors[f"first.{i}"])
-                second = _like(extra[2], value, tensors[f"second.{i}"])
+            if f"first.{key}" in tensors:
+                count = type(extra[0])([int(tensors[f"count.{key}"][0])])
+                first = _like(extra[1], value, tensors[f"first.{key}"])
+                second = _like(extra[2], value, tensors[f"second.{key}"])
                 extra = (count, first, second, extra[3])
             self.optimiser.state[key] = (value, promoted, rate, extra)
 
-    def _record(self, drive: Trajectory) -> IterationRecord:
-        """Judge a drive with the present textures, and keep them if they are best."""
+    def _record(self, drive: Trajectory, value: float) -> IterationRecord:
+        """Judge a drive; keep the present parameters if they are the best."""
         states = drive.states_numpy()[:, 1:]
-        error = self.route.cross_track_numpy(states.reshape(-1, 3))
-        error = np.abs(error).reshape(states.shape[:2])
-        objective, mean = float(error.sum(axis=1).mean()), float(error.mean())
-        if mean > self.best_mean_m:
-            self.best_mean_m = mean
-            self.best = [field.texture.numpy().copy() for field in self.fields]
-        return IterationRecord(self.iteration, objective, mean, float(error.max()))
+        error = self.route.cross_track_numpy(states.reshape(-1, states.shape[2]))
+        error = np.abs(error)
+        mean = float(error.mean())
+        if value < self.best_objective:
+            self.best_objective, self.best_mean_m = value, mean
+            self.best = self._textures()
+            if self.freedom.pose_rate is not None:
+                self.best_offsets = self.sensor.offsets()
+        return IterationRecord(self.iteration, value, mean, float(error.max()))
+
+
+def _tensor(value: np.ndarray) -> Any:
+    return mi.TensorXf(np.ascontiguousarray(value, np.float32))
 
 
 def _scalar(value: Any) -> int:

@@ -17,18 +17,17 @@ from mi_nerfattack.attack.checkpoint import (
     save_checkpoint,
 )
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.objective import CrossTrackDeviation
 from mi_nerfattack.attack.results import write_results
+from mi_nerfattack.attack.setup import build_attack
 from mi_nerfattack.attack.textures import random_texture
 from mi_nerfattack.attack.world import (
     World,
     build_world,
-    initial_states,
 )
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.memory import peak_memory_mb
 from mi_nerfattack.report.metrics import Drive, departure_limit
-from mi_nerfattack.rollout.loop import simulate, to_state
+from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario import Scenario, portable_text
 
@@ -108,9 +107,24 @@ class Job:
             "renders": world.surrogate.renders + world.deployment.renders,
         }
         textures = {"unperturbed": original, "gradient": attacked}
-        return write_results(
-            self.output, world, self.drives, attack, textures, self.text, cost
+        on_step = self._counter(
+            "surrogate: attribution", 3 * self.scenario.drive.horizon
         )
+        return write_results(
+            self.output, world, self.drives, attack, textures, self.text, cost, on_step
+        )
+
+    def _counter(self, stage: str, total: int) -> Callable[[int], None]:
+        """Report the progress of a stage each time that the result is called."""
+        done = 0
+
+        def on_step(step: int) -> None:
+            nonlocal done
+            del step
+            done += 1
+            self.on_progress(stage, done, total, "")
+
+        return on_step
 
     def _check_folder(self, resume: bool) -> None:
         """Refuse a folder that holds something else; nothing is written."""
@@ -147,7 +161,8 @@ class Job:
             done = first_run * horizon + step + 1
             self.on_progress(stage, done, count * horizon, "")
 
-        drive = simulate(world.loop(sensor), to_state(initial), horizon, on_step)
+        loop = world.loop(sensor)
+        drive = simulate(loop, loop.initial(initial), horizon, on_step)
         states, controls = drive.states_numpy(), drive.controls_numpy()
         for i in range(len(initial)):
             self.drives.append(
@@ -189,18 +204,7 @@ class Job:
 
     def _attack(self, world: World, digest: str, resume: bool) -> GradientAttack:
         section = self.scenario.attack
-        initial = initial_states(self.scenario, world.route, section.poses, 2)
-        attack = GradientAttack(
-            world.loop(world.surrogate),
-            world.fields,
-            world.route,
-            CrossTrackDeviation(world.route),
-            to_state(initial),
-            self.scenario.drive.horizon,
-            section.learning_rate,
-            section.attached,
-            section.keep_frames,
-        )
+        attack = build_attack(world, self.base)
         path = self.output / CHECKPOINT
         if resume:
             load_checkpoint(path, attack, digest)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.attack.objective_builder import build_objective
+from mi_nerfattack.attack.vehicle_builder import build_dynamics, build_integrator
 from mi_nerfattack.deploy.mitsuba import PathTracedSensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
@@ -18,16 +20,11 @@ from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.posed import Pose, PosedField
 from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.loop import ClosedLoop
-from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor
-from mi_nerfattack.scenario import Scenario, VehicleSection, resolve
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
-from mi_nerfattack.vehicle.integrators import (
-    RK4,
-    AbstractIntegrator,
-    ExplicitEuler,
-    ImplicitMidpoint,
-)
+from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.scenario import Scenario, resolve
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route import Route
 
 
@@ -42,6 +39,7 @@ class World:
         surrogate: sensor in the scene's field.
         deployment: sensor in the path-traced scene.
         policy: a policy.AbstractPolicy.
+        dynamics: the vehicle.
         initial: (runs, 3) initial states, the first one nominal.
     """
 
@@ -51,6 +49,7 @@ class World:
     surrogate: FieldSensor
     deployment: PathTracedSensor
     policy: Any
+    dynamics: AbstractDynamics
     initial: np.ndarray
 
     def loop(self, sensor: AbstractSensor) -> ClosedLoop:
@@ -60,9 +59,11 @@ class World:
             sensor,
             self.policy,
             self.route.goal,
-            build_dynamics(vehicle),
+            self.dynamics,
             build_integrator(vehicle),
             vehicle.dt_s,
+            vehicle.substeps,
+            vehicle.delay_steps,
         )
 
     def set_textures(self, textures: list[np.ndarray]) -> None:
@@ -92,6 +93,8 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
     ]
     camera, mount = build_camera(scenario)
     route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
+    dynamics = build_dynamics(scenario.vehicle, base)
+    build_objective(scenario, route, dynamics, base)  # refused before it is driven
     xml = load_scene(resolve(scenario.scene.deployment, base))
     jitter = scenario.seed if scenario.attack.jitter else None
     return World(
@@ -110,6 +113,7 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
             xml, posed, camera, mount, scenario.deployment.spp, scenario.seed
         ),
         policy,
+        dynamics,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )
 
@@ -164,24 +168,6 @@ def build_camera(scenario: Scenario) -> tuple[Camera, CameraMount]:
     return camera, mount
 
 
-def build_dynamics(section: VehicleSection) -> AbstractDynamics:
-    """Make the vehicle model."""
-    if section.model == "dubins":
-        return Dubins(section.speed_ms, section.max_heading_rate)
-    steer = float(np.radians(section.max_steer_deg))
-    return Ackermann(section.speed_ms, section.wheelbase_m, steer)
-
-
-def build_integrator(section: VehicleSection) -> AbstractIntegrator:
-    """Make the time step."""
-    members: dict[str, AbstractIntegrator] = {
-        "euler": ExplicitEuler(),
-        "rk4": RK4(),
-        "implicit_midpoint": ImplicitMidpoint(),
-    }
-    return members[section.integrator]
-
-
 def object_footprints(world: World) -> list[np.ndarray]:
     """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
     outlines = []
@@ -198,6 +184,7 @@ def object_footprints(world: World) -> list[np.ndarray]:
                 )
             ]
         )
-        world_corners = posed.pose.scale * corners @ posed.pose.rotation.T
-        outlines.append((world_corners + posed.pose.translation)[:, :2])
+        pose = posed.placed
+        world_corners = pose.scale * corners @ pose.rotation.T
+        outlines.append((world_corners + pose.translation)[:, :2])
     return outlines

@@ -134,17 +134,28 @@ class GridField(AbstractField):
         grad = dr.gather(mi.Float, packed_gradient, 4 * vertex + 1 + (i - 3 * vertex))
         return mi.TensorXf(grad, (self.n_vertices, 3))
 
-    def _pack(self) -> None:
+    def pack(self, texture: mi.Float, density: mi.Float | None = None) -> mi.Float:
+        """Lay density and colours side by side, (4 n_vertices,); differentiable.
+
+        Args:
+            texture: (3 n_vertices,), vertex by vertex.
+            density: (n_vertices,); the field's own when left out.
+        """
         i = dr.arange(mi.UInt32, 4 * self.n_vertices)
         vertex, channel = i >> 2, i & 3
         is_density = channel == 0
         colour = dr.select(is_density, 0, 3 * vertex + channel - 1)
-        self.encoding.data = dr.select(
+        density = self._density if density is None else density
+        packed = dr.select(
             is_density,
-            dr.gather(mi.Float, self._density, vertex, is_density),
-            dr.gather(mi.Float, self._texture, colour, ~is_density),
+            dr.gather(mi.Float, density, vertex, is_density),
+            dr.gather(mi.Float, texture, colour, ~is_density),
         )
-        dr.eval(self.encoding.data)
+        dr.eval(packed)
+        return packed
+
+    def _pack(self) -> None:
+        self.encoding.data = self.pack(self._texture)
 
     def eval(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool

@@ -19,8 +19,9 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.dataset import write_shard
 from mi_nerfattack.policy.placement import Ground, Roadside, Scatter
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.loop import ClosedLoop, simulate, to_state
-from mi_nerfattack.rollout.sensor import AbstractSensor, FieldSensor, Observation
+from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.expert import LaneFollower
 from mi_nerfattack.vehicle.integrators import RK4

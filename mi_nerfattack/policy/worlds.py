@@ -18,7 +18,7 @@ from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.scene import load_scene
-from mi_nerfattack.rollout.sensor import FieldSensor
+from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.route import Route
 
 

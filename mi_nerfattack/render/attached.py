@@ -73,4 +73,7 @@ class _Render(dr.CustomOp):
         total: Any = self.grad_out()
         radiance, opacity = total
         cotangent = March(radiance, opacity, mi.Float(0))
-        self.composite.backward_rays(*self.fixed, self.seen, cotangent, self.stop)
+        posed, rays = self.fixed
+        self.composite.backward_rays(
+            posed, rays, self.seen, cotangent, self.stop, range(len(posed))
+        )

@@ -20,6 +20,11 @@ from mi_nerfattack.render.march import (
     pick_rays,
 )
 
+#: Tangents or cotangents of origins and directions of n rays, `mi.Vector3f` each.
+RayTangent = tuple[Any, Any]
+#: What to do where a backdrop has no derivative by the rays.
+DETACH = "keep the camera detached"
+
 
 @dataclass
 class Seen:
@@ -74,9 +79,32 @@ class AbstractComposite(ABC):
 
     @abstractmethod
     def forward(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
+        self,
+        posed: Sequence[Layer],
+        rays: Rays,
+        seen: Seen,
+        stop: float,
+        t_rays: RayTangent | None = None,
     ) -> March:
-        """Return the tangent of the total, from those of the fields' parameters."""
+        """Return the tangent of the total, from those of the fields' parameters.
+
+        Args:
+            posed: as given to :meth:`render`.
+            rays: likewise.
+            seen: what it returned.
+            stop: as given to :meth:`render`.
+            t_rays: tangents of origins and directions, if they have any.
+        """
+
+    @abstractmethod
+    def keep(self, seen: Seen) -> Any:
+        """Return the part of what was seen that is costly to find again."""
+
+    @abstractmethod
+    def restore(
+        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
+    ) -> Seen:
+        """Return what :meth:`render` gave, from what :meth:`keep` kept of it."""
 
     def backward(
         self,
@@ -120,11 +148,21 @@ class AbstractComposite(ABC):
         seen: Seen,
         cotangent: March,
         stop: float,
-    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        wanted: Sequence[int],
+    ) -> list[RayTangent]:
         """Do what :meth:`backward` does, and differentiate by the rays.
 
+        Args:
+            posed: as given to :meth:`render`.
+            rays: likewise.
+            seen: what it returned.
+            cotangent: derivative of the objective by the total, per ray.
+            stop: as given to :meth:`render`.
+            wanted: layers that matter, among them those that ask for gradients.
+
         Returns:
-            the objective's derivatives by origin and direction, (3, n).
+            the objective's derivatives by origin and direction, (3, n), as each of
+            the wanted layers sees them.
         """
 
 
@@ -141,14 +179,33 @@ class DepthComposite(AbstractComposite):
         layers = [_see(item, rays, stop) for item in rays.light(posed)]
         return Seen(depth_composite(layers), layers)
 
+    def keep(self, seen: Seen) -> Any:
+        """See :meth:`AbstractComposite.keep`: the first layer, 20 bytes a ray."""
+        return seen.layers[0]
+
+    def restore(
+        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
+    ) -> Seen:
+        """See :meth:`AbstractComposite.restore`; marches all layers but the first."""
+        others = [_see(item, rays, stop) for item in rays.light(posed)[1:]]
+        layers = [kept, *others]
+        return Seen(depth_composite(layers), layers)
+
     def forward(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
+        self,
+        posed: Sequence[Layer],
+        rays: Rays,
+        seen: Seen,
+        stop: float,
+        t_rays: RayTangent | None = None,
     ) -> March:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
+        if t_rays is not None:
+            only_fields(posed, "a backdrop is not differentiated by rays", DETACH)
         tangents = [
-            march_derivative(mode, item, *rays, layer, none, stop)[0]
-            if item.has_gradients
+            march_derivative(mode, item, *rays, layer, none, stop, t_rays)[0]
+            if item.has_gradients or t_rays is not None
             else none
             for item, layer in zip(rays.light(posed), seen.layers, strict=True)
         ]
@@ -188,19 +245,18 @@ class DepthComposite(AbstractComposite):
         seen: Seen,
         cotangent: March,
         stop: float,
-    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        wanted: Sequence[int],
+    ) -> list[RayTangent]:
         """See :meth:`AbstractComposite.backward_rays`."""
+        lit = rays.light(posed)
         purpose = "a backdrop is not differentiated by rays"
-        lit = rays.light(only_fields(posed, purpose, "keep the camera detached"))
-        d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+        fields = only_fields([lit[k] for k in wanted], purpose, DETACH)
         parts = self._cotangents(seen, cotangent)
-        for item, layer, part in zip(lit, seen.layers, parts, strict=True):
-            _, by_origin, by_direction = march_derivative(
-                dr.ADMode.Backward, item, *rays, layer, part, stop
-            )
-            d_origin += by_origin
-            d_direction += by_direction
-        return d_origin, d_direction
+        mode = dr.ADMode.Backward
+        return [
+            march_derivative(mode, item, *rays, seen.layers[k], parts[k], stop)[1:]
+            for k, item in zip(wanted, fields, strict=True)
+        ]
 
     def _cotangents(self, seen: Seen, cotangent: March) -> list[March]:
         """Return the derivatives of the objective by each layer."""

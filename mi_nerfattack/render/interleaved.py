@@ -12,6 +12,7 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,7 @@ from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
+    RayTangent,
     Seen,
     Task,
     select,
@@ -31,9 +33,16 @@ from mi_nerfattack.render.march import (
     absorption,
     march,
     private_gradients,
-    seek,
 )
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.segments import (
+    Cursor,
+    Path,
+    Segment,
+    advance,
+    enter,
+    next_segment,
+)
 
 
 class InterleavedComposite(AbstractComposite):
@@ -60,11 +69,32 @@ class InterleavedComposite(AbstractComposite):
             shares = _march(lit, rays, stop)
         return Seen(_total(shares), shares)
 
+    def keep(self, seen: Seen) -> Any:
+        """See :meth:`AbstractComposite.keep`: all, 20 + 20 k bytes a ray."""
+        return seen
+
+    def restore(
+        self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
+    ) -> Seen:
+        """See :meth:`AbstractComposite.restore`."""
+        del posed, rays, stop
+        return kept
+
     def forward(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, stop: float
+        self,
+        posed: Sequence[Layer],
+        rays: Rays,
+        seen: Seen,
+        stop: float,
+        t_rays: RayTangent | None = None,
     ) -> March:
-        """See :meth:`AbstractComposite.forward`."""
+        """See :meth:`AbstractComposite.forward`; not by the rays."""
         fields, mode = _fields(posed), dr.ADMode.Forward
+        if t_rays is not None:
+            raise TypeError(
+                "InterleavedComposite: no forward mode by the rays; use the depth "
+                "composite, or keep the camera detached"
+            )
         if not any(item.has_gradients for item in fields):
             return March()
         with dr.suspend_grad():
@@ -101,14 +131,15 @@ class InterleavedComposite(AbstractComposite):
         seen: Seen,
         cotangent: March,
         stop: float,
-    ) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """See :meth:`AbstractComposite.backward_rays`."""
+        wanted: Sequence[int],
+    ) -> list[RayTangent]:
+        """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
-            _, d_origin, d_direction = _derivative(
+            by_field = _derivative(
                 mode, fields, rays, seen.total, cotangent, stop, True
-            )
-        return d_origin, d_direction
+            )[1]
+        return [by_field[k] for k in wanted]
 
 
 COMPOSITES: dict[str, type[AbstractComposite]] = {
@@ -120,89 +151,6 @@ COMPOSITES: dict[str, type[AbstractComposite]] = {
 def _fields(posed: Sequence[Layer]) -> list[PosedField]:
     purpose = "the interleaved composite cannot merge what has no density"
     return only_fields(posed, purpose, "set composite to depth")
-
-
-@dataclass
-class _Path:
-    """Rays in the frame of one field, and where they are inside its box."""
-
-    o: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
-    d: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
-    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
-    near: mi.Float = field(default_factory=lambda: mi.Float(0))
-    far: mi.Float = field(default_factory=lambda: mi.Float(0))
-
-
-@dataclass
-class _Cursor:
-    """One field's lattice interval at or ahead of the march, metres."""
-
-    following: mi.Float = field(default_factory=lambda: mi.Float(0))
-    start: mi.Float = field(default_factory=lambda: mi.Float(0))
-    end: mi.Float = field(default_factory=lambda: mi.Float(0))
-
-
-@dataclass
-class _Segment:
-    """Part of the rays on which the set of fields does not change."""
-
-    t: mi.Float = field(default_factory=lambda: mi.Float(0))
-    width: mi.Float = field(default_factory=lambda: mi.Float(0))
-    end: mi.Float = field(default_factory=lambda: mi.Float(0))
-    inside: list[mi.Bool] = field(default_factory=list)
-
-
-def _enter(posed: PosedField, rays: Rays) -> tuple[_Path, _Cursor]:
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    first = dr.floor(posed.lattice_index(near))
-    missed = ~(near < far)
-    end = dr.select(missed, dr.inf, -1)  # -1 is spent: the first interval is sought
-    path = _Path(o, d, dr.normalize(d), near, far)
-    return path, _Cursor(first, dr.select(missed, dr.inf, 0), end)
-
-
-def _advance(
-    posed: PosedField,
-    path: _Path,
-    cursor: _Cursor,
-    t: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
-) -> _Cursor:
-    """Move on to the next occupied interval where the present one lies behind t."""
-    spent = active & (cursor.end <= t)
-    index, _, _, found = seek(
-        posed, path.o, path.d, cursor.following, path.near, path.far, jitter, spent
-    )
-    start = dr.maximum(posed.lattice(index), path.near)
-    end = dr.maximum(dr.minimum(posed.lattice(index + 1), path.far), start)
-    start, end = dr.select(found, start, dr.inf), dr.select(found, end, dr.inf)
-    return _Cursor(
-        dr.select(spent, index + 1, cursor.following),
-        dr.select(spent, start, cursor.start),
-        dr.select(spent, end, cursor.end),
-    )
-
-
-def _segment(
-    cursors: list[_Cursor], t: mi.Float, jitter: mi.Float, active: mi.Bool
-) -> _Segment:
-    """Find the next segment at or after t; its end is infinite where there is none."""
-    nearest = mi.Float(dr.inf)
-    for cursor in cursors:
-        nearest = dr.minimum(nearest, cursor.start)
-    begin = dr.maximum(t, nearest)
-    end = mi.Float(dr.inf)
-    inside = []
-    for cursor in cursors:
-        entered = cursor.start <= begin
-        end = dr.minimum(end, dr.select(entered, cursor.end, cursor.start))
-        inside.append(active & entered & (cursor.end < dr.inf))
-    exists = active & (nearest < dr.inf)
-    width = dr.select(exists, end - begin, 0)
-    sample = dr.select(exists, begin + jitter * width, 0)
-    return _Segment(sample, width, end, inside)
 
 
 def _total(shares: list[March]) -> March:
@@ -218,7 +166,7 @@ def _march(posed: list[PosedField], rays: Rays, stop: float) -> list[March]:
     tau = mi.Float(0)  # optical depth so far
     while active:
         cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
-        here = _segment(cursors, t, rays.jitter, active)
+        here = next_segment(cursors, t, rays.jitter, active)
         active &= here.end < dr.inf
         values, _ = _evaluate(posed, paths, here, False)
         depth = _density(values) * here.width
@@ -239,7 +187,7 @@ def _derivative(
     cotangent: March,
     stop: float,
     with_rays: bool,
-) -> tuple[March, mi.Vector3f, mi.Vector3f]:
+) -> tuple[March, list[RayTangent]]:
     posed = rays.light(posed)
     paths, cursors = _enter_all(posed, rays)
     slopes = [_RayGradient() for _ in posed]
@@ -249,7 +197,7 @@ def _derivative(
     rest = primal.copy()  # what is still to come; opacity stays that of the ray
     while active:
         cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
-        here = _segment(cursors, t, rays.jitter, active)
+        here = next_segment(cursors, t, rays.jitter, active)
         active &= here.end < dr.inf
         with dr.resume_grad():
             values, places = _evaluate(posed, paths, here, with_rays)
@@ -263,26 +211,24 @@ def _derivative(
         tau += dr.select(active, depth, 0)
         t = dr.select(active, here.end, t)
         active &= dr.exp(-tau) > stop
-    return tangent, *_finish(posed, paths, slopes)
+    return tangent, _finish(posed, paths, slopes)
 
 
-def _enter_all(
-    posed: list[PosedField], rays: Rays
-) -> tuple[list[_Path], list[_Cursor]]:
-    entries = [_enter(item, rays) for item in posed]
+def _enter_all(posed: list[PosedField], rays: Rays) -> tuple[list[Path], list[Cursor]]:
+    entries = [enter(item, rays) for item in posed]
     return [path for path, _ in entries], [cursor for _, cursor in entries]
 
 
 def _advance_all(
     posed: list[PosedField],
-    paths: list[_Path],
-    cursors: list[_Cursor],
+    paths: list[Path],
+    cursors: list[Cursor],
     t: mi.Float,
     jitter: mi.Float,
     active: mi.Bool,
-) -> list[_Cursor]:
+) -> list[Cursor]:
     return [
-        _advance(item, path, cursor, t, jitter, active)
+        advance(item, path, cursor, t, jitter, active)
         for item, path, cursor in zip(posed, paths, cursors, strict=True)
     ]
 
@@ -309,7 +255,7 @@ def _share(
 
 
 def _change(
-    values: list, here: _Segment, tau: mi.Float, rest: March
+    values: list, here: Segment, tau: mi.Float, rest: March
 ) -> tuple[March, March]:
     """Linearise the march in one segment.
 
@@ -345,7 +291,7 @@ class _RayGradient:
 
 
 def _evaluate(
-    posed: list[PosedField], paths: list[_Path], here: _Segment, with_rays: bool
+    posed: list[PosedField], paths: list[Path], here: Segment, with_rays: bool
 ) -> tuple[list, list]:
     """Evaluate all fields, attached; also return the points and directions used."""
     values, places = [], []
@@ -383,16 +329,12 @@ def _collect(
 
 
 def _finish(
-    posed: list[PosedField], paths: list[_Path], slopes: list[_RayGradient]
-) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return the derivatives by origin and direction in the world."""
-    d_origin, d_direction = mi.Vector3f(0), mi.Vector3f(0)
+    posed: list[PosedField], paths: list[Path], slopes: list[_RayGradient]
+) -> list[RayTangent]:
+    """Return each field's derivatives by origin and direction in the world."""
+    result = []
     for item, path, slope in zip(posed, paths, slopes, strict=True):
         along = path.heading * dr.dot(path.heading, slope.heading)
         turned = (slope.heading - along) * dr.rcp(dr.norm(path.d))
-        by_origin, by_direction = item.to_world_gradient(
-            slope.origin, slope.direction + turned
-        )
-        d_origin += by_origin
-        d_direction += by_direction
-    return d_origin, d_direction
+        result.append(item.to_world_gradient(slope.origin, slope.direction + turned))
+    return result

@@ -247,6 +247,7 @@ def march_derivative(  # noqa: D417  one entry describes seven
     primal: March,
     cotangent: March,
     stop: float = STOP,
+    t_rays: tuple[mi.Vector3f, mi.Vector3f] | None = None,
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     """Replay :func:`march` and propagate derivatives through the field.
 
@@ -267,6 +268,8 @@ def march_derivative(  # noqa: D417  one entry describes seven
         primal: the result of :func:`march`.
         cotangent: derivative of the objective by radiance, opacity and moment;
             ignored in forward mode.
+        t_rays: tangents of origin and direction, (3, n) each, in forward mode; None
+            where the rays are constants.
 
     Returns:
         the tangent of the march (forward mode; zeros otherwise), and the objective's
@@ -284,6 +287,7 @@ def march_derivative(  # noqa: D417  one entry describes seven
             primal,
             cotangent,
             stop,
+            t_rays,
         )
 
 
@@ -331,8 +335,10 @@ def _march_derivative(
     primal: March,
     cotangent: March,
     stop: float,
+    t_rays: tuple[mi.Vector3f, mi.Vector3f] | None,
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     backward = mode == dr.ADMode.Backward
+    moving = t_rays is not None
     o, d = posed.to_local(origin, direction)
     near, far = posed.interval(o, d, t_max)
     heading = dr.normalize(d)
@@ -344,13 +350,17 @@ def _march_derivative(
     rest_moment = mi.Float(primal.moment)
     d_origin, d_direction, d_heading = (mi.Vector3f(0) for _ in range(3))
     tangent = March()
+    t_o, t_d, t_heading = posed.local_tangents(d, heading, t_rays)
     while active:
         index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
         point = mi.Point3f(o + t * d)
         towards = mi.Vector3f(heading)
         with dr.resume_grad():
-            if dr.hint(backward, mode="scalar"):
+            if dr.hint(backward or moving, mode="scalar"):
                 dr.enable_grad(point, towards)
+            if dr.hint(moving, mode="scalar"):
+                dr.set_grad(point, t_o + t * t_d)
+                dr.set_grad(towards, t_heading)
             density, colour = posed.eval(point, towards, active)
             sigma, value = dr.detach(density), dr.detach(colour)
             x = dr.select(active, sigma * width, 0)

@@ -81,17 +81,37 @@ class PosedField:
     def __init__(self, field: AbstractField, pose: Pose | None = None) -> None:
         self.field = field
         self.pose = pose or Pose.identity()
-        rotation = np.asarray(self.pose.rotation, np.float32)
-        self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
-        self._origin = mi.Point3f(*map(float, self.pose.translation))
+        self.move(self.pose.rotation, self.pose.translation)
         self._inverse_scale = mi.Float(1 / self.pose.scale)
         self._step = mi.Float(field.step_m * self.pose.scale)
         # cone -> 0 makes the lattice uniform; the floor keeps step / cone finite
         self._cone = mi.Float(max(field.cone, 1e-6))
-        dr.make_opaque(
-            self._columns, self._origin, self._inverse_scale, self._step, self._cone
-        )
+        dr.make_opaque(self._inverse_scale, self._step, self._cone)
         self._gain: mi.Color3f | None = None
+
+    def move(self, rotation: np.ndarray, translation: np.ndarray) -> None:
+        """Put the field elsewhere: `placed`; `pose` stays what it was made with.
+
+        Args:
+            rotation: (3, 3), field to world.
+            translation: (3,) of the field's origin, metres in the world.
+        """
+        self.placed = Pose(rotation, translation, self.pose.scale)
+        rotation = np.asarray(rotation, np.float32)
+        self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
+        self._origin = mi.Point3f(*map(float, translation))
+        dr.make_opaque(self._columns, self._origin)
+
+    def at(self, columns: list[mi.Vector3f], origin: mi.Point3f) -> PosedField:
+        """Return this field at another pose, given by arrays that may be attached.
+
+        Args:
+            columns: three, of the rotation from field to world.
+            origin: of the field's frame, metres in the world.
+        """
+        twin = copy.copy(self)
+        twin._columns, twin._origin = columns, origin
+        return twin
 
     def with_gain(self, gain: mi.Color3f) -> PosedField:
         """Return this field with its radiance multiplied, ray by ray.
@@ -102,6 +122,11 @@ class PosedField:
         twin = copy.copy(self)
         twin._gain = dr.detach(gain)
         return twin
+
+    @property
+    def origin(self) -> mi.Point3f:
+        """Where the origin of the field's frame is in the world, metres."""
+        return self._origin
 
     @property
     def has_gradients(self) -> bool:
@@ -128,11 +153,35 @@ class PosedField:
     ) -> tuple[mi.Point3f, mi.Vector3f]:
         """Map a world ray; ``o + t d`` keeps its meaning with t in world metres."""
         offset = mi.Vector3f(origin - self._origin)
-        o = [dr.dot(column, offset) * self._inverse_scale for column in self._columns]
-        d = [
-            dr.dot(column, direction) * self._inverse_scale for column in self._columns
-        ]
-        return mi.Point3f(*o), mi.Vector3f(*d)
+        return mi.Point3f(self.turn(offset)), self.turn(direction)
+
+    def turn(self, vector: mi.Vector3f) -> mi.Vector3f:
+        """Map a difference of world points, (3, n), to the field's frame."""
+        return mi.Vector3f(
+            *[dr.dot(column, vector) * self._inverse_scale for column in self._columns]
+        )
+
+    def local_tangents(
+        self,
+        d: mi.Vector3f,
+        heading: mi.Vector3f,
+        t_rays: tuple[mi.Vector3f, mi.Vector3f] | None,
+    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
+        """Map tangents of world rays to those of the local ones; zeros for None.
+
+        Args:
+            d: (3, n), local directions.
+            heading: (3, n), the same of unit length.
+            t_rays: tangents of origin and direction in the world.
+
+        Returns:
+            tangents of local origin, local direction and heading.
+        """
+        if t_rays is None:
+            return mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)
+        t_o, t_d = (self.turn(tangent) for tangent in t_rays)
+        along = heading * dr.dot(heading, t_d)
+        return t_o, t_d, (t_d - along) * dr.rcp(dr.norm(d))
 
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Return what lies behind the field, (3, n), linear; it turns with the field.

@@ -1,135 +1,156 @@
-"""Adjoint of the closed loop by replay: memory that does not grow with the drive.
+"""Ways to go back through a drive: what is kept, and what is computed again.
 
-For an objective ``J = mean_n sum_t C(x_t)`` under ``G_t(x_{t-1}, x_t, theta) = 0``,
-``(dG_t/dx_t)^T l_t = -(dC/dx_t)^T - (dG_{t+1}/dx_t)^T l_{t+1}`` is solved backwards
-from ``l_{T+1} = 0``, and ``dJ/dtheta = sum_t l_t^T dG_t/dtheta``. Each step renders
-its frame again, so that between steps only states, controls and one gradient buffer
-exist. Cost of a step: one more observation (none where the trajectory kept them), one
-product with the policy's derivative and one march derivative. Source: appendix A.9 to
-A.12.
+For ``J`` of the states ``x_1 .. x_T`` under ``G_t(x_{t-1}, x_t, theta) = 0`` the
+adjoint method solves ``(dG_t/dx_t)^T l_t = -(dJ/dx_t)^T - (dG_{t+1}/dx_t)^T l_{t+1}``
+backwards from ``l_{T+1} = 0``; then ``dJ/dtheta = sum_t l_t^T dG_t/dtheta``. G is
+taken in resolved form, ``G_t = x_t - Phi(x_{t-1}, u)``, also for implicit integrators
+(the derivative of whose Phi is that of the implicit function), so that ``l_t`` is
+minus the derivative of J by ``x_t``. Source: appendix A.9 to A.12.
+
+All members but :class:`FullTape` (tape.py) solve these equations; they differ in what
+they keep. m is the number of rows of the state, T the number of control periods.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-import numpy as np
+from mi_nerfattack.rollout.cost import Cost
+from mi_nerfattack.rollout.loop import ClosedLoop, Step, Trajectory
+from mi_nerfattack.rollout.sweep import Gradient, Options, backward, differentiable
 
-from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Trajectory, state_type
-from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
-from mi_nerfattack.vehicle.integrators import solve_columns
 
-StageCost = Callable[[Any], Any]
+class AbstractAdjoint(ABC):
+    """How a drive is differentiated in reverse."""
+
+    @abstractmethod
+    def keep(self, loop: ClosedLoop, step: Step) -> Any:
+        """Return what to keep of a control period during the forward pass."""
+
+    @abstractmethod
+    def gradient(
+        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
+        """Differentiate a cost.
+
+        Args:
+            loop: as it was when it drove.
+            drive: what it did, with what :meth:`keep` kept.
+            cost: of the states.
+            options: what to differentiate by.
+
+        Raises:
+            TypeError: sensor or policy have no such derivatives.
+        """
 
 
 @dataclass(frozen=True)
-class Gradient:
-    """Derivatives of an objective.
+class Replay(AbstractAdjoint):
+    """Keeps states, and the policy's memory where it has one; renders all again.
 
-    Attributes:
-        textures: one tensor (n_vertices, 3) an object.
-        initial: (3, n) by the initial states.
-        costates: (horizon, n, 3) l_t, NumPy.
+    Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
+    independent of the horizon. Time: a backward pass renders every frame once more,
+    then costs one product with the policy's derivative and one march derivative a
+    period; forward and backward together about 2.3 forward passes.
     """
 
-    textures: list[Any]
-    initial: Any
-    costates: np.ndarray
+    def keep(self, loop: ClosedLoop, step: Step) -> Any:
+        """See :meth:`AbstractAdjoint.keep`."""
+        del loop
+        return step.memory
+
+    def gradient(
+        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
+        """See :meth:`AbstractAdjoint.gradient`."""
+        visits = self._visit(loop, drive)
+        return backward(loop, drive, visits, cost.by_states(drive), options)
+
+    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        for index in reversed(range(drive.horizon)):
+            state = drive.states[index]
+            seen = loop.sensor.observe(state, index)
+            yield Step(index, state, seen, drive.kept[index])
 
 
-def objective_value(trajectory: Trajectory, cost: StageCost) -> float:
-    """Evaluate ``mean_n sum_{t>=1} C(x_t)``."""
-    total = 0.0
-    for state in trajectory.states[1:]:
-        total += float(np.mean(np.array(cost(state))))
-    return total
+@dataclass(frozen=True)
+class KeptBackgrounds(AbstractAdjoint):
+    """Keeps how the scene looked in each frame; renders the objects again.
+
+    Memory: what :class:`Replay` keeps and 20 bytes a pixel and period (colour, opacity
+    and depth of the scene in single precision): 0.26 MB a vehicle and period at
+    200x66, 1.4 MB at 366x188. Exact composites keep 20 (k + 2) bytes for k objects.
+    Time: as Replay without rendering the scene again, so that forward and backward
+    together take less than 2 forward passes where the objects fill little of the
+    frame. The choice as long as the memory suffices.
+    """
+
+    def keep(self, loop: ClosedLoop, step: Step) -> Any:
+        """See :meth:`AbstractAdjoint.keep`."""
+        return differentiable(loop).keep(step.observation), step.memory
+
+    def gradient(
+        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
+        """See :meth:`AbstractAdjoint.gradient`."""
+        visits = self._visit(loop, drive)
+        return backward(loop, drive, visits, cost.by_states(drive), options)
+
+    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        sensor = differentiable(loop)
+        for index in reversed(range(drive.horizon)):
+            kept, memory = drive.kept[index]
+            state = drive.states[index]
+            yield Step(index, state, sensor.restore(state, index, kept), memory)
 
 
-def replay_gradient(
-    loop: ClosedLoop,
-    trajectory: Trajectory,
-    cost: StageCost,
-    attached: bool = False,
-    on_step: OnStep | None = None,
-) -> Gradient:
-    """Differentiate ``mean_n sum_t C(x_t)`` by the textures and initial states.
+@dataclass(frozen=True)
+class Checkpointed(AbstractAdjoint):
+    """Keeps the policy's memory once a segment; drives each segment again.
+
+    For policies with a large memory (stacks of frames) and long drives. Memory: states,
+    the policy's memory once every `segment` periods, and what :class:`KeptBackgrounds`
+    keeps for one segment; least near ``segment = sqrt(T)``. Time: as Replay, and the
+    policy is evaluated once more.
 
     Args:
-        loop: as it was when it gave `trajectory`; its sensor differentiable.
-        trajectory: from :func:`simulate`.
-        cost: C, maps states (3, n) to (n,), differentiable by Dr.Jit.
-        attached: keep the derivative of the observation by the state (its default
-            is A.12, which stops it). Only attached gradients are those of the
-            whole loop.
-        on_step: called after each step with its index.
-
-    Raises:
-        TypeError: the sensor is not differentiable.
+        segment: control periods, at least 1.
     """
-    sensor = loop.sensor
-    if not isinstance(sensor, AbstractDifferentiableSensor):
-        raise TypeError(f"{type(sensor).__name__}: has no derivatives")
-    count = dr.width(trajectory.states[0])
-    carry = dr.opaque(state_type(), 0, count)  # (dG_{t+1}/dx_t)^T l_{t+1}
-    costates = []
-    sensor.start_gradient()
-    for step in reversed(range(trajectory.horizon)):
-        before, after = trajectory.states[step], trajectory.states[step + 1]
-        right = -_cost_gradient(cost, after, count) - carry
-        costate = _solve(loop, before, after, trajectory.controls[step], right)
-        dr.eval(costate)
-        d_before, d_control = _residual_vjp(
-            loop, before, after, trajectory.controls[step], costate
-        )
-        kept = trajectory.observations
-        seen = kept[step] if kept else sensor.observe(before, step)
-        row = dr.array_t(seen.image)
-        _, d_image = loop.policy.vjp(seen.image, loop.goal, row(d_control))
-        d_state = sensor.vjp(seen, before, d_image, attached)
-        carry = d_before if d_state is None else d_before + d_state
-        dr.eval(carry)
-        costates.append(np.array(costate).T)
-        if on_step is not None:
-            on_step(step)
-    gradients = sensor.texture_gradients()
-    return Gradient(gradients, carry, np.stack(costates[::-1]))
 
+    segment: int = 16
 
-def _cost_gradient(cost: StageCost, state: Any, count: int) -> Any:
-    leaf = type(state)(state)
-    dr.enable_grad(leaf)
-    dr.backward_from(cost(leaf) / count)
-    return dr.grad(leaf)
+    def __post_init__(self) -> None:
+        if self.segment < 1:
+            raise ValueError(f"Checkpointed.segment: {self.segment}; at least 1")
 
+    def keep(self, loop: ClosedLoop, step: Step) -> Any:
+        """See :meth:`AbstractAdjoint.keep`."""
+        del loop
+        return step.memory if step.index % self.segment == 0 else None
 
-def _residual(loop: ClosedLoop, before: Any, after: Any, control: Any) -> Any:
-    applied = loop.dynamics.saturate(control)
-    return loop.integrator.residual(loop.dynamics, before, after, applied, loop.dt)
+    def gradient(
+        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
+        """See :meth:`AbstractAdjoint.gradient`."""
+        visits = self._visit(loop, drive)
+        return backward(loop, drive, visits, cost.by_states(drive), options)
 
-
-def _residual_vjp(
-    loop: ClosedLoop, before: Any, after: Any, control: Any, costate: Any
-) -> tuple[Any, Any]:
-    """Return ``(dG/dx_{t-1})^T l`` and ``(dG/du)^T l``."""
-    leaf, control_leaf = type(before)(before), type(control)(control)
-    dr.enable_grad(leaf, control_leaf)
-    dr.backward_from(dr.dot(_residual(loop, leaf, after, control_leaf), costate))
-    result = dr.grad(leaf), dr.grad(control_leaf)
-    dr.eval(result)
-    return result
-
-
-def _solve(loop: ClosedLoop, before: Any, after: Any, control: Any, right: Any) -> Any:
-    """Solve ``(dG_t/dx_t)^T l = right``."""
-    if loop.integrator.explicit:
-        return right
-    rows = []
-    for axis in range(3):
-        leaf = type(after)(after)
-        dr.enable_grad(leaf)
-        dr.backward_from(_residual(loop, before, leaf, control)[axis])
-        rows.append(dr.grad(leaf))
-    return solve_columns(rows, right)
+    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        sensor = differentiable(loop)
+        starts = range(0, drive.horizon, self.segment)
+        for start in reversed(starts):
+            end = min(start + self.segment, drive.horizon)
+            memory, kept = drive.kept[start], []
+            for index in range(start, end):
+                seen = sensor.observe(drive.states[index], index)
+                kept.append((sensor.keep(seen), memory))
+                if index + 1 < end:
+                    _, memory = loop.policy.step(seen.image, loop.goal, memory)
+                del seen
+            for index in reversed(range(start, end)):
+                view, memory = kept.pop()
+                state = drive.states[index]
+                yield Step(index, state, sensor.restore(state, index, view), memory)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
+from mi_nerfattack.rollout.transition import Transition
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
 
@@ -24,11 +27,15 @@ class ClosedLoop:
     Attributes:
         sensor: what the policy sees.
         policy: a policy.AbstractPolicy (named so because this package imports no
-            torch): `control(image, goal)` and, for gradients, `vjp`.
+            torch).
         goal: index of the policy's goal.
         dynamics: the vehicle.
         integrator: the time step.
-        dt: seconds; the control is held for one step.
+        dt: control period, seconds: time between two images; a control is held for
+            one period.
+        substeps: integration steps a control period.
+        delay: integration steps until a control takes effect; before the first one
+            does, the control is 0.
     """
 
     sensor: AbstractSensor
@@ -37,6 +44,36 @@ class ClosedLoop:
     dynamics: AbstractDynamics
     integrator: AbstractIntegrator
     dt: float
+    substeps: int = 1
+    delay: int = 0
+    transition: Transition = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        transition = Transition(
+            self.dynamics, self.integrator, self.dt, self.substeps, self.delay
+        )
+        object.__setattr__(self, "transition", transition)
+
+    def initial(self, poses: np.ndarray) -> Any:
+        """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""
+        return to_state(self.dynamics.extend(np.atleast_2d(poses)))
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened in one control period, for those who keep parts of it.
+
+    Attributes:
+        index: from 0.
+        state: (m, n) before it.
+        observation: what was seen.
+        memory: of the policy, before it.
+    """
+
+    index: int
+    state: Any
+    observation: Observation
+    memory: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -44,40 +81,62 @@ class Trajectory:
     """States and controls of a batch of drives.
 
     Attributes:
-        states: horizon + 1 arrays (3, n), metres and radians, evaluated.
+        states: horizon + 1 arrays (m, n), metres and radians, evaluated.
         controls: horizon rows (n,), the policy's raw outputs, evaluated.
-        observations: what was seen in each step, where it was asked to be kept.
+        dt: control period, seconds.
+        kept: what `keep` returned for each control period.
     """
 
     states: tuple[Any, ...]
     controls: tuple[Any, ...]
-    observations: tuple[Observation, ...] = ()
+    dt: float
+    kept: tuple[Any, ...] = ()
 
     @property
     def horizon(self) -> int:
-        """Number of steps."""
+        """Number of control periods."""
         return len(self.controls)
 
+    @property
+    def count(self) -> int:
+        """Number of vehicles."""
+        return dr.width(self.states[0])
+
     def states_numpy(self) -> np.ndarray:
-        """States as (n, horizon + 1, 3) float64."""
+        """States as (n, horizon + 1, m) float64."""
         return np.stack([np.array(s) for s in self.states], axis=-1).transpose(1, 2, 0)
 
     def controls_numpy(self) -> np.ndarray:
         """Controls as (n, horizon) float64."""
         return np.stack([np.array(c) for c in self.controls], axis=-1)
 
+    def history(self) -> StateHistory:
+        """Lay all states but the first side by side, detached."""
+        states = self.states_numpy()[:, 1:]
+        rows = to_state(states.reshape(-1, states.shape[2]))
+        return StateHistory(rows, self.count, self.horizon, self.dt)
 
-def state_type() -> Any:
-    """Type of a batch of states for the active variant, double precision."""
-    return dr.float64_array_t(mi.Vector3f)
+
+def state_type(size: int = 3) -> Any:
+    """Type of a batch of states of `size` rows, of the active variant, double."""
+    if size == 3:
+        return dr.float64_array_t(mi.Vector3f)
+    return sys.modules[mi.Float.__module__].ArrayXf64
 
 
 def to_state(states: np.ndarray) -> Any:
-    """Upload states (n, 3), metres and radians, as an opaque (3, n) array."""
+    """Upload states (n, m), metres and radians first, as an opaque (m, n) array.
+
+    Raises:
+        ValueError: another shape, less than three columns, or not finite.
+    """
     states = np.atleast_2d(np.asarray(states, np.float64))
-    if states.ndim != 2 or states.shape[1] != 3 or not np.isfinite(states).all():
+    if states.ndim != 2 or states.shape[1] < 3 or not np.isfinite(states).all():
         raise ValueError(f"states: shape {states.shape}; expected finite (n, 3)")
-    result = state_type()(*[np.ascontiguousarray(column) for column in states.T])
+    kind = state_type(states.shape[1])
+    # lists: memory from NumPy has an alignment of its own, and so its own kernels
+    row = dr.value_t(kind)
+    result = kind(*[row(column) for column in states.T.tolist()])
     dr.make_opaque(result)
     return result
 
@@ -87,32 +146,41 @@ def simulate(
     initial: Any,
     horizon: int,
     on_step: OnStep | None = None,
-    keep: bool = False,
+    keep: Callable[[Step], Any] | None = None,
 ) -> Trajectory:
     """Drive a batch of vehicles.
 
     Args:
         loop: the closed loop.
-        initial: (3, n) from :func:`to_state`.
-        horizon: number of steps, at least 1.
-        on_step: called after each step with its index.
-        keep: keep all observations, so that a gradient need not render them again;
-            about 80 + 20 k bytes a pixel and step for k fields. Otherwise nothing but
-            states and controls is kept.
+        initial: (m, n) from :meth:`ClosedLoop.initial`.
+        horizon: number of control periods, at least 1.
+        on_step: called after each with its index.
+        keep: called in each; what it returns is kept for a backward pass. Otherwise
+            nothing but states and controls is.
+
+    Raises:
+        ValueError: horizon below 1, or a state of the wrong size.
+        InputError: the policy fails, or an implicit step does not converge.
     """
     if horizon < 1:
         raise ValueError(f"horizon: {horizon}; at least 1")
-    states, controls, observations = [initial], [], []
-    for step in range(horizon):
-        seen = loop.sensor.observe(states[-1], step)
-        control = dr.value_t(state_type())(loop.policy.control(seen.image, loop.goal))
-        applied = loop.dynamics.saturate(control)
-        state = loop.integrator.step(loop.dynamics, states[-1], applied, loop.dt)
-        dr.eval(state, control)
-        states.append(state)
-        controls.append(control)
-        if keep:
-            observations.append(seen)
+    if len(initial) != loop.dynamics.state_size:
+        raise ValueError(
+            f"states: {len(initial)} rows; {type(loop.dynamics).__name__} has "
+            f"{loop.dynamics.state_size}: make them by ClosedLoop.initial"
+        )
+    states, controls, kept = [initial], [], []
+    memory = loop.policy.initial_memory(dr.width(initial))
+    for index in range(horizon):
+        seen = loop.sensor.observe(states[-1], index)
+        step = Step(index, states[-1], seen, memory)
+        control, memory = loop.policy.step(seen.image, loop.goal, memory)
+        controls.append(dr.value_t(type(initial))(control))
+        older, newer = loop.transition.controls(controls, index, initial)
+        states.append(loop.transition.advance(states[-1], older, newer))
+        dr.eval(controls[-1])
+        if keep is not None:
+            kept.append(keep(step))
         if on_step is not None:
-            on_step(step)
-    return Trajectory(tuple(states), tuple(controls), tuple(observations))
+            on_step(index)
+    return Trajectory(tuple(states), tuple(controls), loop.dt, tuple(kept))

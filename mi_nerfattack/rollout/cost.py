@@ -1,0 +1,55 @@
+"""The number that is minimised, as a function of a batch of drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.rollout.loop import Trajectory
+from mi_nerfattack.rollout.objective import AbstractObjective, StateHistory
+from mi_nerfattack.rollout.reduction import AbstractReduction
+
+
+@dataclass(frozen=True)
+class Cost:
+    """An objective of each drive, reduced over the batch.
+
+    Attributes:
+        objective: cost of one drive.
+        reduction: of the batch.
+        scale: factor of all derivatives.
+    """
+
+    objective: AbstractObjective
+    reduction: AbstractReduction
+    scale: float = 1.0
+
+    def of(self, drive: Trajectory) -> tuple[float, np.ndarray]:
+        """Evaluate: the cost of the batch, and those of its drives, (n,)."""
+        costs = self.objective.evaluate(drive.history())
+        return float(self.reduction.reduce(costs)[0]), np.array(costs)
+
+    def by_states(self, drive: Trajectory) -> np.ndarray:
+        """Differentiate by x_1 to x_T: (T, n, m)."""
+        history = drive.history()
+        leaf = type(history.rows)(history.rows)
+        dr.enable_grad(leaf)
+        dr.backward_from(self.attached(_with(history, leaf)))
+        by_rows = np.array(dr.grad(leaf), np.float64)
+        shape = (len(leaf), history.count, history.horizon)
+        return self.scale * by_rows.reshape(shape).transpose(2, 1, 0)
+
+    def tangent(self, drive: Trajectory, tangents: np.ndarray) -> float:
+        """Differentiate in the direction of tangents (T, n, m) of x_1 to x_T."""
+        return float((self.by_states(drive) * tangents).sum())
+
+    def attached(self, history: StateHistory) -> Any:
+        """Evaluate the cost of the batch, one entry, on Dr.Jit's tape."""
+        return self.reduction.reduce(self.objective.evaluate(history))
+
+
+def _with(history: StateHistory, rows: Any) -> StateHistory:
+    return StateHistory(rows, history.count, history.horizon, history.dt)

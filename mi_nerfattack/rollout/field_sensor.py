@@ -1,0 +1,357 @@
+"""The surrogate simulator's camera: fields, differentiable in all their parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.colour import linear_to_srgb
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.backdrop import Layer
+from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
+from mi_nerfattack.render.composite import (
+    AbstractComposite,
+    DepthComposite,
+    RayTangent,
+    Seen,
+    Task,
+    depth_composite,
+)
+from mi_nerfattack.render.march import STOP, March, Rays
+from mi_nerfattack.render.offset import (
+    offset_gradient,
+    offset_on_tape,
+    offset_pose,
+    wrench_of,
+)
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.taped import taped_march
+from mi_nerfattack.rollout.frozen import freeze_method
+from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
+
+
+class FieldSensor(AbstractDifferentiableSensor):
+    """Camera in a scene with objects: the surrogate simulator.
+
+    One ray a pixel through its centre; behind everything the background of the
+    scene's field. All fields are marched for all vehicles together.
+
+    Cost of an observation: one march. Cost of a product: one march derivative over
+    the rays that meet an object (over all rays of the objects for their poses, over
+    all rays and fields when attached).
+
+    Args:
+        scene: the scene's field in the world, or a backdrop; that one needs the depth
+            composite, and has no attached derivatives.
+        objects: fields with textures, posed in the world; may be empty.
+        camera: intrinsics.
+        mount: pose on the vehicle.
+        jitter_seed: seed of per-ray sample positions, renewed each step and replayed
+            by products; None places samples at the middle of their intervals.
+        stop: transmittance at which rays end.
+        composite: how fields become one colour; `DepthComposite` by default.
+    """
+
+    def __init__(
+        self,
+        scene: Layer,
+        objects: list[PosedField],
+        camera: Camera,
+        mount: CameraMount | None = None,
+        jitter_seed: int | None = None,
+        stop: float = STOP,
+        composite: AbstractComposite | None = None,
+    ) -> None:
+        for posed in objects:
+            if not isinstance(posed.field, GridField):
+                raise TypeError(f"objects: {posed.field.kind}; grid fields are needed")
+        self.scene = scene
+        self.objects = list(objects)
+        self.camera = camera
+        self.mount = mount or CameraMount()
+        self.jitter_seed = jitter_seed
+        self.stop = stop
+        self.composite = composite or DepthComposite()
+        self.composite.check(self._fields)
+        self.renders = 0
+        self._offsets = np.zeros((len(objects), 6))
+        self._wrenches: list[Any] | None = None
+        # Tracing these in Python takes longer than running them.
+        self._frozen_render = freeze_method(self._render, self._state)
+        self._frozen_restore = freeze_method(self._restore, self._state)
+        self._frozen_cotangent = freeze_method(self._cotangent, self._state)
+        self._frozen_accumulate = freeze_method(self._accumulate, self._state)
+        self._frozen_all_rays = freeze_method(self._by_all_rays, self._state)
+        self._frozen_object_rays = freeze_method(self._by_object_rays, self._state)
+
+    def observe(self, state: Any, step: int) -> Observation:
+        """Render the composite; see :meth:`AbstractSensor.observe`."""
+        count = dr.width(state)
+        key = dr.opaque(mi.UInt32, step)
+        found = self._frozen_render(_pose(state), key, count)
+        self.renders += count
+        return self._observation(count, *found)
+
+    def keep(self, observation: Observation) -> Any:
+        """Keep the scene's march, 20 bytes a pixel (more for other composites)."""
+        assert observation.seen is not None
+        return self.composite.keep(observation.seen)
+
+    def restore(self, state: Any, step: int, kept: Any) -> Observation:
+        """March the objects again, and lay them over the scene that was kept."""
+        count = dr.width(state)
+        key = dr.opaque(mi.UInt32, step)
+        found = self._frozen_restore(_pose(state), key, kept, count)
+        return self._observation(count, *found)
+
+    def _render(
+        self, state: Any, step: mi.UInt32, count: int
+    ) -> tuple[mi.Color3f, Seen, Rays]:
+        rays = self._make_rays(state, step, count)
+        seen = self.composite.render(self._fields, rays, self.stop)
+        return self._develop(seen.total, rays.direction), seen, rays
+
+    def _restore(
+        self, state: Any, step: mi.UInt32, kept: Any, count: int
+    ) -> tuple[mi.Color3f, Seen, Rays]:
+        rays = self._make_rays(state, step, count)
+        seen = self.composite.restore(self._fields, rays, kept, self.stop)
+        return self._develop(seen.total, rays.direction), seen, rays
+
+    def _observation(
+        self, count: int, pixels: mi.Color3f, seen: Seen, rays: Rays
+    ) -> Observation:
+        return Observation(self._tensor(pixels, count), seen, rays)
+
+    def vjp(
+        self, observation: Observation, state: Any, d_image: Any, attached: bool
+    ) -> Any:
+        """See :meth:`AbstractDifferentiableSensor.vjp`."""
+        rays, seen = observation.rays, observation.seen
+        assert rays is not None and seen is not None
+        cotangent, d_direction = self._frozen_cotangent(
+            seen.total, rays.direction, d_image.array
+        )
+        if attached:
+            d_rays, wrenches = self._frozen_all_rays(rays, seen, cotangent)
+        elif self._wrenches is not None:
+            d_rays, wrenches = None, self._frozen_object_rays(rays, seen, cotangent)
+        else:
+            d_rays = wrenches = None
+            for task in self.composite.tasks(self._fields, rays, seen, cotangent):
+                self._frozen_accumulate(task)
+        if wrenches is not None and self._wrenches is not None:
+            pairs = zip(self._wrenches, wrenches, strict=True)
+            self._wrenches = [
+                [a + b for a, b in zip(*pair, strict=True)] for pair in pairs
+            ]
+        dr.eval([dr.grad(posed.field.packed) for posed in self.objects], self._wrenches)
+        return self._by_state(state, d_rays, d_direction) if attached else None
+
+    def _cotangent(
+        self, total: March, direction: mi.Vector3f, d_image: mi.Float
+    ) -> tuple[March, mi.Vector3f]:
+        """Differentiate by the composite and, for the sky, by the direction."""
+        total, direction = total.copy(), mi.Vector3f(direction)
+        dr.enable_grad(total, direction)
+        pixels = self._develop(total, direction)
+        index = 3 * dr.arange(mi.UInt32, dr.width(pixels))
+        weights = [dr.gather(mi.Float, d_image, index + c) for c in range(3)]
+        dr.backward_from(dr.dot(pixels, mi.Color3f(*weights)))
+        return dr.grad(total), dr.grad(direction)
+
+    def _accumulate(self, task: Task) -> None:
+        posed = [self._fields[k] for k in task.fields]
+        self.composite.accumulate(posed, task, self.stop)
+
+    def _by_all_rays(
+        self, rays: Rays, seen: Seen, cotangent: March
+    ) -> tuple[RayTangent, list[Any]]:
+        """Differentiate all layers: sums over layers, and the objects' wrenches."""
+        layers = range(len(self._fields))
+        found = self.composite.backward_rays(
+            self._fields, rays, seen, cotangent, self.stop, layers
+        )
+        d_origin = sum((by_origin for by_origin, _ in found), mi.Vector3f(0))
+        d_direction = sum((by_direction for _, by_direction in found), mi.Vector3f(0))
+        return (d_origin, d_direction), self._sum_wrenches(rays, found[1:])
+
+    def _by_object_rays(self, rays: Rays, seen: Seen, cotangent: March) -> list[Any]:
+        layers = range(1, len(self._fields))
+        found = self.composite.backward_rays(
+            self._fields, rays, seen, cotangent, self.stop, layers
+        )
+        return self._sum_wrenches(rays, found)
+
+    def _sum_wrenches(self, rays: Rays, found: list[RayTangent]) -> list[Any]:
+        pairs = zip(self.objects, found, strict=True)
+        return [wrench_of(posed, rays, by_rays) for posed, by_rays in pairs]
+
+    def _state(self, *arguments: Any) -> list[Any]:
+        """Return what frozen functions read or depend on beside their arguments."""
+        # Recordings hold literals of one image's size; a task has none.
+        sizes = [dr.width(x) for x in arguments if not isinstance(x, Task)]
+        state = [posed.state() for posed in self._fields]
+        return [self.composite, self.stop, sizes, state]
+
+    def start_gradient(self, poses: bool = False) -> None:
+        """Make every object's packed grid a fresh leaf with gradient zero."""
+        for posed in self.objects:
+            leaf = mi.Float(dr.detach(posed.field.packed))
+            dr.enable_grad(leaf)
+            posed.field.packed = leaf
+            dr.set_grad(posed.field.packed, dr.opaque(mi.Float, 0, dr.width(leaf)))
+        double = dr.float64_array_t(mi.Float)
+        zeros = [[dr.opaque(double, 0) for _ in range(6)] for _ in self.objects]
+        self._wrenches = zeros if poses else None
+
+    def texture_gradients(self) -> list[Any]:
+        """Return the accumulated gradient of each texture, (n_vertices, 3)."""
+        return [
+            posed.field.texture_gradient(dr.grad(posed.field.packed))
+            for posed in self.objects
+        ]
+
+    def textures(self) -> list[Any]:
+        """See :meth:`AbstractDifferentiableSensor.textures`."""
+        return [posed.field.texture for posed in self.objects]
+
+    def set_textures(self, textures: list[Any]) -> None:
+        """See :meth:`AbstractDifferentiableSensor.set_textures`."""
+        for posed, texture in zip(self.objects, textures, strict=True):
+            posed.field.set_parameter("texture", texture)
+
+    def offsets(self) -> np.ndarray:
+        """See :meth:`AbstractDifferentiableSensor.offsets`."""
+        return self._offsets.copy()
+
+    def set_offsets(self, offsets: np.ndarray) -> None:
+        """See :meth:`AbstractDifferentiableSensor.set_offsets`."""
+        offsets = np.asarray(offsets, np.float64)
+        if offsets.shape != (len(self.objects), 6) or not np.isfinite(offsets).all():
+            raise ValueError(
+                f"offsets: shape {offsets.shape}; expected finite "
+                f"({len(self.objects)}, 6)"
+            )
+        self._offsets = offsets.copy()
+        for posed, offset in zip(self.objects, offsets, strict=True):
+            posed.move(*offset_pose(posed.pose, offset))
+
+    def offset_gradients(self) -> np.ndarray:
+        """See :meth:`AbstractDifferentiableSensor.offset_gradients`."""
+        assert self._wrenches is not None, "start_gradient(poses=True) comes before"
+        wrenches = [[float(x[0]) for x in wrench] for wrench in self._wrenches]
+        pairs = zip(np.array(wrenches).reshape(-1, 6), self._offsets, strict=True)
+        return np.array([offset_gradient(*pair) for pair in pairs]).reshape(-1, 6)
+
+    def start_tangent(self, textures: list[Any]) -> None:
+        """See :meth:`AbstractDifferentiableSensor.start_tangent`."""
+        for posed, tangent in zip(self.objects, textures, strict=True):
+            field = posed.field
+            leaf = mi.Float(dr.detach(field.packed))
+            dr.enable_grad(leaf)
+            none = dr.zeros(mi.Float, field.n_vertices)
+            dr.set_grad(leaf, field.pack(mi.Float(tangent.array), none))
+            field.packed = leaf
+
+    def jvp(self, observation: Observation, state: Any, t_state: Any) -> Any:
+        """See :meth:`AbstractDifferentiableSensor.jvp`."""
+        rays, seen = observation.rays, observation.seen
+        assert rays is not None and seen is not None
+        t_rays = None if t_state is None else self._ray_tangent(state, t_state)
+        tangent = self.composite.forward(self._fields, rays, seen, self.stop, t_rays)
+        with dr.resume_grad():
+            total, direction = seen.total.copy(), mi.Vector3f(rays.direction)
+            dr.enable_grad(total, direction)
+            dr.set_grad(total, tangent)
+            dr.set_grad(direction, 0 if t_rays is None else t_rays[1])
+            pixels = self._develop(total, direction)
+            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+            t_pixels: Any = dr.forward_to(pixels, flags=flags)
+        return self._tensor(t_pixels, dr.width(state))
+
+    def trace(self, state: Any, step: int, textures: list[Any], offsets: Any) -> Any:
+        """See :meth:`AbstractDifferentiableSensor.trace`; depth composite only."""
+        if not isinstance(self.composite, DepthComposite):
+            name = type(self.composite).__name__
+            raise TypeError(f"{name}: cannot be taped; use the depth composite")
+        if not isinstance(self.scene, PosedField):
+            raise TypeError(f"{self.scene.name}: a backdrop cannot be taped")
+        count = dr.width(state)
+        key = dr.opaque(mi.UInt32, step)
+        rays = self._make_rays([state[i] for i in range(3)], key, count)
+        layers = [taped_march(self.scene, rays, self.stop)]
+        for k, (posed, texture) in enumerate(zip(self.objects, textures, strict=True)):
+            posed.field.packed = posed.field.pack(mi.Float(texture.array))
+            if offsets is not None:
+                row = [offsets[k, i].array for i in range(6)]
+                posed = offset_on_tape(posed, posed.pose, row)
+            layers.append(taped_march(posed, rays, self.stop))
+        pixels = self._develop(depth_composite(layers), rays.direction)
+        return self._tensor(pixels, count)
+
+    def _make_rays(self, state: Any, step: mi.UInt32, count: int) -> Rays:
+        origin, direction = self._rays(state, count)
+        jitter = self._jitter(step, dr.width(direction))
+        far, active = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Bool, True)
+        return Rays(origin, direction, far, jitter, active)
+
+    def _rays(self, state: Any, count: int) -> tuple[mi.Point3f, mi.Vector3f]:
+        mount = self.mount
+        origin, columns = mount_pose(
+            (mi.Float(state[0]), mi.Float(state[1]), mi.Float(state[2])),
+            mount.height_m,
+            mount.forward_m,
+            mount.pitch_deg,
+        )
+        dr.eval(origin, columns)
+        return generate_rays(self.camera, origin, columns, count)
+
+    def _jitter(self, step: mi.UInt32, count: int) -> mi.Float:
+        if self.jitter_seed is None:
+            return dr.opaque(mi.Float, 0.5)
+        seed = dr.opaque(mi.UInt32, self.jitter_seed)
+        key = mi.sample_tea_32(seed, step)[0]
+        return mi.sample_tea_float32(key, dr.arange(mi.UInt32, count))
+
+    @property
+    def _fields(self) -> list[Layer]:
+        return [self.scene, *self.objects]
+
+    def _develop(self, total: March, direction: mi.Vector3f) -> mi.Color3f:
+        behind = self.scene.background(direction)
+        return linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
+
+    def _tensor(self, pixels: mi.Color3f, count: int) -> mi.TensorXf:
+        shape = (count, self.camera.height, self.camera.width, 3)
+        return mi.TensorXf(dr.ravel(pixels), shape)
+
+    def _by_state(self, state: Any, d_rays: Any, d_direction: Any) -> Any:
+        """Differentiate the rays, and what they see, by the state."""
+        d_origin, by_direction = d_rays
+        d_direction += by_direction
+        dr.eval(d_origin, d_direction)
+        leaf = _pose(state)
+        dr.enable_grad(leaf)
+        origin, direction = self._rays(leaf, dr.width(leaf))
+        dr.backward_from(dr.dot(origin, d_origin) + dr.dot(direction, d_direction))
+        result = dr.grad(leaf)
+        dr.eval(result)
+        return result
+
+    def _ray_tangent(self, state: Any, t_state: Any) -> RayTangent:
+        leaf = _pose(state)
+        dr.enable_grad(leaf)
+        dr.set_grad(leaf, _pose(t_state))
+        origin, direction = self._rays(leaf, dr.width(leaf))
+        t_origin, t_direction = dr.forward_to(origin, direction)
+        return mi.Vector3f(t_origin), t_direction
+
+
+def _pose(state: Any) -> Any:
+    """Return the rows px, py, theta of a state, (3, n), detached."""
+    kind = dr.float64_array_t(mi.Vector3f)
+    return kind(*[dr.detach(state[i]) for i in range(3)])

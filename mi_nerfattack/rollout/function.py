@@ -1,0 +1,181 @@
+"""The closed loop as a function of textures, object poses and initial states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.rollout.adjoint import AbstractAdjoint, Replay
+from mi_nerfattack.rollout.cost import Cost
+from mi_nerfattack.rollout.loop import (
+    ClosedLoop,
+    OnStep,
+    Step,
+    Trajectory,
+    simulate,
+)
+from mi_nerfattack.rollout.objective import AbstractObjective
+from mi_nerfattack.rollout.reduction import AbstractReduction, Mean
+from mi_nerfattack.rollout.sweep import (
+    Gradient,
+    Options,
+    StepRecorder,
+    differentiable,
+    forward,
+)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a batch of drives gave.
+
+    Attributes:
+        value: the cost that is minimised.
+        costs: (n,) that of each drive.
+        trajectory: the drives, with what their derivatives need.
+    """
+
+    value: float
+    costs: np.ndarray
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """``J(textures, initial states, offsets)`` of a batch of drives.
+
+    Call it with Dr.Jit arrays and differentiate by `dr.backward`; with torch tensors
+    see `bridge.rollout`. Or, without either's graph, :meth:`run` and :meth:`gradient`.
+
+    Attributes:
+        loop: the closed loop; its sensor's textures are replaced.
+        objective: cost of one drive.
+        horizon: control periods.
+        reduction: of the costs of the batch.
+        adjoint: how derivatives are made; each states what it costs.
+        attached: keep the derivative of the image by the state. By default it is
+            stopped (A.12); only attached derivatives are those of the whole loop.
+    """
+
+    loop: ClosedLoop
+    objective: AbstractObjective
+    horizon: int
+    reduction: AbstractReduction = field(default_factory=Mean)
+    adjoint: AbstractAdjoint = field(default_factory=Replay)
+    attached: bool = False
+
+    def run(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
+        """Drive with the textures and offsets that the sensor has.
+
+        Args:
+            initial: (m, n) from :meth:`ClosedLoop.initial`.
+            on_step: called after each control period with its index.
+        """
+
+        def keep(step: Step) -> Any:
+            return self.adjoint.keep(self.loop, step)
+
+        drive = simulate(self.loop, initial, self.horizon, on_step, keep)
+        value, costs = Cost(self.objective, self.reduction).of(drive)
+        return Evaluation(value, costs, drive)
+
+    def gradient(
+        self,
+        evaluation: Evaluation,
+        offsets: bool = False,
+        recorder: StepRecorder | None = None,
+        on_step: OnStep | None = None,
+        scale: float = 1.0,
+    ) -> Gradient:
+        """Differentiate what :meth:`run` gave; nothing may have changed since.
+
+        Args:
+            evaluation: from :meth:`run`.
+            offsets: whether to differentiate by the objects' offsets, too.
+            recorder: takes the texture's gradient apart by control periods.
+            on_step: called after each control period with its index.
+            scale: factor of all derivatives.
+
+        Raises:
+            TypeError: there are no such derivatives.
+        """
+        cost = Cost(self.objective, self.reduction, scale)
+        options = Options(self.attached, offsets, recorder, on_step)
+        drive = evaluation.trajectory
+        return self.adjoint.gradient(self.loop, drive, cost, options)
+
+    def tangent(
+        self, evaluation: Evaluation, textures: Sequence[Any], initial: Any
+    ) -> float:
+        """Differentiate in one direction (forward mode); renders every frame again.
+
+        Args:
+            evaluation: from :meth:`run`.
+            textures: tangents, one tensor (n_vertices, 3) an object.
+            initial: (m, n), tangent of the initial states.
+
+        Returns:
+            the derivative of the value in that direction.
+
+        Raises:
+            TypeError: sensor or policy have no forward mode.
+        """
+        sensor = differentiable(self.loop)
+        sensor.start_tangent(list(textures))
+        drive = evaluation.trajectory
+        tangents = forward(self.loop, drive, initial, self.attached)
+        return Cost(self.objective, self.reduction).tangent(drive, tangents)
+
+    def __call__(
+        self, textures: Sequence[Any], initial: Any, offsets: Any = None
+    ) -> Any:
+        """Evaluate J as one differentiable operation of Dr.Jit.
+
+        Args:
+            textures: one tensor (n_vertices, 3) an object, raw colours.
+            initial: (m, n) from :meth:`ClosedLoop.initial`.
+            offsets: tensor (k, 6), shift (metres) and rotation vector (radians) of
+                each object from where it was put; left alone when left out.
+
+        Returns:
+            one entry, attached to whatever of the three is. Reverse mode only.
+        """
+        if offsets is None:
+            return dr.custom(_RolloutOp, self, list(textures), initial)
+        return dr.custom(_RolloutOp, self, list(textures), initial, offsets)
+
+    def install(self, textures: Sequence[Any], offsets: Any = None) -> None:
+        """Give the sensor's objects textures and offsets, detached."""
+        sensor = differentiable(self.loop)
+        sensor.set_textures([dr.detach(texture) for texture in textures])
+        if offsets is not None:
+            sensor.set_offsets(np.array(dr.detach(offsets), np.float64))
+
+
+class _RolloutOp(dr.CustomOp):
+    """Forward: a batch of drives. Backward: the rollout's adjoint."""
+
+    def eval(
+        self, rollout: Rollout, textures: list[Any], initial: Any, *offsets: Any
+    ) -> Any:
+        self.rollout = rollout
+        self.parameters = dr.detach(textures), *dr.detach(offsets)
+        rollout.install(*self.parameters)
+        self.evaluation = rollout.run(dr.detach(initial))
+        row = dr.detached_t(dr.value_t(type(initial)))
+        return row([self.evaluation.value])
+
+    def backward(self) -> None:
+        self.rollout.install(*self.parameters)
+        moved = len(self.parameters) > 1
+        scale = float(dr.detach(self.grad_out())[0])
+        found = self.rollout.gradient(self.evaluation, offsets=moved, scale=scale)
+        self.set_grad_in("textures", found.textures)
+        self.set_grad_in("initial", found.initial)
+        if found.offsets is not None:
+            tensor = type(self.parameters[1])
+            self.set_grad_in("offsets", (tensor(found.offsets.astype(np.float32)),))

@@ -1,0 +1,241 @@
+"""The backward and the forward sweep through a drive: costates and tangents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory, to_state
+from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """What each control period contributed to the gradient, object by object.
+
+    Attributes:
+        norms: (T, k), Euclidean norms of the periods' texture gradients.
+        along: (T, k), their inner products with given directions, e.g. the change
+            that an attack made to the texture: to first order, what the period
+            contributed to the change of the objective; empty without directions.
+    """
+
+    norms: np.ndarray
+    along: np.ndarray
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Derivatives of an objective.
+
+    Attributes:
+        textures: one tensor (n_vertices, 3) an object.
+        offsets: (k, 6) by the objects' offsets, NumPy; None where not asked for.
+        initial: (m, n) by the initial states.
+        costates: (T, n, m) NumPy: ``l_t``, minus the derivative by ``x_t``.
+        attribution: per control period; None where not asked for.
+    """
+
+    textures: list[Any]
+    offsets: np.ndarray | None
+    initial: Any
+    costates: np.ndarray
+    attribution: Attribution | None
+
+
+class StepRecorder:
+    """Takes the texture's gradient apart by control periods.
+
+    Costs a few passes over the texture a period, and one more gradient buffer.
+
+    Args:
+        directions: one array (n_vertices, 3) an object, for the inner products.
+    """
+
+    def __init__(self, directions: Sequence[Any] = ()) -> None:
+        self.directions = [np.asarray(d, np.float32).ravel() for d in directions]
+        self._before: list[np.ndarray] = []
+        self._rows: list[tuple[list[float], list[float]]] = []
+
+    def add(self, textures: list[Any]) -> None:
+        """Record one period from the sums so far; periods come last one first."""
+        sums = [t.numpy().ravel().copy() for t in textures]
+        before = self._before or [np.zeros_like(value) for value in sums]
+        parts = [value - old for value, old in zip(sums, before, strict=True)]
+        self._before = sums
+        norms = [float(np.linalg.norm(part)) for part in parts]
+        pairs = zip(parts, self.directions, strict=False)
+        self._rows.append((norms, [float(a @ b) for a, b in pairs]))
+
+    def result(self) -> Attribution:
+        """Return what was recorded, first period first."""
+        norms, along = zip(*reversed(self._rows), strict=True)
+        return Attribution(np.array(norms), np.array(along))
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a backward pass gives.
+
+    Attributes:
+        attached: keep the derivative of the image by the state (A.12 stops it). Only
+            attached gradients are those of the whole loop.
+        offsets: differentiate by the objects' offsets, too.
+        recorder: takes the gradient apart by control periods.
+        on_step: called after each control period with its index.
+    """
+
+    attached: bool = False
+    offsets: bool = False
+    recorder: StepRecorder | None = None
+    on_step: OnStep | None = None
+
+
+@dataclass
+class Sweep:
+    """Costates through the control periods of a drive, last one first.
+
+    Attributes:
+        loop: the closed loop.
+        drive: what it did.
+        attached: whether images follow the state.
+        pending: derivatives by controls that act in periods already visited.
+        d_memory: derivative by the policy's memory after the period.
+    """
+
+    loop: ClosedLoop
+    drive: Trajectory
+    attached: bool
+    pending: dict[int, Any] = field(default_factory=dict)
+    d_memory: tuple[Any, ...] = ()
+
+    def back(self, step: Step, d_after: Any) -> Any:
+        """Return the derivative by the state before a period.
+
+        Args:
+            step: the period.
+            d_after: (m, n), by the state after it.
+        """
+        loop, index = self.loop, step.index
+        controls = self.drive.controls[: index + 1]
+        pair = loop.transition.controls(controls, index, step.state)
+        d_state, *d_pair = loop.transition.vjp(step.state, *pair, d_after)
+        for source, value in zip(loop.transition.sources(index), d_pair, strict=True):
+            self.pending[source] = self.pending.get(source, 0) + value
+        image = step.observation.image
+        none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
+        cotangent = dr.array_t(image)(self.pending.pop(index, none))
+        dr.eval(cotangent)
+        d_image, self.d_memory = loop.policy.step_vjp(
+            image, loop.goal, step.memory, cotangent, self.d_memory
+        )
+        by_pose = differentiable(loop).vjp(
+            step.observation, step.state, d_image, self.attached
+        )
+        if by_pose is not None:
+            for axis in range(3):
+                d_state[axis] += by_pose[axis]
+        dr.eval(d_state, self.pending)
+        return d_state
+
+
+def backward(
+    loop: ClosedLoop,
+    drive: Trajectory,
+    visits: Iterator[Step],
+    d_states: np.ndarray,
+    options: Options,
+) -> Gradient:
+    """Pull derivatives by the states back to everything that led to them.
+
+    Args:
+        loop: as it was when it drove.
+        drive: what it did.
+        visits: its control periods, last one first.
+        d_states: (T, n, m), derivatives of J by x_1 to x_T.
+        options: what to differentiate by.
+
+    Raises:
+        TypeError: sensor or policy have no such derivatives.
+    """
+    sensor = differentiable(loop)
+    sweep = Sweep(loop, drive, options.attached)
+    sensor.start_gradient(options.offsets)
+    d_before, costates = to_state(np.zeros_like(d_states[0])), []
+    for step in visits:
+        d_after = d_before + to_state(d_states[step.index])
+        d_before = sweep.back(step, d_after)
+        costates.append(-np.array(d_after).T)
+        if options.recorder is not None:
+            options.recorder.add(sensor.texture_gradients())
+        if options.on_step is not None:
+            options.on_step(step.index)
+    textures = sensor.texture_gradients()
+    dr.eval(textures)
+    return Gradient(
+        textures,
+        sensor.offset_gradients() if options.offsets else None,
+        d_before,
+        np.stack(costates[::-1]),
+        options.recorder.result() if options.recorder else None,
+    )
+
+
+def forward(
+    loop: ClosedLoop, drive: Trajectory, initial: Any, attached: bool
+) -> np.ndarray:
+    """Push tangents of the parameters and initial states through a drive.
+
+    Renders every frame again. The textures' tangents are those that the sensor was
+    given by `start_tangent`.
+
+    Args:
+        loop: as it was when it drove.
+        drive: what it did.
+        initial: (m, n) tangent of the initial states.
+        attached: keep the derivative of the image by the state.
+
+    Returns:
+        (T, n, m), tangents of x_1 to x_T.
+
+    Raises:
+        TypeError: sensor or policy have no forward mode.
+    """
+    sensor, tangent, controls, tangents = differentiable(loop), initial, [], []
+    memory = loop.policy.initial_memory(drive.count)
+    t_memory: tuple[Any, ...] = ()
+    for index in range(drive.horizon):
+        state = drive.states[index]
+        seen = sensor.observe(state, index)
+        t_image = sensor.jvp(seen, state, tangent if attached else None)
+        t_control, t_memory = loop.policy.step_jvp(
+            seen.image, loop.goal, memory, t_image, t_memory
+        )
+        _, memory = loop.policy.step(seen.image, loop.goal, memory)
+        controls.append(dr.value_t(type(state))(t_control))
+        pair = loop.transition.controls(drive.controls[: index + 1], index, state)
+        t_pair = loop.transition.controls(controls, index, state)
+        tangent = loop.transition.jvp((state, *pair), (tangent, *t_pair))
+        tangents.append(np.array(tangent).T)
+    return np.stack(tangents)
+
+
+def differentiable(loop: ClosedLoop) -> AbstractDifferentiableSensor:
+    """Return the loop's sensor.
+
+    Raises:
+        TypeError: sensor or policy have no derivatives.
+    """
+    if not isinstance(loop.sensor, AbstractDifferentiableSensor):
+        raise TypeError(f"{type(loop.sensor).__name__}: has no derivatives")
+    if not loop.policy.differentiable:
+        raise TypeError(
+            f"{type(loop.policy).__name__}: a black box has no derivatives; use a "
+            "gradient-free method, or give the policy as a torch module, an exported "
+            "program, an ONNX file or a Dr.Jit network"
+        )
+    return loop.sensor
