@@ -45,6 +45,7 @@ FILE_KEYS = (
     "function",
 )
 _REFERENCE = re.compile(r"\.py:\w+$")
+_MODULE = re.compile(r"(?!bundled:)[A-Za-z_][\w.]*(?<!\.py):\w+")  # of Python
 
 
 class Scenario(Section):
@@ -74,10 +75,10 @@ class Scenario(Section):
         """
         data = self.model_dump(mode="json")
         objective = data["objective"]
-        sections = (data["scene"], data["policy"], *data["objects"])
+        sections = (data["scene"], data["policy"], data["vehicle"], *data["objects"])
         for section in (*sections, objective, *objective["terms"]):
             for key in FILE_KEYS:
-                if section.get(key):
+                if section.get(key) and not _MODULE.fullmatch(section[key]):
                     section[key] = _hash(section[key], base)
         text = json.dumps(data, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -143,7 +144,7 @@ def portable_text(text: str, base: str | Path) -> str:
 
     def absolute(match: re.Match[str]) -> str:
         value = match.group(3)
-        if not value.startswith(BUNDLED):
+        if not value.startswith(BUNDLED) and not _MODULE.fullmatch(value):
             value = str(resolve(value, base).resolve())
         return match.group(1) + json.dumps(value)
 

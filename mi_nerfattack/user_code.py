@@ -1,8 +1,9 @@
-"""Functions that a user gives as ``FILE.py:NAME``."""
+"""Functions that a user gives as ``FILE.py:NAME`` or ``package.module:NAME``."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -62,6 +63,31 @@ def load_function(path: str | Path, name: str) -> Callable[..., Any]:
         raise InputError(
             f"{path}: has no function {name!r}; it has {', '.join(known) or 'none'}"
         )
+    return found
+
+
+def import_function(reference: str) -> Callable[..., Any]:
+    """Import what ``package.module:NAME`` names, from the installed packages.
+
+    Raises:
+        InputError: there is no such module, importing it raises an exception, or it
+            has no such callable.
+    """
+    module, _, name = reference.rpartition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ModuleNotFoundError as err:
+        raise InputError(
+            f"{reference!r}: {err}; install the package, or name a file: FILE.py:{name}"
+        ) from err
+    except Exception as err:
+        if is_interrupt(err):
+            raise
+        raise InputError(
+            f"{reference!r}: importing it raised {type(err).__name__}: {err}"
+        ) from err
+    if not callable(found):
+        raise InputError(f"{reference!r}: {module} has no function {name!r}")
     return found
 
 

@@ -15,6 +15,7 @@ from mi_nerfattack.policy.adapter import to_torch
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 from mi_nerfattack.vehicle.function import (
     append_rows,
+    call_model,
     describe_function,
     require_finite,
     require_model,
@@ -82,7 +83,7 @@ class TorchDynamics(AbstractDynamics):
 
     def evaluate(self, state: torch.Tensor, control: torch.Tensor) -> torch.Tensor:
         """Call the function with (n, m) and (n,), and check what it returned."""
-        result = self.function(state, control)
+        result = call_model(self.name, self.function, state, control)
         if not isinstance(result, torch.Tensor) or result.shape != state.shape:
             shape = getattr(result, "shape", None)
             found = type(result).__name__ + (
@@ -202,9 +203,11 @@ def _to_state(values: torch.Tensor, like: Any) -> Any:
 
 
 def _to_row(values: torch.Tensor, kind: Any) -> Any:
-    """Upload (n,); Dr.Jit has a stream of its own, which must find them there."""
+    """Upload (n,), never as a literal."""
     values = values.detach().contiguous()
     if not values.is_cuda:
-        return kind(values.numpy())
+        # a list: memory from torch has an alignment of its own, and so its own kernels
+        return kind(values.tolist())
+    # Dr.Jit has a stream of its own
     torch.cuda.current_stream(values.device).synchronize()
     return kind(values)

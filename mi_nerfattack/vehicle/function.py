@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 
 
@@ -61,10 +63,11 @@ class FunctionDynamics(AbstractDynamics):
         """Call the function.
 
         Raises:
-            InputError: it returned something else than m rows, one entry a vehicle,
-                or rows that do not depend on the control by Dr.Jit operations.
+            InputError: it failed, or returned something else than m rows, one entry a
+                vehicle, or rows that do not depend on the control by Dr.Jit operations.
         """
-        result = self._rows(self.function(state, control), state)
+        result = call_model(self.name, self.function, state, control)
+        result = self._rows(result, state)
         if dr.grad_enabled(control) and not dr.grad_enabled(result):
             raise InputError(
                 f"{self.name}: what it returned has no derivative by the control; "
@@ -121,10 +124,27 @@ def require_model(owner: str, size: int, limit: float, rest: tuple[float, ...]) 
 
 
 def describe_function(function: Callable[..., Any]) -> str:
-    """Name a function by its module and name, other callables by their class."""
+    """Name a function by its file and name, other callables by their class."""
+    code = getattr(function, "__code__", None)
     name = getattr(function, "__qualname__", type(function).__qualname__)
-    module = getattr(function, "__module__", None)
-    return name if module in (None, "__main__") else f"{module}.{name}"
+    return name if code is None else f"{Path(code.co_filename).name}:{name}"
+
+
+def call_model(
+    owner: str, function: Callable[[Any, Any], Any], state: Any, control: Any
+) -> Any:
+    """Call a function of the user's; raise `InputError` with its line if it fails."""
+    try:
+        return function(state, control)
+    except Exception as err:
+        if is_interrupt(err):
+            raise
+        frames = traceback.extract_tb(err.__traceback__)[1:2]
+        line = f" in line {frames[0].lineno}" if frames else ""
+        raise InputError(
+            f"{owner}: raised {type(err).__name__}{line}: {err}; it is called with a "
+            "state and a control"
+        ) from err
 
 
 def append_rows(poses: np.ndarray, rest: tuple[float, ...]) -> np.ndarray:
