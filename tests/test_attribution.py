@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from small_fields import blob, vertices
 
+from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.report import heat
 from mi_nerfattack.report.attribution import TimeAttribution, plot_attribution
@@ -133,3 +134,39 @@ def test_wrong_gradients_are_named(tmp_path, rng):
         surface_heat(grid, np.full((grid.n_vertices, 3), np.nan))
     with pytest.raises(InputError, match="at least one"):
         write_heat(tmp_path / "none.png", {})
+
+
+def test_a_failure_is_taken_apart(tmp_path):
+    """Shares add up to 1; the last costate is minus the derivative of the last cost."""
+    import toy_loop as toy
+
+    from mi_nerfattack.attack.attribution import attribute, write_attribution
+    from mi_nerfattack.attack.gradient import GradientAttack
+    from mi_nerfattack.attack.objective import AbsoluteDeviation
+    from mi_nerfattack.rollout.function import Rollout
+    from mi_nerfattack.rollout.objective import StageSum
+
+    loop, grid = toy.make_loop()
+    objective = StageSum(AbsoluteDeviation(toy.ROUTE))
+    initial = loop.initial(np.array([[0.0, 0.1, 0.0], [0.0, -0.2, 0.05]]))
+    attack = GradientAttack(Rollout(loop, objective, 3), toy.ROUTE, initial)
+    attack.measure()
+    steps = []
+    found = attribute(attack, ["ball"], 0.85, steps.append)
+    assert len(steps) == 9
+    times = found.times
+    assert times.costates.shape == (3, 2, 3) and times.shares.shape == (3, 1)
+    assert times.shares.sum() == pytest.approx(1, rel=1e-6)
+    square = (found.textures[0].astype(float) ** 2).sum()
+    assert times.along.sum() == pytest.approx(square, rel=1e-4)
+    # the last image steers the last period, whose heading no state follows
+    assert found.norms[-1, 0] == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(times.time_s, toy.DT * np.array([1, 2, 3]))
+    side = np.sign(times.cross_track_m[-1])
+    np.testing.assert_allclose(
+        times.costates[-1], [[0, side[0] / 2, 0], [0, side[1] / 2, 0]], atol=1e-12
+    )
+    pictures = write_attribution(tmp_path, found, [grid])
+    assert all(path.stat().st_size > 5000 for path in pictures.values())
+    data = files.read_json(tmp_path / "attribution.json")
+    assert len(data["gradient_share"]["ball"]) == 3

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack import files
+from mi_nerfattack.attack.attribution import attribute, write_attribution
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.world import World, object_footprints
 from mi_nerfattack.fields import save_field
@@ -19,7 +20,7 @@ from mi_nerfattack.report.metrics import Drive, departure_limit, metrics_documen
 from mi_nerfattack.report.page import write_report
 from mi_nerfattack.report.strip import first_person_strip
 from mi_nerfattack.report.table import write_steps
-from mi_nerfattack.rollout.loop import to_state
+from mi_nerfattack.rollout.loop import OnStep, to_state
 from mi_nerfattack.versions import versions
 
 STRIP_FRAMES = 6
@@ -34,6 +35,7 @@ def write_results(
     textures: dict[str, list[np.ndarray]],
     scenario_text: str,
     cost: dict[str, Any],
+    on_step: OnStep | None = None,
 ) -> dict[str, Any]:
     """Write everything but scenario and checkpoint.
 
@@ -45,6 +47,8 @@ def write_results(
         textures: per case, one texture an object.
         scenario_text: the scenario file.
         cost: of the run, as `metrics.json` holds it.
+        on_step: called after each of the 3 x horizon control periods of the
+            attribution.
 
     Returns:
         the document that ``metrics.json`` holds.
@@ -67,6 +71,9 @@ def write_results(
         grid.set_parameter("texture", texture)
         save_field(output / "objects" / f"{item.id}.safetensors", grid)
     images = _write_plots(output, world, drives, history, limit)
+    names = [item.id for item in scenario.objects]
+    found = attribute(attack, names, limit, on_step)
+    images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = output / "strip.png"
     first_person_strip(images["First-person frames"], *_strip(world, drives, textures))
     _write_frames(output / "frames", world, drives, textures)
