@@ -17,18 +17,26 @@ from mi_nerfattack.vehicle import (
     Dubins,
     ExplicitEuler,
     ImplicitMidpoint,
+    KinematicBicycle,
+    RateLimitedAckermann,
 )
 from mi_nerfattack.vehicle.dynamics import soft_limit
 from mi_nerfattack.vehicle.integrators import state_jacobian
 
 INTEGRATORS = [ExplicitEuler(), RK4(), ImplicitMidpoint()]
-DYNAMICS = [Dubins(5.0), Ackermann(4.0, 2.5, 0.6)]
+DYNAMICS = [
+    Dubins(5.0),
+    Ackermann(4.0, 2.5, 0.6),
+    KinematicBicycle(4.0, 1.1, 1.4, 0.6),
+    RateLimitedAckermann(4.0, 2.5, 0.6, 0.7, 0.1),
+]
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def array64(values):
-    """Upload (3, n) as a differentiable float64 state."""
-    return dr.llvm.ad.Array3f64(np.asarray(values, np.float64))
+    """Upload (m, n) as a differentiable float64 state."""
+    rows = [row64(row) for row in values]
+    return (dr.llvm.ad.Array3f64 if len(rows) == 3 else dr.llvm.ad.ArrayXf64)(*rows)
 
 
 def row64(values):
@@ -99,7 +107,8 @@ class Spring(AbstractDynamics):
 @pytest.mark.parametrize("dynamics", [*DYNAMICS, Spring()])
 def test_residual_of_a_step_is_zero(integrator, dynamics):
     rng = np.random.default_rng(1)
-    x_prev, u = array64(rng.normal(size=(3, 7))), row64(rng.uniform(-0.5, 0.5, 7))
+    x_prev = array64(0.5 * rng.normal(size=(dynamics.state_size, 7)))
+    u = row64(rng.uniform(-0.5, 0.5, 7))
     x = integrator.step(dynamics, x_prev, u, 0.05)
     residual = integrator.residual(dynamics, x_prev, x, u, 0.05)
     assert np.abs(residual.numpy()).max() < 1e-13
@@ -127,19 +136,16 @@ def test_state_jacobian_where_a_rate_is_itself_a_state():
 @pytest.mark.parametrize("function", ["step", "residual"])
 def test_derivatives(integrator, dynamics, function):
     """Forward mode equals central differences; reverse mode is its transpose."""
-    rng = np.random.default_rng(2)
-    point = rng.normal(size=(7, 4)) * 0.5
-    tangent, cotangent = rng.normal(size=(7, 4)), rng.normal(size=(3, 4))
+    rng, m = np.random.default_rng(2), dynamics.state_size
+    point = rng.normal(size=(2 * m + 1, 4)) * 0.4
+    tangent, cotangent = rng.normal(size=(2 * m + 1, 4)), rng.normal(size=(m, 4))
 
     def split(values):
         return [row64(v) for v in values]
 
-    def pack(rows):
-        state = dr.llvm.ad.Array3f64
-        return [state(*rows[:3]), state(*rows[3:6]), rows[6]]
-
     def call(rows):
-        x_prev, x, u = pack(rows)
+        kind = type(array64(point[:m]))
+        x_prev, x, u = kind(*rows[:m]), kind(*rows[m : 2 * m]), rows[-1]
         if function == "step":
             return integrator.step(dynamics, x_prev, u, 0.1)
         return integrator.residual(dynamics, x_prev, x, u, 0.1)
@@ -158,7 +164,7 @@ def test_derivatives(integrator, dynamics, function):
     np.testing.assert_allclose(forward, numeric, rtol=1e-7, atol=1e-8)
     rows = split(point)
     dr.enable_grad(*rows)
-    dr.backward(dr.sum(dr.dot(call(rows), array64(cotangent))))
+    dr.backward(dr.sum(dr.sum(call(rows) * array64(cotangent), axis=0)))
     reverse = np.stack([dr.grad(row).numpy() for row in rows])
     assert (reverse * tangent).sum() == pytest.approx(
         (forward * cotangent).sum(), rel=1e-11
@@ -196,6 +202,13 @@ def test_soft_limit_is_bounded_and_odd(value, limit):
         lambda: Dubins(5.0, float("nan")),
         lambda: Ackermann(5.0, -1.0),
         lambda: Ackermann(5.0, 2.0, 1.6),
+        lambda: KinematicBicycle(5.0, 0.0),
+        lambda: KinematicBicycle(0.0),
+        lambda: KinematicBicycle(max_steer=1.6),
+        lambda: RateLimitedAckermann(0.0),
+        lambda: RateLimitedAckermann(max_steer_rate=-1.0),
+        lambda: RateLimitedAckermann(time_constant=0.0),
+        lambda: RateLimitedAckermann(max_steer=float("inf")),
     ],
 )
 def test_dynamics_reject_parameters(make):
@@ -204,7 +217,27 @@ def test_dynamics_reject_parameters(make):
 
 
 def test_float32_state_and_batch_of_the_active_variant():
-    state = mi.Vector3f(np.zeros((3, 5)))
-    u = mi.Float(np.linspace(-1, 1, 5))
-    for integrator in INTEGRATORS:
-        assert integrator.step(Dubins(5.0), state, u, 0.1).numpy().shape == (3, 5)
+    """Single precision agrees with double, and stays single."""
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-0.5, 0.5, 5)
+    for dynamics in DYNAMICS:
+        m = dynamics.state_size
+        x = rng.normal(size=(m, 5)) * 0.4
+        kind = mi.Vector3f if m == 3 else mi.ArrayXf
+        state = kind(*[mi.Float(row) for row in x])
+        for integrator in INTEGRATORS:
+            found = integrator.step(dynamics, state, mi.Float(u), 0.1)
+            integrator.check(dynamics, state, found, mi.Float(u), 0.1)
+            expected = integrator.step(dynamics, array64(x), row64(u), 0.1)
+            assert type(found) is kind
+            np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_one_vehicle_is_a_column_of_many(integrator):
+    rng = np.random.default_rng(5)
+    for dynamics in DYNAMICS:
+        x, u = rng.normal(size=(dynamics.state_size, 6)), rng.uniform(-0.5, 0.5, 6)
+        many = integrator.step(dynamics, array64(x), row64(u), 0.1).numpy()
+        one = integrator.step(dynamics, array64(x[:, 3:4]), row64(u[3:4]), 0.1)
+        np.testing.assert_allclose(one.numpy()[:, 0], many[:, 3], rtol=1e-14)
