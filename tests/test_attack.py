@@ -136,7 +136,8 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
         )
         assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
         assert metadata["scenario"] == "toy"
-    for name in ("overhead", "errors", "convergence", "strip"):
+    plots = ("overhead", "errors", "convergence", "strip")
+    for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000
     assert "<html" in (output / "report.html").read_text()
     # a second run into the same folder is refused and changes nothing
@@ -246,6 +247,10 @@ def test_a_checkpoint_of_another_scenario_is_refused(folder, tmp_path):
         (("object.safetensors", "truncated.safetensors"), ["truncated.safetensors"]),
         (("object.safetensors", "nan.safetensors"), ["nan.safetensors", "texture"]),
         (("policy.safetensors", "object.safetensors"), ["object.safetensors"]),
+        (
+            ("[drive]", '[objective]\nkind="function"\nfunction="a.py:f"\n[drive]'),
+            ["a.py", "does not exist"],
+        ),
     ],
 )
 def test_bad_input_is_named(folder, tmp_path, capsys, change, words):

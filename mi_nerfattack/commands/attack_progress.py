@@ -73,6 +73,7 @@ def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
         ("report.html", "everything on one page"),
         ("overhead.png", "all drives from above"),
         ("strip.png", "what the policy sees"),
+        ("attribution*.png", "when and where the failure is made"),
         ("metrics.json, steps.csv", "the numbers"),
         ("objects/", "the attacked fields"),
         ("frames/", "EXR frames with layers"),
