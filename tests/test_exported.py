@@ -1,0 +1,153 @@
+"""Programs of torch.export and TorchScript as policies."""
+
+from __future__ import annotations
+
+import io
+import warnings
+import zipfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.load import load_policy
+from mi_nerfattack.sections import PolicySection
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def section(**keys):
+    return PolicySection.model_validate(keys)
+
+
+def camera(n, rng):
+    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
+
+
+def small(batch_norm=True):
+    network = nn.Sequential(
+        nn.Conv2d(3, 4, 5, stride=8),
+        nn.BatchNorm2d(4) if batch_norm else nn.Identity(),
+        nn.ELU(),
+        nn.Flatten(),
+        nn.Linear(4 * 8 * 25, 1),
+    )
+    network[0].weight.data.normal_()
+    return network.eval()
+
+
+def write_exported(network, path, count=2, free=True):
+    shapes = [{0: torch.export.Dim("n", min=1)}] if free else None
+    image = torch.zeros(count, 3, 66, 200)
+    program = torch.export.export(network, (image,), dynamic_shapes=shapes)
+    torch.export.save(program, path)
+
+
+def write_script(network, path):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+        torch.jit.save(torch.jit.script(network), path)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"), [("net.pt2", write_exported), ("net.pt", write_script)]
+)
+def test_programs_have_the_module_s_derivatives(name, write, tmp_path, rng):
+    network = small()
+    write(network, tmp_path / name)
+    policy = load_policy(section(file=name), tmp_path)
+    assert not any(p.requires_grad for p in policy.module.parameters())
+    image, weight = camera(3, rng), mi.Float(1, -2, 0.5)
+    leaf = torch.from_numpy(image.numpy()).double().requires_grad_(True)
+    expected = network.double()(leaf.permute(0, 3, 1, 2))[:, 0]
+    torch.autograd.backward(expected, torch.tensor([1, -2, 0.5]).double())
+    for _ in range(3):  # TorchScript optimises what it sees for the third time
+        control, gradient = policy.vjp(image, 0, weight)
+        np.testing.assert_allclose(control, expected.detach(), atol=1e-5)
+        np.testing.assert_allclose(gradient, leaf.grad, atol=1e-5)
+    tangent = rng.normal(size=(3, 66, 200, 3)).astype("f4")
+    t_control, _ = policy.step_jvp(image, 0, (), mi.TensorXf(tangent), ())
+    products = gradient.numpy().astype(float) * tangent
+    assert np.dot(t_control, weight) == pytest.approx(
+        products.sum(), abs=1e-5 * np.abs(products).sum()
+    )
+
+
+def test_programs_for_one_image_serve_several(tmp_path, rng):
+    network = small()
+    write_exported(network, tmp_path / "net.pt2", 1, free=False)
+    policy = load_policy(section(file="net.pt2"), tmp_path)
+    image = camera(3, rng)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))[:, 0]
+    np.testing.assert_allclose(policy.control(image, 0), expected, atol=1e-5)
+    write_exported(network, tmp_path / "two.pt2", 2, free=False)
+    with pytest.raises(InputError, match="two.pt2: takes exactly 2 images"):
+        load_policy(section(file="two.pt2"), tmp_path)
+
+
+def test_one_image_at_a_time_keeps_hidden_states_apart(tmp_path, rng):
+    (tmp_path / "net.py").write_text(
+        "import torch\n"
+        "class Net(torch.nn.Module):\n"
+        "    def forward(self, image, goal, hidden):\n"
+        "        new = image.mean((1, 2, 3)) + goal\n"
+        "        hidden = hidden + new[None, :, None]\n"
+        "        return hidden[0, :, 0], hidden\n"
+    )
+    keys = {
+        "file": "net.py:Net",
+        "recurrent": ((1, -1, 2),),
+        "goal": "integer",
+        "goals": 3,
+    }
+    image = camera(3, rng)
+    results = []
+    for extra in ({}, {"batch": 1}):
+        policy = load_policy(section(**keys, **extra), tmp_path)
+        memory = policy.initial_memory(3)
+        for _ in range(2):
+            control, memory = policy.step(image, 2, memory)
+        results.append((control.numpy(), memory[0].numpy()))
+    np.testing.assert_allclose(results[0][0], results[1][0])
+    np.testing.assert_allclose(results[0][1], results[1][1])
+
+
+@pytest.mark.parametrize("name", ["net.pt", "net.pt2"])
+def test_other_files_are_no_programs(name, tmp_path):
+    torch.save({"a": torch.zeros(2)}, tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: (is|holds) no"):
+        load_policy(section(file=name), tmp_path)
+    (tmp_path / name).write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match=f"{name}: is no"):
+        load_policy(section(file=name), tmp_path)
+
+
+class Marker:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_programs_with_pickled_objects_are_refused_unread(tmp_path):
+    write_exported(small(), tmp_path / "good.pt2")
+    buffer, mark = io.BytesIO(), tmp_path / "mark"
+    torch.save((Marker(mark), {}), buffer)
+    with (
+        zipfile.ZipFile(tmp_path / "good.pt2") as good,
+        zipfile.ZipFile(tmp_path / "bad.pt2", "w") as bad,
+    ):
+        for name in good.namelist():
+            sample = "sample_inputs" in name
+            bad.writestr(name, buffer.getvalue() if sample else good.read(name))
+    with pytest.raises(InputError, match="bad.pt2: .*sample_inputs.*pickled objects"):
+        load_policy(section(file="bad.pt2"), tmp_path)
+    assert not mark.exists()
