@@ -38,7 +38,8 @@ def run_scenario(
     if object_field is not None:
         scenario, text = replace_objects(scenario, text, object_field)
     model = scenario.vehicle.model
-    if model != "dubins" and policy_kind(scenario.policy) == "pilotnet":
+    steered = model not in ("dubins", "custom")
+    if steered and policy_kind(scenario.policy) == "pilotnet":
         raise InputError(
             f"{path}: vehicle.model: {model} takes a steering angle in radians, "
             "PilotNet gives a heading rate in rad/s; use dubins, or a policy of "
