@@ -13,11 +13,12 @@ import io
 import json
 import math
 import os
+import re
 import secrets
 import stat
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ MAX_TENSOR_BYTES = 1 << 33
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of what `read_image` reads
 _IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # what a killed writer leaves
 _TENSOR_REMEDY = "only .safetensors files are read"
 
 _REASONS = {
@@ -221,20 +223,24 @@ def write_safetensors(
     encoded = json.dumps(header, separators=(",", ":")).encode("utf-8")
     encoded += b" " * (-len(encoded) % 8)
     size = len(encoded).to_bytes(8, "little")
-    write_bytes(path, size + encoded + raw[8 + length :])
+    _write(path, [size, encoded, memoryview(raw)[8 + length :]])
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write bytes atomically: temporary file, fsync, rename, fsync of the folder."""
+    _write(path, [data])
+
+
+def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
     with _reported(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, "is a folder")
         if target.exists() and not target.is_file():
             raise InputError(f"{path}: is not a regular file; choose another name")
-        partial = target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
+        partial = _temporary(target)
         try:
-            _write_new(partial, data)
+            _write_new(partial, parts)
             os.replace(partial, target)
         finally:
             partial.unlink(missing_ok=True)
@@ -258,9 +264,9 @@ def check_writable(path: str | Path) -> None:
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, "is a folder")
-        probe = target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
+        probe = _temporary(target)
         try:
-            _write_new(probe, b"")
+            _write_new(probe, [])
         finally:
             probe.unlink(missing_ok=True)
 
@@ -334,12 +340,17 @@ def _check_tensor_header(path: str | Path, start: bytes, size: int) -> None:
         )
 
 
-def _write_new(path: Path, data: bytes) -> None:
+def _temporary(target: Path) -> Path:
+    return target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
+
+
+def _write_new(path: Path, parts: Sequence[bytes | memoryview]) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
+        for part in parts:
+            rest = memoryview(part)
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
         os.fsync(descriptor)
     finally:
         os.close(descriptor)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,6 +65,27 @@ class Scenario(Section):
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSection = DeploymentSection()
 
+    def identity(self, base: str | Path) -> dict[str, str]:
+        """Return all values by key, as JSON, and the content of the files they name.
+
+        Args:
+            base: folder of the scenario file.
+
+        Returns:
+            ``{"scenario.drive.horizon": "60", ...}``; a file is given by its name and
+            the SHA-256 of its content.
+
+        Raises:
+            InputError: a file cannot be read.
+        """
+        result = {}
+        for key, value in _leaves("scenario", self.model_dump(mode="json")):
+            name = key.rpartition(".")[2]
+            if name in FILE_KEYS and value and not _MODULE.fullmatch(value):
+                value = _content(value, base)
+            result[key] = json.dumps(value, sort_keys=True)
+        return result
+
     def digest(self, base: str | Path) -> str:
         """Hash all values, and the content of the files that they name.
 
@@ -71,16 +93,15 @@ class Scenario(Section):
             base: folder of the scenario file.
 
         Returns:
-            16 hexadecimal digits; equal where the results are, wherever the files lie.
+            16 hexadecimal digits; equal where the results are, wherever the files lie
+            and whatever they are called.
         """
-        data = self.model_dump(mode="json")
-        objective = data["objective"]
-        sections = (data["scene"], data["policy"], data["vehicle"], *data["objects"])
-        for section in (*sections, objective, *objective["terms"]):
-            for key in FILE_KEYS:
-                if section.get(key) and not _MODULE.fullmatch(section[key]):
-                    section[key] = _hash(section[key], base)
-        text = json.dumps(data, sort_keys=True)
+        identity = self.identity(base)
+        values = {key: json.loads(value) for key, value in identity.items()}
+        for value in values.values():
+            if isinstance(value, dict):
+                value.pop("file")
+        text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -151,15 +172,25 @@ def portable_text(text: str, base: str | Path) -> str:
     return line.sub(absolute, text)
 
 
-def _hash(value: str, base: str | Path) -> str:
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Walk through tables and arrays of tables."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _leaves(f"{key}.{name}", item)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for index, item in enumerate(value):
+            yield from _leaves(f"{key}[{index}]", item)
+    else:
+        yield key, value
+
+
+def _content(value: str, base: str | Path) -> dict[str, str]:
     """Hash the content of ``FILE`` or ``FILE.py:NAME``, and the name."""
     file, name = (value, "") if not _REFERENCE.search(value) else split_reference(value)
     path = resolve(file, base)
-    try:
-        raw = path.read_bytes()
-    except OSError as err:
-        raise InputError(f"{path}: {err.strerror}; check the path") from err
-    return hashlib.sha256(raw).hexdigest() + name
+    raw = files.read_bytes(path, files.MAX_TENSOR_BYTES) + name.encode()
+    shown = f"{path.name}:{name}" if name else path.name
+    return {"file": shown, "sha256": hashlib.sha256(raw).hexdigest()}
 
 
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:

@@ -200,6 +200,7 @@ class AttackSection(Section):
     attached: bool = False
     jitter: bool = False
     checkpoint_every: Count = 10
+    deterministic: bool = False  # equal bits from run to run, on one thread
 
 
 class BaselineSection(Section):

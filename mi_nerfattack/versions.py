@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from typing import Any
 
 import drjit
 import mitsuba as mi
 
 import mi_nerfattack
+from mi_nerfattack import llvm
 
 
 def versions() -> dict[str, str]:
@@ -17,5 +19,8 @@ def versions() -> dict[str, str]:
         "mi_nerfattack": mi_nerfattack.__version__,
         "mitsuba": str(mi.__version__),
         "drjit": str(dr.__version__),
+        "numpy": importlib.metadata.version("numpy"),
+        "torch": importlib.metadata.version("torch"),
+        "llvm": ".".join(map(str, llvm.version() or ())),
         "variant": str(mi.variant()),
     }

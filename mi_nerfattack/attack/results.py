@@ -35,6 +35,7 @@ def write_results(
     textures: dict[str, list[np.ndarray]],
     scenario_text: str,
     cost: dict[str, Any],
+    ignored: list[str],
     on_step: OnStep | None = None,
 ) -> dict[str, Any]:
     """Write everything but scenario and checkpoint.
@@ -47,6 +48,7 @@ def write_results(
         textures: per case, one texture an object.
         scenario_text: the scenario file.
         cost: of the run, as `metrics.json` holds it.
+        ignored: changes between interruption and resumption that were ignored.
         on_step: called after each of the 3 x horizon control periods of the
             attribution.
 
@@ -60,6 +62,8 @@ def write_results(
     document = metrics_document(
         scenario.model_dump(mode="json"), scenario.seed, drives, limits, cost
     )
+    if ignored:
+        document["ignored_changes"] = ignored
     files.write_json(output / "metrics.json", document)
     write_steps(output / "steps.csv", drives, limits)
     history = [asdict(record) for record in attack.history]

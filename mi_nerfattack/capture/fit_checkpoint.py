@@ -14,9 +14,14 @@ from mi_nerfattack import files
 from mi_nerfattack.capture.fit_options import FitProgress
 from mi_nerfattack.capture.fit_training import Training
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.resumable import read_kept, write_kept
 from mi_nerfattack.versions import versions
 
-FORMAT = "mi_nerfattack fit checkpoint 1"
+FORMAT = "mi_nerfattack fit checkpoint 2"
+_REMEDY = (
+    "resume with the same images, depth, options and versions, or delete the file to "
+    "start again"
+)
 _EVERY_S = 30.0
 _MAX_SHARE = 0.02  # of the time that may go into writing
 
@@ -64,19 +69,12 @@ class FitCheckpoint:
         shape = len(rows), len(fields(FitProgress))
         tensors["history"] = np.array(rows, np.float64).reshape(shape)
         tensors["elapsed"] = np.array([elapsed_s])
-        files.write_safetensors(self.path, tensors, self._header)
+        write_kept(self.path, tensors, self._header, {})
         self._written = time.perf_counter()
         self._cost_s = self._written - start
 
     def _load(self) -> None:
-        tensors, metadata = files.read_safetensors(self.path)
-        for key, value in self._header.items():
-            if metadata.get(key) != value:
-                raise InputError(
-                    f"{self.path}: {key} is {metadata.get(key)!r}, this fit has "
-                    f"{value!r}; resume with the same images, depth, options and "
-                    "versions, or delete the file to start again"
-                )
+        tensors = read_kept(self.path, self._header, _REMEDY).tensors
         try:
             self.training.load_tensors(tensors)
             self.elapsed_s = float(tensors["elapsed"][0])

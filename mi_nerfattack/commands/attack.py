@@ -23,12 +23,20 @@ class Attack:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder, new or empty."""
     resume: bool = False
-    """Continue an interrupted attack from the checkpoint in the run folder."""
+    """Continue an interrupted attack from what it left in the run folder; start one
+    if it left nothing."""
+    force: bool = False
+    """With --resume: continue although scenario, files or versions have changed."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
     def run(self) -> int:
         """Run the job and print the table."""
         from mi_nerfattack.commands.attack_progress import run_scenario
+        from mi_nerfattack.errors import InputError
 
-        return run_scenario(self.scenario, self.output, self.resume, self.json)
+        if self.force and not self.resume:
+            raise InputError("--force: says how to resume; give it with --resume")
+        return run_scenario(
+            self.scenario, self.output, self.resume, self.json, force=self.force
+        )

@@ -13,15 +13,17 @@ def run_scenario(
     resume: bool,
     as_json: bool,
     object_field: Path | None = None,
+    force: bool = False,
 ) -> int:
     """Run a scenario with a progress bar on stderr, and print its table.
 
     Args:
         path: the scenario file.
         output: the run folder.
-        resume: continue from its checkpoint.
+        resume: continue from what an interrupted run left in it.
         as_json: print the metrics as JSON in place of the table.
         object_field: grid field that replaces the one of every object.
+        force: resume although something has changed.
     """
     from rich.console import Console
 
@@ -52,8 +54,8 @@ def run_scenario(
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        job = Job(scenario, text, path.parent, policy, output, show)
-        document = job.run(resume)
+        job = Job(scenario, text, path.parent, policy, output, show, bars.say)
+        document = job.run(resume, force)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
@@ -67,7 +69,8 @@ def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
     cost = document["cost"]
     console.print(
         f"{cost['wall_s']:.0f} s, {cost['renders']} frames, "
-        f"{cost['peak_memory_mb']:.0f} MB at most"
+        f"{cost['peak_memory_mb']:.0f} MB at most; "
+        f"{cost['checkpoint_s']:.1f} s of it in checkpoints"
     )
     console.print(f"Run folder: {output.resolve()}", soft_wrap=True)
     for name, meaning in (

@@ -40,6 +40,10 @@ class StageBars:
         if self._console.is_terminal:
             self._bars.stop()
 
+    def say(self, text: str) -> None:
+        """Write a line above the bars."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def show(self, stage: str, done: float, total: float, state: str) -> None:
         """Show how far a stage is.
 

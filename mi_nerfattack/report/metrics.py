@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pydantic
-import scipy.stats
 
 from mi_nerfattack.errors import InputError
 
@@ -304,6 +303,8 @@ def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
 def _mean_interval(means: np.ndarray, seed: int) -> list[float] | None:
     if len(means) < 2:
         return None
+    import scipy.stats  # it takes a second
+
     # Percentile: the bias-corrected interval is undefined for equal runs.
     interval = scipy.stats.bootstrap(
         (means,),

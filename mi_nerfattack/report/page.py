@@ -36,6 +36,8 @@ _COST_LABELS = {
     "wall_s": "wall time (s)",
     "peak_memory_mb": "peak memory (MB)",
     "renders": "frames rendered",
+    "checkpoint_s": "of the wall time, in checkpoints (s)",
+    "processes": "processes, one and one a resumption",
 }
 
 
