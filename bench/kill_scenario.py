@@ -24,7 +24,7 @@ HORIZON = 2
 EVERY = 3
 WRITING = "writing a file"
 
-_SCENARIO = f"""\
+SCENARIO = f"""\
 name = "kill"
 seed = 1
 [scene]
@@ -84,7 +84,7 @@ def make_scenario(folder: Path) -> None:
     }
     files.write_json(folder / "routes.json", {"line": route})
     files.write_text(folder / "deployment.xml", _XML)
-    files.write_text(folder / "scenario.toml", _SCENARIO)
+    files.write_text(folder / "scenario.toml", SCENARIO)
 
 
 def _fog(finest: int, half: float, density: float, step: float, seed: int) -> GridField:

@@ -222,8 +222,8 @@ def write_safetensors(
         header = {"__metadata__": dict(sorted(metadata.items())), **header}
     encoded = json.dumps(header, separators=(",", ":")).encode("utf-8")
     encoded += b" " * (-len(encoded) % 8)
-    size = len(encoded).to_bytes(8, "little")
-    _write(path, [size, encoded, memoryview(raw)[8 + length :]])
+    start = len(encoded).to_bytes(8, "little") + encoded
+    _write(path, [start, memoryview(raw)[8 + length :]])
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
@@ -249,10 +249,9 @@ def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
 
 def make_folder(path: str | Path) -> Path:
     """Create a folder and its parents where they are missing."""
-    folder = Path(path)
     with _reported(path):
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder
+        Path(path).mkdir(parents=True, exist_ok=True)
+    return Path(path)
 
 
 def check_writable(path: str | Path) -> None:
@@ -347,8 +346,7 @@ def _temporary(target: Path) -> Path:
 def _write_new(path: Path, parts: Sequence[bytes | memoryview]) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
-        for part in parts:
-            rest = memoryview(part)
+        for rest in map(memoryview, parts):
             while rest:
                 rest = rest[os.write(descriptor, rest) :]
         os.fsync(descriptor)

@@ -120,7 +120,7 @@ def test_unfinished_fit_is_not_overwritten(tmp_path):
     before = path.read_bytes()
     with pytest.raises(InputError, match=r"fit\.safetensors: an unfinished fit.*--res"):
         ngp(path)
-    with pytest.raises(InputError, match=r"fit\.safetensors: fit is .*, this fit has"):
+    with pytest.raises(InputError, match=r"fit\.safetensors: belongs .*\n  fit: "):
         ngp(path, True, changes={"seed": 1})
     path.write_bytes(before[: len(before) // 2])
     with pytest.raises(InputError, match="damaged or truncated"):
@@ -190,7 +190,7 @@ def test_other_depth_is_refused(tmp_path):
     arguments = (*BOX, TINY_NGP, options())
     with pytest.raises(KeyboardInterrupt):
         fit_ngp(images, *arguments, depth, checkpoint=path, progress=stop_after(25))
-    with pytest.raises(InputError, match=r"fit\.safetensors: fit is"):
+    with pytest.raises(InputError, match=r"fit\.safetensors: belongs .*\n  fit: "):
         fit_ngp(images, *arguments, depth * 1.001, checkpoint=path, resume=True)
 
 
