@@ -146,8 +146,6 @@ def _checksum(tensors: Mapping[str, np.ndarray]) -> str:
     total = 0
     for name in sorted(tensors):
         value = np.ascontiguousarray(tensors[name])
-        about = f"{name} {value.dtype.str} {value.shape}"
-        total = zlib.crc32(
-            value.reshape(-1).view(np.uint8), zlib.crc32(about.encode(), total)
-        )
+        total = zlib.crc32(f"{name} {value.dtype.str} {value.shape}".encode(), total)
+        total = zlib.crc32(value.reshape(-1).view(np.uint8).data, total)
     return f"{total:08x}"

@@ -53,7 +53,9 @@ def no_results(monkeypatch):
     """Leave out plots and pages, which take seconds."""
     from mi_nerfattack.attack import results
 
-    def only_numbers(output, world, drives, attack, textures, text, cost, ignored):
+    def only_numbers(
+        output, world, drives, attack, textures, text, cost, ignored, *more
+    ):
         document = {"cost": cost, "ignored_changes": ignored, "drives": drives}
         files.write_json(output / "metrics.json", {"cost": cost})
         return document

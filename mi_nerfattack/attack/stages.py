@@ -110,7 +110,8 @@ class Stages:
     def _records(
         self, trajectory: Trajectory, environment: str, case: str, first_run: int
     ) -> list[Drive]:
-        states, controls = trajectory.states_numpy(), trajectory.controls_numpy()
+        states = trajectory.states_numpy()[..., :3]  # vehicles may have more
+        controls = trajectory.controls_numpy()
         world = self.world
         common: dict[str, Any] = {
             "environment": environment,
