@@ -86,7 +86,7 @@ class PathTracedSensor(AbstractSensor):
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render one image a vehicle; see :meth:`AbstractSensor.observe`."""
-        poses = mount_matrix(np.array(state).T, self.mount)
+        poses = mount_matrix(np.array(state).T[:, :3], self.mount)
         images = [
             linear_to_srgb_numpy(self.linear(pose, seed))
             for pose, seed in zip(poses, self._seeds(step, len(poses)), strict=True)
