@@ -233,12 +233,14 @@ Layout = Callable[[torch.Tensor], torch.Tensor]
 
 def channels_first(frames: torch.Tensor) -> torch.Tensor:
     """Return (n, t c, h, w)."""
+    if frames.shape[1] == 1:  # a view with the camera's strides: convolutions see them
+        return frames[:, 0]
     return frames.flatten(1, 2)
 
 
 def channels_last(frames: torch.Tensor) -> torch.Tensor:
     """Return (n, h, w, t c)."""
-    return frames.flatten(1, 2).permute(0, 2, 3, 1)
+    return channels_first(frames).permute(0, 2, 3, 1)
 
 
 def time_first(frames: torch.Tensor) -> torch.Tensor:
