@@ -32,12 +32,33 @@ class Samples:
         rank: (n,) int64, position among the samples of the ray.
         unit: (n, 3), in the unit box.
         width: (n,), metres.
+        distance: (n,) from the ray's origin, metres.
     """
 
     ray: torch.Tensor
     rank: torch.Tensor
     unit: torch.Tensor
     width: torch.Tensor
+    distance: torch.Tensor
+
+
+@dataclass
+class Lit:
+    """Samples in front of the ends of their rays.
+
+    Attributes:
+        ray: (n,) int64, ascending.
+        x: (n,) optical depth.
+        weight: (n,) of the colour in the ray's radiance.
+        colour: (n, 3), linear.
+        distance: (n,) from the ray's origin, metres.
+    """
+
+    ray: torch.Tensor
+    x: torch.Tensor
+    weight: torch.Tensor
+    colour: torch.Tensor
+    distance: torch.Tensor
 
 
 class TorchNGP:
@@ -90,29 +111,66 @@ class TorchNGP:
         Returns:
             (n, 3) linear radiance.
         """
-        count = len(origin)
+        depth, radiance = torch.zeros(len(origin)), torch.zeros(len(origin), 3)
         samples = self.samples(origin, direction, jitter)
         harmonics = spherical_harmonics(direction)
-        depth = torch.zeros(count)  # optical depth so far
-        radiance = torch.zeros(count, 3)
-        for low, high in self.batches:
-            on = (samples.rank >= low) & (samples.rank < high)
-            chosen = (on & (depth.detach() < self.limit)[samples.ray]).nonzero()[:, 0]
-            if not len(chosen):
+        for ranks in self.batches:
+            lit = self._lit(samples, harmonics, depth, ranks)
+            if lit is None:
                 break
-            ray, width = samples.ray[chosen], samples.width[chosen]
-            h = self._geometry(samples.unit[chosen])
-            density = self.density_scale * torch.exp(h[:, 0].clamp(max=15.0))
-            x = density * width
-            before = depth[ray] + sum_before(x, ray)
-            lit = (before.detach() < self.limit).nonzero()[:, 0]
-            ray, x, before = ray[lit], x[lit], before[lit]
-            colour = self._colour(h[lit], harmonics[ray])
-            weight = torch.exp(-before) * -torch.expm1(-x)
-            radiance = radiance.index_add(0, ray, weight[:, None] * colour)
-            depth = depth.index_add(0, ray, x)
-            self.evaluated += len(lit)
-        return radiance + torch.exp(-depth)[:, None] * self._background(direction)
+            radiance = radiance.index_add(0, lit.ray, lit.weight[:, None] * lit.colour)
+            depth = depth.index_add(0, lit.ray, lit.x)
+        return radiance + torch.exp(-depth)[:, None] * self.background(direction)
+
+    def march(
+        self, origin: torch.Tensor, direction: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """March rays, with all that a composite by depth needs.
+
+        Args:
+            origin: (n, 3), metres.
+            direction: (n, 3), unit vectors.
+
+        Returns:
+            premultiplied linear radiance (n, 3), transmittance (n,), and the depth
+            times the opacity (n,), metres.
+        """
+        depth, seen = torch.zeros(len(origin)), torch.zeros(len(origin), 4)
+        samples = self.samples(origin, direction)
+        harmonics = spherical_harmonics(direction)
+        for ranks in self.batches:
+            lit = self._lit(samples, harmonics, depth, ranks)
+            if lit is None:
+                break
+            value = torch.cat([lit.colour, lit.distance[:, None]], 1)
+            seen = seen.index_add(0, lit.ray, lit.weight[:, None] * value)
+            depth = depth.index_add(0, lit.ray, lit.x)
+        return seen[:, :3], torch.exp(-depth), seen[:, 3]
+
+    def _lit(
+        self,
+        samples: Samples,
+        harmonics: torch.Tensor,
+        depth: torch.Tensor,
+        ranks: tuple[int, int],
+    ) -> Lit | None:
+        """Evaluate the samples of some ranks, given the optical depth so far."""
+        low, high = ranks
+        on = (samples.rank >= low) & (samples.rank < high)
+        chosen = (on & (depth.detach() < self.limit)[samples.ray]).nonzero()[:, 0]
+        if not len(chosen):
+            return None
+        ray, width = samples.ray[chosen], samples.width[chosen]
+        h = self._geometry(samples.unit[chosen])
+        density = self.density_scale * torch.exp(h[:, 0].clamp(max=15.0))
+        x = density * width
+        before = depth[ray] + sum_before(x, ray)
+        lit = (before.detach() < self.limit).nonzero()[:, 0]
+        ray, x, before = ray[lit], x[lit], before[lit]
+        colour = self._colour(h[lit], harmonics[ray])
+        self.evaluated += len(lit)
+        weight = torch.exp(-before) * -torch.expm1(-x)
+        return Lit(ray, x, weight, colour, samples.distance[chosen][lit])
 
     def samples(
         self,
@@ -146,7 +204,7 @@ class TorchNGP:
         unit = (start_unit[ray] + t[:, None] * slope[ray]).clamp_(0.0, 1.0 - 1e-6)
         each = torch.bincount(ray, minlength=len(origin))
         rank = torch.arange(len(ray)) - (torch.cumsum(each, 0) - each)[ray]
-        return Samples(ray, rank, unit, width)
+        return Samples(ray, rank, unit, width, t)
 
     def _lattice(self, index: torch.Tensor) -> torch.Tensor:
         """Return the distance of lattice points, metres."""
@@ -172,7 +230,8 @@ class TorchNGP:
             value = F.relu(F.linear(value, matrix))
         return F.linear(value, matrices[-1])
 
-    def _background(self, direction: torch.Tensor) -> torch.Tensor:
+    def background(self, direction: torch.Tensor) -> torch.Tensor:
+        """Return what lies behind the field, (n, 3), linear."""
         height, width = self.sky.shape[:2]
         azimuth = torch.atan2(direction[:, 1], direction[:, 0])
         u = azimuth * (0.5 / math.pi) * width

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack import variant
+from mi_nerfattack.bench.attack_sides import AbstractAttack
 from mi_nerfattack.bench.full_ngp import NGPData
 from mi_nerfattack.bench.sides import AbstractSide, AbstractTrainer
 
@@ -24,7 +25,8 @@ def main(arguments: Sequence[str]) -> None:
     """Serve one side until stdin ends.
 
     Args:
-        arguments: ``fit`` and what :func:`make_trainer` takes; or role, width, height,
+        arguments: ``fit`` and what :func:`make_trainer` takes; ``attack`` and what
+            :func:`make_attack` takes; or role, width, height,
             and what the role needs: the field's file (``ours``, ``plain``,
             ``tuned``), samples per ray (``slab``), nothing (``object``); then, for the
             peers, sizes of chunks.
@@ -32,6 +34,8 @@ def main(arguments: Sequence[str]) -> None:
     side: Any
     if arguments[0] == "fit":
         side = make_trainer(*arguments[1:])
+    elif arguments[0] == "attack":
+        side = make_attack(*arguments[1:])
     else:
         role, width, height, *rest = arguments
         side = make_side(role, int(width), int(height), rest)
@@ -79,6 +83,32 @@ def make_trainer(role: str, start: str, *rest: str) -> AbstractTrainer:
     from mi_nerfattack.bench.fit_ours import OurTrainer
 
     return OurTrainer(Path(start))
+
+
+def make_attack(role: str, *rest: str) -> AbstractAttack:
+    """Make a side of a comparison of attack iterations; imports only what it needs.
+
+    Args:
+        role: ``ours``, ``plain`` or ``tuned``.
+        rest: width, height, poses and horizon; for a peer, also the files of the
+            background and of the object, and, to try nothing else, the rays of a
+            chunk and the object's lookup.
+    """
+    from mi_nerfattack.bench.attack_drive import Job
+
+    job, others = Job(*map(int, rest[:4])), rest[4:]
+    if role in ("plain", "tuned"):
+        from mi_nerfattack.bench.attack_peer import LOOKUPS, TorchAttack
+        from mi_nerfattack.bench.peer import CHUNKS
+
+        scene, item, *choices = others
+        chunks = (int(choices[0]),) if choices else CHUNKS
+        lookups = (choices[1],) if choices else tuple(LOOKUPS)
+        return TorchAttack(role, Path(scene), Path(item), job, chunks, lookups)
+    variant.ensure()
+    from mi_nerfattack.bench.attack_ours import OurAttack
+
+    return OurAttack(job)
 
 
 if __name__ == "__main__":
