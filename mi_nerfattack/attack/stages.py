@@ -124,7 +124,7 @@ class Stages:
         return [
             Drive(
                 run=first_run + i,
-                states=states[i, :, :3],
+                states=states[i],
                 controls=controls[i],
                 cross_track_m=world.route.cross_track_numpy(states[i, 1:]),
                 **common,
