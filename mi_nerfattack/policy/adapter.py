@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, ClassVar
 
 import torch
@@ -233,7 +233,7 @@ class TorchPolicy(AbstractPolicy):
         leaves = [
             part.detach().requires_grad_(True) for part in (to_torch(image), *memory)
         ]
-        with torch.enable_grad():
+        with torch.enable_grad(), self._plain_layers():
             control, after = self._evaluate(leaves[0], goal, tuple(leaves[1:]))
         weight = to_torch(cotangent).to(control)
         if weight.shape != control.shape:
@@ -300,6 +300,16 @@ class TorchPolicy(AbstractPolicy):
                 "and recurrent as the network needs them"
             ) from err
         return tuple(result) if isinstance(result, (tuple, list)) else (result,)
+
+    def _plain_layers(self) -> AbstractContextManager[None]:
+        """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.
+
+        Programs do not show their layers; hidden states betray them.
+        """
+        layers = self.module.modules()
+        if self.recurrent or any(isinstance(m, torch.nn.RNNBase) for m in layers):
+            return torch.backends.cudnn.flags(enabled=False)
+        return nullcontext()
 
     def _precision(self) -> torch.dtype | None:
         """Return the type of the module's parameters and buffers, if it has any."""
