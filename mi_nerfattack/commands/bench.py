@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
@@ -160,6 +160,56 @@ class BenchFit:
         return [*command, "--quick"] if self.quick else command
 
 
+@dataclass(frozen=True)
+class BenchAttack:
+    """Measure an attack iteration against a rollout and against the loop in PyTorch.
+
+    One drive past the bundled hydrant, both sides in turns, in processes of their own,
+    on all cores; medians count. Keep the machine otherwise idle. Takes about half an
+    hour; each part of it, at each size, can be measured alone.
+    """
+
+    sizes: tuple[str, ...] = ("200x66", "366x188")
+    """Widths and heights of the camera's image, pixels."""
+    parts: tuple[Literal["time", "memory"], ...] = ("time", "memory")
+    """What to measure."""
+    repeats: int = 3
+    """Turns of each side."""
+    quick: bool = False
+    """Drive two steps: to see that it works, not for figures."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date: a .json file, or a folder
+    in which it is named by date and machine."""
+    json: bool = False
+    """Print one line of JSON in place of the tables."""
+
+    def run(self) -> int:
+        """Measure, print and write."""
+        import json
+
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            attack,
+        )
+
+        sizes = _read_sizes(self.sizes)
+        _check_repeats(self.repeats)
+        settings = attack.Settings(sizes, self.parts, repeats=self.repeats)
+        if self.quick:
+            settings = attack.Settings.quick(sizes, self.parts, self.repeats)
+        document = _measure(attack.run, settings)
+        document = _publish("attack", document, self._command(), self.output)
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            _print_attack(document)
+        return 0
+
+    def _command(self) -> list[str]:
+        command = ["mi-nerfattack", "bench", "attack", "--sizes", *self.sizes]
+        command += ["--parts", *self.parts, "--repeats", str(self.repeats)]
+        return [*command, "--quick"] if self.quick else command
+
+
 def _measure(run: Callable[..., dict[str, Any]], settings: Any) -> dict[str, Any]:
     """Run a benchmark, and show how far it is."""
     from mi_nerfattack.commands.bars import StageBars
@@ -192,6 +242,7 @@ _Chosen = tyro.conf.OmitArgPrefixes[
         Union[  # noqa: UP007  the members are no plain types
             Annotated[BenchRender, tyro.conf.subcommand("render")],
             Annotated[BenchFit, tyro.conf.subcommand("fit")],
+            Annotated[BenchAttack, tyro.conf.subcommand("attack")],
             Annotated[BenchComposite, tyro.conf.subcommand("composite")],
         ]
     ]
@@ -255,6 +306,21 @@ def _print_fit(document: dict[str, Any]) -> None:
     console.print(first, highlight=False, soft_wrap=True)
     console.print(fit_table.ratio_table(document))
     for line in others:
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _print_attack(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+        attack_table,
+    )
+
+    console = Console()
+    for table in attack_table.time_table(document), attack_table.memory_table(document):
+        if table.row_count:
+            console.print(table)
+    for line in attack_table.remarks(document):
         console.print(line, highlight=False, soft_wrap=True)
 
 
