@@ -120,9 +120,7 @@ def test_reverse_mode_through_time_equals_differences(make, rng):
     weights = rng.normal(size=(5, 2))
 
     def objective(step):
-        images = [
-            tensor(v + step * d) for v, d in zip(values, directions, strict=True)
-        ]
+        images = [tensor(v + step * d) for v, d in zip(values, directions, strict=True)]
         return float(np.sum(weights * drive(policy, images)[0]))
 
     images = [tensor(v) for v in values]
