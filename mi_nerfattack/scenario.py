@@ -185,12 +185,22 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _content(value: str, base: str | Path) -> dict[str, str]:
-    """Hash the content of ``FILE`` or ``FILE.py:NAME``, and the name."""
+    """Hash the content of ``FILE`` or ``FILE.py:NAME``, and the name.
+
+    An XML file counts with the files that it names itself, meshes and pictures.
+    """
     file, name = (value, "") if not _REFERENCE.search(value) else split_reference(value)
     path = resolve(file, base)
-    raw = files.read_bytes(path, files.MAX_TENSOR_BYTES) + name.encode()
+    raw = files.read_bytes(path, files.MAX_TENSOR_BYTES)
+    digest = hashlib.sha256(raw + name.encode())
+    if path.suffix.lower() == ".xml":
+        text = raw.decode("utf-8", "replace")
+        for inner in sorted(set(re.findall(r'="([^"\n]+)"', text))):
+            if (path.parent / inner).is_file():
+                part = files.read_bytes(path.parent / inner, files.MAX_TENSOR_BYTES)
+                digest.update(hashlib.sha256(part).digest())
     shown = f"{path.name}:{name}" if name else path.name
-    return {"file": shown, "sha256": hashlib.sha256(raw).hexdigest()}
+    return {"file": shown, "sha256": digest.hexdigest()}
 
 
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:

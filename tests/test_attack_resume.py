@@ -515,6 +515,24 @@ def test_differences_are_told_key_by_key():
     ]
 
 
+def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
+    from mi_nerfattack.scenario import load_scenario
+
+    mine = tmp_path / "mine"
+    shutil.copytree(folder, mine)
+    mesh = mine / "road.ply"
+    mesh.write_text("one")
+    xml = (mine / "deployment.xml").read_text()
+    shape = '<shape type="ply"><string name="filename" value="road.ply"/></shape>'
+    (mine / "deployment.xml").write_text(xml.replace("<emitter", f"{shape}<emitter"))
+    scenario, _ = load_scenario(mine / "scenario.toml")
+    before = scenario.identity(mine)
+    mesh.write_text("other")
+    assert resumable.differences(before, scenario.identity(mine)) == [
+        "scenario.scene.deployment: the content of deployment.xml has changed"
+    ]
+
+
 @pytest.mark.slow
 def test_killed_attacks_go_on(tmp_path):
     from mi_nerfattack.bench.kill import Campaign
