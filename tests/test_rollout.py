@@ -1,13 +1,21 @@
-"""The closed loop and its adjoint."""
+"""The closed loop through fields, and its adjoints, in single precision."""
 
 from __future__ import annotations
 
+import gc
+from dataclasses import replace
+
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from derivatives import central_difference
 
 pytestmark = pytest.mark.usefixtures("variant")
+
+INITIAL = np.array([[0.0, 0.35, 0.02]])
+ADJOINTS = ("replay", "kept_backgrounds", "checkpointed", "tape")
 
 
 @pytest.fixture
@@ -17,74 +25,169 @@ def toy(variant):
     return toy_loop
 
 
-INITIAL = np.array([[0.0, 0.35, 0.02]])
+def make_adjoint(name):
+    from mi_nerfattack.rollout import adjoint, tape
+
+    if name == "tape":
+        return tape.FullTape()
+    if name == "checkpointed":
+        return adjoint.Checkpointed(3)
+    return adjoint.Replay() if name == "replay" else adjoint.KeptBackgrounds()
 
 
-def objective(toy, loop, initial, horizon):
-    from mi_nerfattack.rollout.adjoint import objective_value
-    from mi_nerfattack.rollout.loop import simulate, to_state
+def make_rollout(toy, loop, horizon, attached=False, adjoint="replay"):
+    from mi_nerfattack.rollout.function import Rollout
+    from mi_nerfattack.rollout.objective import StageSum
 
-    drive = simulate(loop, to_state(initial), horizon)
-    return objective_value(drive, toy.square_error)
-
-
-def gradient(toy, loop, initial, horizon, attached):
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
-
-    drive = simulate(loop, to_state(initial), horizon)
-    return replay_gradient(loop, drive, toy.square_error, attached)
+    return Rollout(
+        loop,
+        StageSum(toy.square_error),
+        horizon,
+        adjoint=make_adjoint(adjoint),
+        attached=attached,
+    )
 
 
-@pytest.mark.parametrize("horizon", [2, 5])
-def test_attached_gradient_is_that_of_the_whole_loop(toy, horizon, rng):
-    loop, item = toy.make_loop()
-    found = gradient(toy, loop, INITIAL, horizon, True).textures[0].numpy().copy()
-    base = toy.texture_of(item)
-    along = found / np.linalg.norm(found)
-    for direction in (along, along + 0.5 * _unit(rng.normal(size=base.shape))):
-        direction = _unit(direction).astype(np.float32)
-        values = []
-        h = 0.3
-        for sign in (1, -1):
-            item.set_parameter("texture", base + np.float32(sign * h) * direction)
-            values.append(objective(toy, loop, INITIAL, horizon))
-        item.set_parameter("texture", base)
-        difference = (values[0] - values[1]) / (2 * h)
-        expected = float((found.astype(float) * direction).sum())
-        assert difference == pytest.approx(expected, rel=1e-2)
+def gradient(rollout, initial=INITIAL, **options):
+    return rollout.gradient(rollout.run(rollout.loop.initial(initial)), **options)
 
 
-def _unit(value):
+def objective(rollout, initial=INITIAL):
+    return rollout.run(rollout.loop.initial(initial)).value
+
+
+def texture_gradient(rollout, initial=INITIAL):
+    return gradient(rollout, initial).textures[0].numpy().astype(float)
+
+
+def unit(value):
     return value / np.linalg.norm(value)
+
+
+def along_texture(toy, rollout, item, direction):
+    """Return J as a function of a step along a direction of the texture."""
+    base = toy.texture_of(item)
+
+    def value(s):
+        moved = base + s * direction
+        rollout.loop.sensor.set_textures([moved.astype(np.float32)])
+        return objective(rollout)
+
+    return value
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 10])
+def test_attached_gradient_is_that_of_the_whole_loop(toy, horizon, rng):
+    from mi_nerfattack.vehicle.integrators import RK4
+
+    loop, item = toy.make_loop(RK4())  # Euler feels a control after two steps
+    rollout = make_rollout(toy, loop, horizon, attached=True)
+    found = texture_gradient(rollout)
+    along = unit(found)
+    for direction in (along, unit(along + 0.5 * unit(rng.normal(size=found.shape)))):
+        value = along_texture(toy, rollout, item, direction)
+        expected = float((found * direction).sum())
+        assert central_difference(value, 1.0) == pytest.approx(expected, rel=1e-3)
 
 
 def test_attached_gradient_by_the_initial_state(toy):
     loop, _ = toy.make_loop()
-    found = np.array(gradient(toy, loop, INITIAL, 5, True).initial)[:, 0]
-    for axis, h in ((0, 2e-2), (1, 2e-2), (2, 5e-3)):
-        values = []
-        for sign in (1, -1):
+    rollout = make_rollout(toy, loop, 5, attached=True)
+    found = np.array(gradient(rollout).initial)[:, 0]
+    for axis, step in ((0, 4e-2), (1, 4e-2), (2, 1e-2)):
+
+        def value(s, axis=axis):
             moved = INITIAL.copy()
-            moved[0, axis] += sign * h
-            values.append(objective(toy, loop, moved, 5))
-        difference = (values[0] - values[1]) / (2 * h)
-        scale = np.abs(found).max()
-        assert difference == pytest.approx(found[axis], rel=1e-2, abs=2e-3 * scale)
+            moved[0, axis] += s
+            return objective(rollout, moved)
+
+        expected = pytest.approx(found[axis], rel=1e-3, abs=1e-3 * np.abs(found).max())
+        assert central_difference(value, step) == expected
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_gradient_by_the_pose_of_an_object(toy, attached):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 4, attached)
+    start = np.array([[0.05, -0.1, 0.08, 0.1, -0.2, 0.15]])
+    loop.sensor.set_offsets(start)
+    found = gradient(rollout, offsets=True).offsets
+    assert found.shape == (1, 6)
+    if not attached:
+        tape = make_rollout(toy, loop, 4, attached, "tape")
+        expected = gradient(tape, offsets=True).offsets
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6)
+        return
+    for axis in range(6):
+
+        def value(s, axis=axis):
+            moved = start.copy()
+            moved[0, axis] += s
+            loop.sensor.set_offsets(moved)
+            return objective(rollout)
+
+        scale = np.abs(found[0, 3 * (axis // 3) :][:3]).max()
+        expected = pytest.approx(found[0, axis], rel=2e-3, abs=2e-3 * scale)
+        assert central_difference(value, 2e-2) == expected
+
+
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize("adjoint", ADJOINTS[1:])
+@pytest.mark.parametrize("horizon", [1, 2, 10])
+def test_adjoints_agree(toy, horizon, adjoint, attached):
+    loop, _ = toy.make_loop(coarse=True)
+    both = np.array([[0.0, 0.35, 0.02], [0.1, -0.2, -0.05]])
+    replay = gradient(make_rollout(toy, loop, horizon, attached), both, offsets=True)
+    expected = flat(replay)
+    rollout = make_rollout(toy, loop, horizon, attached, adjoint)
+    for a, b in zip(flat(gradient(rollout, both, offsets=True)), expected, strict=True):
+        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b)
+
+
+@pytest.mark.slow
+def test_replay_agrees_with_the_tape_over_a_long_drive(toy):
+    loop, _ = toy.make_loop(coarse=True)
+    replay = gradient(make_rollout(toy, loop, 100), offsets=True)
+    expected = flat(replay)
+    tape = gradient(make_rollout(toy, loop, 100, adjoint="tape"), offsets=True)
+    for a, b in zip(flat(tape), expected, strict=True):
+        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b)
+
+
+def flat(found):
+    """Copy all parts of a gradient."""
+    textures = [texture.numpy().astype(float) for texture in found.textures]
+    return [*textures, np.array(found.initial), found.offsets, found.costates]
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_forward_and_reverse_mode_are_transposes(toy, rng, attached):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 4, attached)
+    evaluation = rollout.run(loop.initial(INITIAL))
+    found = rollout.gradient(evaluation)
+    by_texture = found.textures[0].numpy().astype(float)
+    direction = unit(by_texture) + 0.3 * unit(rng.normal(size=by_texture.shape))
+    start = np.array([[0.1, -0.3, 0.05]])
+    expected = (by_texture * direction).sum() + (
+        np.array(found.initial).T * start
+    ).sum()
+    tensor = mi.TensorXf(direction.astype(np.float32))
+    tangent = rollout.tangent(evaluation, [tensor], loop.initial(start))
+    assert tangent == pytest.approx(float(expected), rel=1e-5)
 
 
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_detached_gradient_is_that_of_a_torch_loop_with_detach(toy, horizon):
     loop, item = toy.make_loop()
-    found = gradient(toy, loop, INITIAL, horizon, False).textures[0].numpy()
+    rollout = make_rollout(toy, loop, horizon)
+    found = texture_gradient(rollout)
     texture = torch.as_tensor(toy.texture_of(item).astype(np.float64))
     texture.requires_grad_(True)
     value = toy.torch_objective(loop, texture, INITIAL[0], horizon)
     value.backward()
     expected = texture.grad.numpy()
-    assert objective(toy, loop, INITIAL, horizon) == pytest.approx(
-        float(value.detach()), rel=1e-5
-    )
+    assert objective(rollout) == pytest.approx(float(value.detach()), rel=1e-5)
     assert np.linalg.norm(expected) > 0
     error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
     assert error < 1e-3
@@ -92,15 +195,15 @@ def test_detached_gradient_is_that_of_a_torch_loop_with_detach(toy, horizon):
 
 def test_euler_needs_two_steps_to_feel_a_control(toy):
     loop, _ = toy.make_loop()
-    found = gradient(toy, loop, INITIAL, 1, True)
+    found = gradient(make_rollout(toy, loop, 1, attached=True))
     assert not found.textures[0].numpy().any()
     assert found.costates.shape == (1, 1, 3)
 
 
 def test_attached_and_detached_differ(toy):
     loop, _ = toy.make_loop()
-    a = gradient(toy, loop, INITIAL, 5, True).textures[0].numpy().copy()
-    b = gradient(toy, loop, INITIAL, 5, False).textures[0].numpy().copy()
+    a = texture_gradient(make_rollout(toy, loop, 5, attached=True))
+    b = texture_gradient(make_rollout(toy, loop, 5))
     assert np.linalg.norm(a - b) > 1e-3 * np.linalg.norm(b)
 
 
@@ -109,65 +212,76 @@ def test_other_integrators_against_differences(toy, name):
     from mi_nerfattack.vehicle import integrators
 
     loop, item = toy.make_loop(getattr(integrators, name)())
-    found = gradient(toy, loop, INITIAL, 3, True).textures[0].numpy().copy()
-    base, along = toy.texture_of(item), _unit(found)
-    values = []
-    for sign in (1, -1):
-        item.set_parameter("texture", base + np.float32(0.3 * sign) * along)
-        values.append(objective(toy, loop, INITIAL, 3))
-    difference = (values[0] - values[1]) / 0.6
-    assert difference == pytest.approx(np.linalg.norm(found), rel=1e-2)
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = texture_gradient(rollout)
+    value = along_texture(toy, rollout, item, unit(found))
+    expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
+    assert central_difference(value, 1.0) == expected
 
 
 def test_a_batch_is_the_mean_of_its_members(toy):
     loop, _ = toy.make_loop()
     both = np.array([[0.0, 0.35, 0.02], [0.1, -0.2, -0.05]])
-    batch = gradient(toy, loop, both, 3, False).textures[0].numpy().copy()
-    one = gradient(toy, loop, both[:1], 3, False).textures[0].numpy().copy()
-    two = gradient(toy, loop, both[1:], 3, False).textures[0].numpy().copy()
+    rollout = make_rollout(toy, loop, 3)
+    batch, one, two = (
+        texture_gradient(rollout, poses) for poses in (both, both[:1], both[1:])
+    )
     assert np.allclose(batch, 0.5 * (one + two), rtol=1e-3, atol=1e-7)
+
+
+def test_a_batch_is_one_sequence_of_launches(toy):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 3, adjoint="kept_backgrounds")
+    counts = []
+    for size in (1, 8):
+        poses = np.repeat(INITIAL, size, 0) + 0.01 * np.arange(size)[:, None]
+        gradient(rollout, poses)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            gradient(rollout, poses + 0.003)
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        counts.append(len(history))
+    assert counts[0] == counts[1] > 0
 
 
 def test_jitter_is_replayed(toy):
     loop, _ = toy.make_loop(jitter_seed=7)
-    from mi_nerfattack.rollout.loop import to_state
-
-    state = to_state(INITIAL)
+    state = loop.initial(INITIAL)
     a = loop.sensor.observe(state, 3).image.numpy()
     assert np.array_equal(a, loop.sensor.observe(state, 3).image.numpy())
     assert not np.array_equal(a, loop.sensor.observe(state, 4).image.numpy())
 
 
-def test_nothing_is_compiled_after_the_first_steps(toy):
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
+def test_a_jittered_loop_is_differentiated_as_it_was_driven(toy):
+    loop, item = toy.make_loop(jitter_seed=7)
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = texture_gradient(rollout)
+    value = along_texture(toy, rollout, item, unit(found))
+    expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
+    assert central_difference(value, 1.0) == expected
 
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[:3])
+def test_nothing_is_compiled_after_the_first_steps(toy, adjoint):
     loop, _ = toy.make_loop()
-    drive = simulate(loop, to_state(INITIAL), 3)
-    replay_gradient(loop, drive, toy.square_error)
+    gradient(make_rollout(toy, loop, 4, adjoint=adjoint))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        drive = simulate(loop, to_state(INITIAL + 0.07), 4)
-        replay_gradient(loop, drive, toy.square_error)
-        history = dr.kernel_history()
-    kernels = [entry for entry in history if "cache_hit" in entry]
-    assert kernels
-    assert all(entry["cache_hit"] for entry in kernels)
+        gradient(make_rollout(toy, loop, 4, adjoint=adjoint), INITIAL + 0.07)
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    assert history
+    assert all(entry["cache_hit"] for entry in history)
 
 
 def test_memory_does_not_grow_with_the_horizon(toy):
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
-
     loop, _ = toy.make_loop()
-    backend = dr.backend_v(type(to_state(INITIAL)[0]))
+    backend = dr.backend_v(mi.Float)
 
     def peak(horizon):
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
-        drive = simulate(loop, to_state(INITIAL), horizon)
-        replay_gradient(loop, drive, toy.square_error)
+        gradient(make_rollout(toy, loop, horizon))
         dr.sync_thread()
         return dr.detail.malloc_watermark(backend)
 
@@ -176,53 +290,50 @@ def test_memory_does_not_grow_with_the_horizon(toy):
 
 
 def test_a_sensor_without_derivatives_is_refused(toy):
-    from dataclasses import replace
-
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
     from mi_nerfattack.rollout.sensor import AbstractSensor
 
-    loop, _ = toy.make_loop()
-    drive = simulate(loop, to_state(INITIAL), 1)
-
     class Blind(AbstractSensor):
-        def observe(self, state, step):
-            raise NotImplementedError
+        def __init__(self, sensor):
+            self.sensor = sensor
 
-    with pytest.raises(TypeError, match="Blind"):
-        replay_gradient(replace(loop, sensor=Blind()), drive, toy.square_error)
+        def observe(self, state, step):
+            return self.sensor.observe(state, step)
+
+    loop, _ = toy.make_loop()
+    blind = replace(loop, sensor=Blind(loop.sensor))
+    with pytest.raises(TypeError, match="Blind: has no derivatives"):
+        gradient(make_rollout(toy, blind, 1))
 
 
 def test_horizon_below_one_and_bad_states_are_refused(toy):
-    from mi_nerfattack.rollout.loop import simulate, to_state
+    from mi_nerfattack.rollout.loop import to_state
 
     loop, _ = toy.make_loop()
     with pytest.raises(ValueError, match="horizon"):
-        simulate(loop, to_state(INITIAL), 0)
+        objective(make_rollout(toy, loop, 0))
     with pytest.raises(ValueError, match="states"):
         to_state(np.array([[0.0, np.nan, 0.0]]))
+    with pytest.raises(ValueError, match=r"offsets: shape \(2, 6\)"):
+        loop.sensor.set_offsets(np.zeros((2, 6)))
 
 
-def test_kept_frames_give_the_same_gradient(toy, single_thread):
-    from mi_nerfattack.rollout.adjoint import replay_gradient
-    from mi_nerfattack.rollout.loop import simulate, to_state
-
+def test_kept_backgrounds_are_not_rendered_again(toy):
     loop, _ = toy.make_loop()
-    start = to_state(INITIAL)
-    kept = simulate(loop, start, 3, keep=True)
-    assert len(kept.observations) == 3
+    rollout = make_rollout(toy, loop, 3, adjoint="kept_backgrounds")
+    evaluation = rollout.run(loop.initial(INITIAL))
+    kept = evaluation.trajectory.kept
+    bytes_kept = sum(
+        4 * dr.width(array)
+        for march, _ in kept
+        for array in (*march.radiance, march.opacity, march.moment)
+    )
+    assert bytes_kept == 3 * toy.WIDTH * toy.HEIGHT * 20  # as its docstring says
     before = loop.sensor.renders
-    found = replay_gradient(loop, kept, toy.square_error)
-    assert loop.sensor.renders == before  # nothing was rendered again
-    again = replay_gradient(loop, simulate(loop, start, 3), toy.square_error)
-    expected = again.textures[0].numpy()
-    assert np.abs(expected).max() > 0
-    np.testing.assert_array_equal(found.textures[0].numpy(), expected)
+    rollout.gradient(evaluation)
+    assert loop.sensor.renders == before
 
 
-def test_attached_gradient_through_the_interleaved_composite(toy):
-    from dataclasses import replace
-
+def interleaved(toy):
     from mi_nerfattack.render.interleaved import InterleavedComposite
     from mi_nerfattack.rollout.field_sensor import FieldSensor
 
@@ -231,28 +342,49 @@ def test_attached_gradient_through_the_interleaved_composite(toy):
     sensor = FieldSensor(
         old.scene, old.objects, old.camera, old.mount, composite=InterleavedComposite()
     )
-    loop = replace(loop, sensor=sensor)
-    found = gradient(toy, loop, INITIAL, 3, True).textures[0].numpy().copy()
-    base = toy.texture_of(item)
-    direction = _unit(found).astype(np.float32)
-    values = []
-    for sign in (1, -1):
-        item.set_parameter("texture", base + np.float32(sign * 0.3) * direction)
-        values.append(objective(toy, loop, INITIAL, 3))
-    expected = float((found.astype(float) * direction).sum())
-    assert (values[0] - values[1]) / 0.6 == pytest.approx(expected, rel=1e-2)
+    return replace(loop, sensor=sensor), item
+
+
+def test_attached_gradient_through_the_interleaved_composite(toy):
+    loop, item = interleaved(toy)
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = texture_gradient(rollout)
+    value = along_texture(toy, rollout, item, unit(found))
+    expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
+    assert central_difference(value, 1.0) == expected
+
+
+def test_gradient_by_pose_through_the_interleaved_composite(toy):
+    loop, _ = interleaved(toy)
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = gradient(rollout, offsets=True).offsets[0, 1]
+
+    def value(s):
+        loop.sensor.set_offsets(s * np.eye(6)[1:2])
+        return objective(rollout)
+
+    assert central_difference(value, 2e-2) == pytest.approx(found, rel=1e-2)
+
+
+def test_the_interleaved_composite_has_no_tape_and_no_ray_tangents(toy):
+    loop, _ = interleaved(toy)
+    with pytest.raises(TypeError, match="InterleavedComposite: cannot be taped"):
+        gradient(make_rollout(toy, loop, 1, adjoint="tape"))
+    rollout = make_rollout(toy, loop, 2, attached=True)
+    evaluation = rollout.run(loop.initial(INITIAL))
+    with pytest.raises(TypeError, match="keep the camera detached"):
+        zero = [0 * texture for texture in loop.sensor.textures()]
+        rollout.tangent(evaluation, zero, loop.initial(INITIAL))
 
 
 def test_sensors_die_safely_while_others_record(toy):
     """Dr.Jit aborts when a recording is destroyed while another is made."""
-    import gc
-
     before = gc.get_threshold()
     gc.set_threshold(1)
     try:
         for _ in range(4):
             loop, _ = toy.make_loop()
             loop.sensor.cycle = loop.sensor  # only the collector can free it
-            gradient(toy, loop, INITIAL, 1, False)
+            gradient(make_rollout(toy, loop, 1))
     finally:
         gc.set_threshold(*before)

@@ -154,7 +154,7 @@ def test_what_needs_a_density_or_a_camera_path_refuses_by_name() -> None:
         InterleavedComposite().render(layers, rays, 0.0)
     seen = DepthComposite().render(layers, rays, 0.0)
     with pytest.raises(InputError, match="splats: .* keep the camera detached"):
-        DepthComposite().backward_rays(layers, rays, seen, March(), 0.0, [0])
+        DepthComposite().backward_rays(layers, rays, seen, March(), 0.0, [0, 1])
 
 
 # The sensor
@@ -210,12 +210,11 @@ def test_nothing_is_compiled_after_the_first_steps(loop) -> None:
     from mi_nerfattack.rollout.objective import StageSum
 
     start = np.array([[0.0, 0.35, 0.02]])
-    drive = simulate(loop[0], to_state(start), 3)
-    replay_gradient(loop[0], drive, toy.square_error)
+    rollout = Rollout(loop[0], StageSum(toy.square_error), 3)
+    rollout.gradient(rollout.run(to_state(start)))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        drive = simulate(loop[0], to_state(start + 0.07), 4)
-        replay_gradient(loop[0], drive, toy.square_error)
+        rollout.gradient(rollout.run(to_state(start + 0.07)))
         history = dr.kernel_history()
     kernels = [entry for entry in history if "cache_hit" in entry]
     assert kernels

@@ -68,10 +68,16 @@ class SmoothPolicy(torch.nn.Module):
         return torch.tanh(((image - 0.4) * self.weight).sum((1, 2, 3)))
 
 
-def make_loop(integrator=None, jitter_seed=None) -> tuple[ClosedLoop, GridField]:
-    """Return a loop through a foggy scene with one object, and the object's field."""
-    scene = blob(GridLayout(2, 6, 9), 25.0, -2.0, 0.5, 1)
-    item = blob(GridLayout(3, 6, 12), 1.0, 2.5, 0.08, 2)
+def make_loop(
+    integrator=None, jitter_seed=None, coarse=False
+) -> tuple[ClosedLoop, GridField]:
+    """Return a loop through a foggy scene with one object, and the object's field.
+
+    A coarse one has few samples a ray.
+    """
+    wider = 5 if coarse else 1
+    scene = blob(GridLayout(2, 6, 9), 25.0, -2.0, 0.5 * wider, 1)
+    item = blob(GridLayout(3, 6, 12), 1.0, 2.5, 0.08 * wider, 2)
     sensor = FieldSensor(
         PosedField(scene),
         [PosedField(item, OBJECT_POSE)],

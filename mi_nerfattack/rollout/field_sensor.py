@@ -287,7 +287,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         for k, (posed, texture) in enumerate(zip(self.objects, textures, strict=True)):
             posed.field.packed = posed.field.pack(mi.Float(texture.array))
             if offsets is not None:
-                row = [offsets[k, i].array for i in range(6)]
+                row = [mi.Float(offsets[k, i].array) for i in range(6)]
                 posed = offset_on_tape(posed, posed.pose, row)
             layers.append(taped_march(posed, rays, self.stop))
         pixels = self._develop(depth_composite(layers), rays.direction)

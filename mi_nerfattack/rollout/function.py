@@ -144,9 +144,8 @@ class Rollout:
         Returns:
             one entry, attached to whatever of the three is. Reverse mode only.
         """
-        if offsets is None:
-            return dr.custom(_RolloutOp, self, list(textures), initial)
-        return dr.custom(_RolloutOp, self, list(textures), initial, offsets)
+        moved = [] if offsets is None else [offsets]
+        return dr.custom(_RolloutOp, _Held(self), list(textures), initial, moved)
 
     def install(self, textures: Sequence[Any], offsets: Any = None) -> None:
         """Give the sensor's objects textures and offsets, detached."""
@@ -156,16 +155,23 @@ class Rollout:
             sensor.set_offsets(np.array(dr.detach(offsets), np.float64))
 
 
+class _Held:
+    """A rollout that Dr.Jit does not look into for arrays."""
+
+    def __init__(self, rollout: Rollout) -> None:
+        self.rollout = rollout
+
+
 class _RolloutOp(dr.CustomOp):
     """Forward: a batch of drives. Backward: the rollout's adjoint."""
 
     def eval(
-        self, rollout: Rollout, textures: list[Any], initial: Any, *offsets: Any
+        self, held: _Held, textures: list[Any], initial: Any, offsets: list[Any]
     ) -> Any:
-        self.rollout = rollout
+        self.rollout = held.rollout
         self.parameters = dr.detach(textures), *dr.detach(offsets)
-        rollout.install(*self.parameters)
-        self.evaluation = rollout.run(dr.detach(initial))
+        self.rollout.install(*self.parameters)
+        self.evaluation = self.rollout.run(dr.detach(initial))
         row = dr.detached_t(dr.value_t(type(initial)))
         return row([self.evaluation.value])
 
@@ -178,4 +184,4 @@ class _RolloutOp(dr.CustomOp):
         self.set_grad_in("initial", found.initial)
         if found.offsets is not None:
             tensor = type(self.parameters[1])
-            self.set_grad_in("offsets", (tensor(found.offsets.astype(np.float32)),))
+            self.set_grad_in("offsets", [tensor(found.offsets)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +73,8 @@ class _Tape:
         self.textures = [_leaf(texture) for texture in sensor.textures()]
         self.offsets = None
         if options.offsets:
-            self.offsets = _leaf(mi.TensorXf(sensor.offsets().astype(np.float32)))
+            double = sys.modules[mi.Float.__module__].TensorXf64
+            self.offsets = _leaf(double(sensor.offsets()))
         self.states = [_leaf(drive.states[0])]
         self.controls: list[Any] = []
 
