@@ -21,7 +21,6 @@ from mi_nerfattack.vehicle import (
     RateLimitedAckermann,
 )
 from mi_nerfattack.vehicle.dynamics import soft_limit
-from mi_nerfattack.vehicle.integrators import state_jacobian
 
 INTEGRATORS = [ExplicitEuler(), RK4(), ImplicitMidpoint()]
 DYNAMICS = [
@@ -125,8 +124,8 @@ def test_midpoint_reports_divergence():
         ImplicitMidpoint(0)
 
 
-def test_state_jacobian_where_a_rate_is_itself_a_state():
-    columns = state_jacobian(Spring(), array64([[0.5], [0.3], [0.2]]), row64([0.1]))
+def test_jacobian_where_a_rate_is_itself_a_state():
+    columns = Spring().jacobian(array64([[0.5], [0.3], [0.2]]), row64([0.1]))
     matrix = np.stack([column.numpy()[:, 0] for column in columns], axis=1)
     np.testing.assert_allclose(matrix, [[0, 1, 0], [-4.5, -1, 0], [1, 0, -50]])
 

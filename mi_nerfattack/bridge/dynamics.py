@@ -26,8 +26,8 @@ from mi_nerfattack.vehicle.function import (
 class TorchDynamics(AbstractDynamics):
     """Vehicle model `dx/dt = function(state, control)` with derivatives by autograd.
 
-    Cost: a call and, in reverse mode, one graph an evaluation; forward mode (Newton's
-    method of `ImplicitMidpoint`) takes m reverse passes. Each waits for the device,
+    Cost: a call and, in reverse mode, one graph an evaluation; forward mode and an
+    iteration of `ImplicitMidpoint` take m reverse passes. Each waits for the device,
     and nothing of it can be recorded: prefer `FunctionDynamics` where the model can
     be written in Dr.Jit operations.
 
@@ -76,6 +76,15 @@ class TorchDynamics(AbstractDynamics):
         if not dr.grad_enabled(state, control):
             return value
         return dr.custom(_Derivative, self, state, control, value)
+
+    def jacobian(self, state: Any, control: Any) -> list[Any]:
+        """Compute the columns of df/dx by m reverse passes over one graph."""
+        result, leaves = self._graph(*_tensors(state, control))
+        rows = [
+            self._reverse(result, leaves, unit.expand_as(result))[0]
+            for unit in torch.eye(self.size).to(result)
+        ]
+        return [_to_state(column, state) for column in torch.stack(rows, 1).unbind(2)]
 
     def saturate(self, control: Any) -> Any:
         """Limit the control (n,) with `soft_limit`."""

@@ -99,6 +99,30 @@ class AbstractDynamics(ABC):
             (m, n), metres per second and radians per second.
         """
 
+    def jacobian(self, state: Any, control: Any) -> list[Any]:
+        """Compute df/dx by forward-mode differentiation.
+
+        Args:
+            state: (m, n), treated as a constant.
+            control: (n,), treated as a constant.
+
+        Returns:
+            m columns, each (m, n): column j is df/dx_j, detached.
+        """
+        columns = []
+        # A model need not depend on every row: Dubins ignores the position. Nor may
+        # the input's gradient be cleared, for a result can be an input, as in
+        # `dx/dt = v`.
+        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+        for row in range(len(state)):
+            with dr.resume_grad():
+                rows = [type(item)(dr.detach(item)) for item in state]
+                dr.enable_grad(rows[row])
+                slope = self.derivative(type(state)(*rows), dr.detach(control))
+                dr.set_grad(rows[row], 1)
+                columns.append(dr.detach(dr.forward_to(slope, flags=flags)))
+        return columns
+
     @abstractmethod
     def saturate(self, control: Any) -> Any:
         """Limit a commanded control (n,) smoothly to what the vehicle can do."""

@@ -146,7 +146,7 @@ class ImplicitMidpoint(AbstractIntegrator):
         self, dynamics: AbstractDynamics, x_prev: Any, x: Any, u: Any, dt: float
     ) -> list[Any]:
         """Compute the columns of dG/dx = 1 - dt/2 df/dx at the midpoint."""
-        columns = state_jacobian(dynamics, 0.5 * (x_prev + x), u)
+        columns = dynamics.jacobian(0.5 * (x_prev + x), u)
         for j, column in enumerate(columns):
             column *= -0.5 * dt
             column[j] += 1
@@ -169,29 +169,3 @@ class ImplicitMidpoint(AbstractIntegrator):
             f"ImplicitMidpoint: residual {worst:.3g} after {self.iterations} Newton "
             f"iterations at dt = {dt!r} s; take a smaller dt or more iterations"
         )
-
-
-def state_jacobian(dynamics: AbstractDynamics, state: Any, control: Any) -> list[Any]:
-    """Compute df/dx by forward-mode differentiation.
-
-    Args:
-        dynamics: vehicle model.
-        state: (m, n), treated as a constant.
-        control: (n,), treated as a constant.
-
-    Returns:
-        m columns, each (m, n): column j is df/dx_j, detached.
-    """
-    size = len(state)
-    columns = []
-    # A model need not depend on every row: Dubins ignores the position. Nor may the
-    # input's gradient be cleared, for a result can be an input, as in `dx/dt = v`.
-    flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-    for row in range(size):
-        with dr.resume_grad():
-            rows = [type(state[0])(dr.detach(state[i])) for i in range(size)]
-            dr.enable_grad(rows[row])
-            slope = dynamics.derivative(type(state)(*rows), dr.detach(control))
-            dr.set_grad(rows[row], 1)
-            columns.append(dr.detach(dr.forward_to(slope, flags=flags)))
-    return columns

@@ -10,7 +10,6 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.function import require_finite
-from mi_nerfattack.vehicle.integrators import state_jacobian
 
 #: Step of the central differences, relative to one plus the magnitude.
 STEP = 1e-6
@@ -43,7 +42,7 @@ def require_model(name: str, dynamics: AbstractDynamics, state: Any, u: Any) -> 
             f"{name}: gave {value[:, 0].tolist()} for a vehicle among others and "
             f"{alone[:, 0].tolist()} for it alone; vehicles must not mix"
         )
-    columns = [*state_jacobian(dynamics, state, u), _by_control(dynamics, state, u)]
+    columns = [*dynamics.jacobian(state, u), _by_control(dynamics, state, u)]
     for j, column in enumerate(columns):
         found = np.broadcast_to(column.numpy(), value.shape)
         source = "the control" if j == len(state) else f"row {j} of the state"
