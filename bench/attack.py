@@ -41,7 +41,7 @@ class Settings:
         memory_poses: in the batch whose memory is measured.
         replay_horizons: of the constant-memory mode; the short and the long one.
         kept_horizons: of the mode that keeps backgrounds.
-        torch_horizons: of the peer; beyond them its memory is extrapolated.
+        torch_horizon: of the peer; beyond it, its memory grows by its tape.
         choices: chunk of rays and lookup of the peers; none to try them out.
     """
 
@@ -53,7 +53,7 @@ class Settings:
     memory_poses: int = 4
     replay_horizons: tuple[int, int] = (25, 400)
     kept_horizons: tuple[int, int] = (25, 100)
-    torch_horizons: tuple[int, int] = (10, 25)
+    torch_horizon: int = 25
     choices: tuple[str, ...] = ()
 
     @staticmethod
@@ -62,7 +62,7 @@ class Settings:
     ) -> Settings:
         """Return settings that take seconds: to see that it works, not for figures."""
         return Settings(
-            sizes, parts, 2, repeats, 2, 1, (1, 2), (1, 2), (1, 2), ("4096", "bag")
+            sizes, parts, 2, repeats, 2, 1, (1, 2), (1, 2), 1, ("4096", "bag")
         )
 
 
@@ -171,24 +171,25 @@ class Bench:
         """Measure the peaks of both adjoints and of the peer by horizon."""
         settings, poses = self.settings, self.settings.memory_poses
         stage = f"memory, {size[0]}x{size[1]}"
-        jobs: list[tuple[str, int]] = []
-        for way, horizons in (
-            ("replay", settings.replay_horizons),
-            ("kept_backgrounds", settings.kept_horizons),
-            ("tuned", settings.torch_horizons),
-        ):
-            jobs += [(way, horizon) for horizon in horizons]
+        jobs = [
+            *(("replay", horizon) for horizon in settings.replay_horizons),
+            *((WAYS[0], horizon) for horizon in settings.kept_horizons),
+            ("tuned", settings.torch_horizon),
+        ]
         peaks: dict[str, dict[str, float]] = {way: {} for way, _ in jobs}
-        kept = 0.0
+        stated: dict[str, float] = {}
         for done, (way, horizon) in enumerate(jobs):
             self.progress(stage, done, len(jobs), f"{way}, {horizon} steps")
             job = Job(*size, poses, horizon)
             with self._peer(way, job) if way in PEERS else self._ours(job) as worker:
-                worker.ask("iterate", "" if way in PEERS else way)
+                found = worker.ask("iterate", way)
                 peaks[way][str(horizon)] = worker.ask("memory")["peak_memory_mb"]
-                kept = kept if way in PEERS else worker.ask("kept_bytes")
+                if way in PEERS:
+                    stated[way] = found["tape_mb"]
+                elif way not in stated:
+                    stated[way] = worker.ask("kept_bytes") / 1e6
         self.progress(stage, len(jobs), len(jobs), "")
-        return memory_row(peaks, kept, poses)
+        return {"memory_poses": poses, **memory_row(peaks, stated)}
 
     def _turn(self, ours: Worker, turns: Turns, ways: Sequence[str] = WAYS) -> None:
         """Take our rollout and iterations once."""
@@ -207,45 +208,36 @@ class Bench:
 
 
 def memory_row(
-    peaks: dict[str, dict[str, float]], kept_bytes: float, poses: int
+    peaks: dict[str, dict[str, float]], stated: dict[str, float]
 ) -> dict[str, Any]:
     """Put the figures of memory together.
 
     Args:
         peaks: MB by horizon, of `replay`, `kept_backgrounds` and the peer, `tuned`.
-        kept_bytes: stated by the mode that keeps backgrounds, a control period.
-        poses: vehicles.
+        stated: MB a control period, of the latter two.
     """
     replay, kept, peer = (dict(peaks[key]) for key in ("replay", WAYS[0], "tuned"))
-    (short, first), (long, last) = replay.items()
-    base, slope = _line(peer)
-    measured = list(peer)
-    for horizon in (short, long):
-        peer.setdefault(horizon, base + slope * int(horizon))
+    (_, first), (long, last) = replay.items()
+    (few, low), (many, high) = kept.items()
+    [(known, peak)] = peer.items()
+    for horizon in replay:
+        more = int(horizon) - int(known)
+        peer.setdefault(horizon, peak + stated["tuned"] * more)
+    ratios = {horizon: peer[horizon] / replay[horizon] for horizon in replay}
     return {
-        "memory_poses": poses,
         "peak_memory_mb_by_horizon": replay,
         "peak_memory_change": last / first - 1,
         "kept_backgrounds": {
             "peak_memory_mb_by_horizon": kept,
-            "stated_mb_per_step": kept_bytes / 1e6,
-            "measured_mb_per_step": _line(kept)[1],
+            "stated_mb_per_step": stated[WAYS[0]],
+            "measured_mb_per_step": (high - low) / (int(many) - int(few)),
         },
         "torch_peak_memory_mb_by_horizon": peer,
-        "torch_measured_horizons": measured,
-        "torch_mb_per_step": slope,
-        "torch_memory_ratio": peer[long] / last,
-        "torch_memory_ratio_by_horizon": {
-            key: peer[key] / replay[key] for key in replay
-        },
+        "torch_measured_horizons": [known],
+        "torch_tape_mb_per_step": stated["tuned"],
+        "torch_memory_ratio": ratios[long],
+        "torch_memory_ratio_by_horizon": ratios,
     }
-
-
-def _line(peaks: dict[str, float]) -> tuple[float, float]:
-    """Return MB at horizon 0, and MB a control period, from two horizons."""
-    (few, low), (many, high) = peaks.items()
-    slope = (high - low) / (int(many) - int(few))
-    return low - slope * int(few), slope
 
 
 def _time_row(turns: Turns) -> dict[str, Any]:

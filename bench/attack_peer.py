@@ -90,14 +90,19 @@ class TorchAttack(AbstractAttack):
         self._choose(chunks, lookups)
 
     def iterate(self, how: str = "") -> dict[str, float]:
-        """See :meth:`AbstractAttack.iterate`; there is one way."""
+        """See :meth:`AbstractAttack.iterate`; there is one way.
+
+        Also returns ``tape_mb``: what the graph keeps of a control period.
+        """
         del how
+        tape = Tape([self.item.texture, *self.loop.policy.parameters()])
         clock = Clock()
-        states = self.loop.drive(self.initial, self.job.horizon)
+        with tape:
+            states = self.loop.drive(self.initial, self.job.horizon)
         self.loop.objective(states).backward()
         self.optimiser.step()
         self.optimiser.zero_grad()
-        return clock.per_step(1)
+        return {**clock.per_step(1), "tape_mb": tape.size / 1e6 / self.job.horizon}
 
     def facts(self) -> dict[str, Any]:
         """Return settings."""
@@ -130,6 +135,36 @@ class TorchAttack(AbstractAttack):
             self.lookup = _best(lookups, see)
             self.item.lookup = LOOKUPS[self.lookup]
             self.optimiser.zero_grad()
+
+
+class Tape(torch.autograd.graph.saved_tensors_hooks):
+    """Counts the bytes that autograd keeps for a backward pass.
+
+    Args:
+        parameters: not counted, for they exist anyway.
+
+    Attributes:
+        size: bytes, each piece of memory once.
+    """
+
+    def __init__(self, parameters: Sequence[torch.Tensor]) -> None:
+        self.size = 0
+        self._known = {_memory_of(value) for value in parameters}
+        super().__init__(self._count, _same)
+
+    def _count(self, value: torch.Tensor) -> torch.Tensor:
+        if _memory_of(value) not in self._known:
+            self._known.add(_memory_of(value))
+            self.size += value.untyped_storage().nbytes()
+        return value
+
+
+def _memory_of(value: torch.Tensor) -> int:
+    return value.untyped_storage().data_ptr()
+
+
+def _same(value: torch.Tensor) -> torch.Tensor:
+    return value
 
 
 def _seconds(action: Callable[[], Any]) -> float:

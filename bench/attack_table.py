@@ -94,7 +94,7 @@ def remarks(document: dict[str, Any]) -> list[str]:
             f"{row['peak_memory_change']:+.2%}; kept backgrounds state "
             f"{kept['stated_mb_per_step']:.3f} MB a period and take "
             f"{kept['measured_mb_per_step']:.3f}; PyTorch's tape takes "
-            f"{row['torch_mb_per_step']:.1f}"
+            f"{row['torch_tape_mb_per_step']:.1f}"
         )
     return lines
 

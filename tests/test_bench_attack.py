@@ -14,6 +14,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.attack.objective import CrossTrackDeviation
 from mi_nerfattack.bench.attack import memory_row
 from mi_nerfattack.bench.attack_drive import SPEED_MS, Job
+from mi_nerfattack.bench.attack_peer import Tape
 from mi_nerfattack.bench.attack_table import memory_table, remarks, time_table
 from mi_nerfattack.bench.full_ngp import NGPData
 from mi_nerfattack.bench.sides import pinhole_rays
@@ -223,16 +224,25 @@ def test_memory_is_extrapolated_along_a_line():
     peaks = {
         "replay": {"25": 500.0, "400": 505.0},
         "kept_backgrounds": {"25": 510.0, "100": 585.0},
-        "tuned": {"10": 700.0, "25": 1000.0},
+        "tuned": {"25": 1000.0},
     }
-    row = memory_row(peaks, 1e6, 4)
+    row = memory_row(peaks, {"replay": 0.1, "kept_backgrounds": 1.1, "tuned": 20.0})
     assert row["peak_memory_change"] == pytest.approx(0.01)
     assert row["kept_backgrounds"]["measured_mb_per_step"] == pytest.approx(1)
-    assert row["torch_mb_per_step"] == pytest.approx(20)
+    assert row["kept_backgrounds"]["stated_mb_per_step"] == 1.1
     assert row["torch_peak_memory_mb_by_horizon"]["400"] == pytest.approx(8500)
     assert row["torch_memory_ratio"] == pytest.approx(8500 / 505)
-    assert row["torch_measured_horizons"] == ["10", "25"]
+    assert row["torch_measured_horizons"] == ["25"]
     assert row["torch_memory_ratio_by_horizon"]["25"] == pytest.approx(2)
+
+
+def test_the_tape_is_counted_once_and_without_parameters():
+    weight = torch.ones(1000, requires_grad=True)
+    given = torch.ones(1000)
+    tape = Tape([weight])
+    with tape:
+        (weight * given + weight * given).sum().backward()
+    assert tape.size == 4000  # `given`, which both products keep
 
 
 SIZE = ["--sizes", "32x16", "--repeats", "1"]
