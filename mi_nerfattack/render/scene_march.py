@@ -1,0 +1,150 @@
+"""Marches through one field whose parameters are constants: a scene's."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.fields.ngp import NGPField
+from mi_nerfattack.fields.packed_ngp import PackedNGP
+from mi_nerfattack.render.march import (
+    MAX_INTERVALS,
+    March,
+    Rays,
+    absorption,
+    march,
+    seek,
+)
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.frozen import freeze_method
+
+
+class AbstractSceneMarch(ABC):
+    """A way to march rays through one field whose parameters are constants."""
+
+    @abstractmethod
+    def march(self, rays: Rays) -> March:
+        """Integrate radiance, opacity and moment; as `render.march.march`.
+
+        Args:
+            rays: n rays, with gains for one field or none.
+
+        Returns:
+            the march, (n,), evaluated.
+        """
+
+
+def scene_march(posed: PosedField, stop: float) -> AbstractSceneMarch:
+    """Choose the fastest way to march a field on this backend.
+
+    Args:
+        posed: the field.
+        stop: transmittance below which a ray ends.
+    """
+    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+    field = posed.field
+    if on_cpu and isinstance(field, NGPField) and field.layout.features % 2 == 0:
+        return PackedMarch(posed, stop)
+    return FieldMarch(posed, stop)
+
+
+class FieldMarch(AbstractSceneMarch):
+    """Any field, any backend: `render.march.march`, recorded once.
+
+    Args:
+        posed: the field.
+        stop: transmittance below which a ray ends.
+    """
+
+    def __init__(self, posed: PosedField, stop: float) -> None:
+        self.posed, self.stop = posed, stop
+        self._frozen = freeze_method(self._record, self._state)
+
+    def march(self, rays: Rays) -> March:
+        """See :meth:`AbstractSceneMarch.march`."""
+        return self._frozen(_opaque(rays))
+
+    def _record(self, rays: Rays) -> March:
+        (posed,) = rays.light([self.posed])
+        return march(posed, *rays, self.stop)
+
+    def _state(self, rays: Rays) -> list[Any]:
+        return [self, self.stop, dr.width(rays.direction), self.posed.state()]
+
+
+class PackedMarch(AbstractSceneMarch):
+    """An NGP on a CPU, from a copy of its parameters that is faster to read.
+
+    Same positions, occupancy and termination as `render.march.march`, and the same
+    result but for rounding, in about 0.7 of the time. Costs a copy of the table.
+
+    Args:
+        posed: an NGP whose vertices have an even number of features.
+        stop: transmittance below which a ray ends.
+    """
+
+    def __init__(self, posed: PosedField, stop: float) -> None:
+        assert isinstance(posed.field, NGPField)
+        self.posed, self.stop = posed, stop
+        self._field = posed.field
+        self._packed = PackedNGP(posed.field)
+        self._frozen = freeze_method(self._record, self._state)
+
+    def march(self, rays: Rays) -> March:
+        """See :meth:`AbstractSceneMarch.march`."""
+        if not self._packed.is_current():
+            self._packed = PackedNGP(self._field)
+        return self._frozen(_opaque(rays))
+
+    def _record(self, rays: Rays) -> March:
+        with dr.suspend_grad():
+            result = _march(self.posed, self._packed, rays, self.stop)
+            for (gain,) in [rays.gains] if rays.gains else []:
+                result.radiance *= gain
+        return result
+
+    def _state(self, rays: Rays) -> list[Any]:
+        sizes = [dr.width(rays.direction), self._field.layout]
+        return [self, self.stop, sizes, self._packed.arrays(), self.posed.state()]
+
+
+@dr.syntax
+def _march(posed: PosedField, packed: PackedNGP, rays: Rays, stop: float) -> March:
+    o, d = posed.to_local(rays.origin, rays.direction)
+    near, far = posed.interval(o, d, rays.t_max)
+    view = packed.view(dr.normalize(d))
+    jitter = rays.jitter
+    active = mi.Bool(rays.active) & (near < far)
+
+    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
+    tau = mi.Float(0)  # optical depth from the origin to the interval
+    radiance = mi.Color3f(0)  # premultiplied radiance so far
+    moment = mi.Float(0)  # integral of t sigma T so far
+    while active:
+        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
+        density, colour = packed.eval(mi.Point3f(o + t * d), view, active)
+        x = dr.select(active, posed.in_world(density) * width, 0)
+        weight = dr.exp(-tau) * x * absorption(x)[0]
+        radiance += weight * colour
+        moment += weight * t
+        tau += x
+        index += 1
+        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
+    return March(radiance, tau * absorption(tau)[0], moment)
+
+
+def _opaque(rays: Rays) -> Rays:
+    """Return rays that are known in memory, so that no number becomes code."""
+    rays = Rays(
+        mi.Point3f(dr.detach(rays.origin)),
+        mi.Vector3f(dr.detach(rays.direction)),
+        mi.Float(dr.detach(rays.t_max)),
+        mi.Float(dr.detach(rays.jitter)),
+        mi.Bool(rays.active),
+        [mi.Color3f(dr.detach(gain)) for gain in rays.gains],
+    )
+    dr.make_opaque(rays)
+    return rays
