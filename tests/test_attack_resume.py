@@ -533,6 +533,14 @@ def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
     ]
 
 
+def test_force_without_resume_is_refused(folder, tmp_path, capsys):
+    from mi_nerfattack import cli
+
+    scenario, output = str(folder / "scenario.toml"), tmp_path / "run"
+    assert cli.main(["attack", scenario, "-o", str(output), "--force"]) == 2
+    assert "--resume" in capsys.readouterr().err and not output.exists()
+
+
 @pytest.mark.slow
 def test_killed_attacks_go_on(tmp_path):
     from mi_nerfattack.bench.kill import Campaign
