@@ -35,7 +35,7 @@ class PackedNGP:
         split = len(last)
         joined = first[:, :split].astype(np.float64) @ last
         groups = [hidden, [last[:1]], [first[:, split:]], [joined], rest]
-        packed = nn.pack([_tensor(w) for group in groups for w in group], "training")
+        packed = nn.pack([_tensor(w) for group in groups for w in group])
         views = iter(packed)
         parts = [[next(views) for _ in group] for group in groups]
         self._hidden, (self._density,), (self._view,), (self._joined,), self._rest = (
