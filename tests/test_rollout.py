@@ -71,7 +71,9 @@ def along_texture(toy, rollout, item, direction):
     def value(s):
         moved = base + s * direction
         rollout.loop.sensor.set_textures([moved.astype(np.float32)])
-        return objective(rollout)
+        result = objective(rollout)
+        rollout.loop.sensor.set_textures([base])
+        return result
 
     return value
 
@@ -87,7 +89,7 @@ def test_attached_gradient_is_that_of_the_whole_loop(toy, horizon, rng):
     for direction in (along, unit(along + 0.5 * unit(rng.normal(size=found.shape)))):
         value = along_texture(toy, rollout, item, direction)
         expected = float((found * direction).sum())
-        assert central_difference(value, 1.0) == pytest.approx(expected, rel=1e-3)
+        assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
 def test_attached_gradient_by_the_initial_state(toy):
@@ -113,10 +115,10 @@ def test_gradient_by_the_pose_of_an_object(toy, attached):
     loop.sensor.set_offsets(start)
     found = gradient(rollout, offsets=True).offsets
     assert found.shape == (1, 6)
-    if not attached:
-        tape = make_rollout(toy, loop, 4, attached, "tape")
-        expected = gradient(tape, offsets=True).offsets
-        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6)
+    tape = make_rollout(toy, loop, 4, attached, "tape")
+    expected = gradient(tape, offsets=True).offsets
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    if not attached:  # then it is not that of the whole loop
         return
     for axis in range(6):
 
@@ -126,9 +128,11 @@ def test_gradient_by_the_pose_of_an_object(toy, attached):
             loop.sensor.set_offsets(moved)
             return objective(rollout)
 
+        # samples that cross the faces of cells, kinks of the field, cost accuracy, as
+        # do the ends of the interval on the ray, which count as constants
         scale = np.abs(found[0, 3 * (axis // 3) :][:3]).max()
-        expected = pytest.approx(found[0, axis], rel=2e-3, abs=2e-3 * scale)
-        assert central_difference(value, 2e-2) == expected
+        expected = pytest.approx(found[0, axis], rel=2e-2, abs=2e-2 * scale)
+        assert central_difference(value, 3e-3) == expected
 
 
 @pytest.mark.parametrize("attached", [True, False])
@@ -216,7 +220,7 @@ def test_other_integrators_against_differences(toy, name):
     found = texture_gradient(rollout)
     value = along_texture(toy, rollout, item, unit(found))
     expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
-    assert central_difference(value, 1.0) == expected
+    assert central_difference(value, 0.2) == expected
 
 
 def test_a_batch_is_the_mean_of_its_members(toy):
@@ -233,7 +237,7 @@ def test_a_batch_is_one_sequence_of_launches(toy):
     loop, _ = toy.make_loop()
     rollout = make_rollout(toy, loop, 3, adjoint="kept_backgrounds")
     counts = []
-    for size in (1, 8):
+    for size in (2, 8):
         poses = np.repeat(INITIAL, size, 0) + 0.01 * np.arange(size)[:, None]
         gradient(rollout, poses)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -258,7 +262,7 @@ def test_a_jittered_loop_is_differentiated_as_it_was_driven(toy):
     found = texture_gradient(rollout)
     value = along_texture(toy, rollout, item, unit(found))
     expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
-    assert central_difference(value, 1.0) == expected
+    assert central_difference(value, 0.2) == expected
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS[:3])
@@ -351,19 +355,19 @@ def test_attached_gradient_through_the_interleaved_composite(toy):
     found = texture_gradient(rollout)
     value = along_texture(toy, rollout, item, unit(found))
     expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
-    assert central_difference(value, 1.0) == expected
+    assert central_difference(value, 0.2) == expected
 
 
 def test_gradient_by_pose_through_the_interleaved_composite(toy):
     loop, _ = interleaved(toy)
     rollout = make_rollout(toy, loop, 3, attached=True)
-    found = gradient(rollout, offsets=True).offsets[0, 1]
+    found = gradient(rollout, offsets=True).offsets[0, 2]
 
     def value(s):
-        loop.sensor.set_offsets(s * np.eye(6)[1:2])
+        loop.sensor.set_offsets(s * np.eye(6)[2:3])
         return objective(rollout)
 
-    assert central_difference(value, 2e-2) == pytest.approx(found, rel=1e-2)
+    assert central_difference(value, 1e-3) == pytest.approx(found, rel=2e-2)
 
 
 def test_the_interleaved_composite_has_no_tape_and_no_ray_tangents(toy):

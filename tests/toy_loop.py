@@ -69,14 +69,14 @@ class SmoothPolicy(torch.nn.Module):
 
 
 def make_loop(
-    integrator=None, jitter_seed=None, coarse=False
+    integrator=None, jitter_seed=None, coarse=False, fog=-2.0
 ) -> tuple[ClosedLoop, GridField]:
     """Return a loop through a foggy scene with one object, and the object's field.
 
-    A coarse one has few samples a ray.
+    A coarse one has few samples a ray; `fog` is the logarithm of the scene's density.
     """
     wider = 5 if coarse else 1
-    scene = blob(GridLayout(2, 6, 9), 25.0, -2.0, 0.5 * wider, 1)
+    scene = blob(GridLayout(2, 6, 9), 25.0, fog, 0.5 * wider, 1)
     item = blob(GridLayout(3, 6, 12), 1.0, 2.5, 0.08 * wider, 2)
     sensor = FieldSensor(
         PosedField(scene),

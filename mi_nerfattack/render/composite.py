@@ -19,6 +19,8 @@ from mi_nerfattack.render.march import (
     march_derivative,
     pick_rays,
 )
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
 #: Tangents or cotangents of origins and directions of n rays, `mi.Vector3f` each.
 RayTangent = tuple[Any, Any]
@@ -95,6 +97,18 @@ class AbstractComposite(ABC):
             stop: as given to :meth:`render`.
             t_rays: tangents of origins and directions, if they have any.
         """
+
+    def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
+        """Return a way to march the first layer by itself, for :meth:`restore`.
+
+        Args:
+            scene: the first layer; its parameters are constants.
+            stop: transmittance below which a ray ends.
+
+        Returns:
+            None where the rule marches all layers together, or the layer is no field.
+        """
+        del scene, stop
 
     @abstractmethod
     def keep(self, seen: Seen) -> Any:
@@ -178,6 +192,10 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.render`; a layer is the field alone."""
         layers = [_see(item, rays, stop) for item in rays.light(posed)]
         return Seen(depth_composite(layers), layers)
+
+    def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
+        """See :meth:`AbstractComposite.ahead`."""
+        return scene_march(scene, stop) if isinstance(scene, PosedField) else None
 
     def keep(self, seen: Seen) -> Any:
         """See :meth:`AbstractComposite.keep`: the first layer, 20 bytes a ray."""

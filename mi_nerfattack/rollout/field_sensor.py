@@ -80,6 +80,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         self._offsets = np.zeros((len(objects), 6))
         self._wrenches: list[Any] | None = None
         # Tracing these in Python takes longer than running them.
+        self._ahead = self.composite.ahead(scene, stop)
+        self._frozen_make_rays = freeze_method(self._make_rays, self._state)
         self._frozen_render = freeze_method(self._render, self._state)
         self._frozen_restore = freeze_method(self._restore, self._state)
         self._frozen_cotangent = freeze_method(self._cotangent, self._state)
@@ -90,10 +92,13 @@ class FieldSensor(AbstractDifferentiableSensor):
     def observe(self, state: Any, step: int) -> Observation:
         """Render the composite; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)
-        key = dr.opaque(mi.UInt32, step)
-        found = self._frozen_render(_pose(state), key, count)
         self.renders += count
-        return self._observation(count, *found)
+        key = dr.opaque(mi.UInt32, step)
+        if self._ahead is None:
+            found = self._frozen_render(_pose(state), key, count)
+            return self._observation(count, *found)
+        rays = self._frozen_make_rays(_pose(state), key, count)
+        return self.restore(state, step, self._ahead.march(rays))
 
     def keep(self, observation: Observation) -> Any:
         """Keep the scene's march, 20 bytes a pixel (more for other composites)."""

@@ -172,8 +172,7 @@ class _RolloutOp(dr.CustomOp):
         self.parameters = dr.detach(textures), *dr.detach(offsets)
         self.rollout.install(*self.parameters)
         self.evaluation = self.rollout.run(dr.detach(initial))
-        row = dr.detached_t(dr.value_t(type(initial)))
-        return row([self.evaluation.value])
+        return dr.value_t(type(initial))([self.evaluation.value])
 
     def backward(self) -> None:
         self.rollout.install(*self.parameters)
