@@ -27,7 +27,7 @@ START_M = 6.0  # from the route's first point
 SPEED_MS, MAX_HEADING_RATE = 5.0, 1.5
 LATERAL_SD_M = 0.1
 ROUNDING_M = 0.05  # of the objective's absolute value
-RATE = 1e-3  # of Adam; small, so that all iterations drive alike
+RATE = 1e-6  # of Adam; small, so that all iterations drive alike
 MOUNT = CameraMount()
 OBJECT_POSE = Pose.upright((-4.0, -3.4, 0.0), 0.0, 2.0)
 

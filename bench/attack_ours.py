@@ -100,15 +100,17 @@ class OurAttack(AbstractAttack):
         """Count kernels of a further iteration.
 
         Returns:
-            ``compiled``, and launches a control period: ``rollout``, and
-            ``iteration``, whose backward pass is included.
+            ``compiled``, and launches a control period: ``rollout``, those of it over
+            all pixels of all poses (``rollout_over_pixels``; the others are over
+            poses or single numbers), and ``iteration``, with its backward pass.
         """
-        rollout, compiled = self._history(self.drive)
-        iteration, late = self._history(lambda: self.iterate(how))
+        rollout, wide, compiled = self._history(self.drive)
+        iteration, _, late = self._history(lambda: self.iterate(how))
         horizon = self.job.horizon
         return {
             "compiled": compiled + late,
             "rollout": rollout / horizon,
+            "rollout_over_pixels": wide / horizon,
             "iteration": iteration / horizon,
         }
 
@@ -123,13 +125,15 @@ class OurAttack(AbstractAttack):
         simulate(self.loop, self.initial, 1, keep=look)
         return sizes[0]
 
-    def _history(self, action: Callable[[], Any]) -> tuple[int, int]:
-        """Return how many kernels were launched, and how many were compiled."""
+    def _history(self, action: Callable[[], Any]) -> tuple[int, int, int]:
+        """Count kernels: launched, those over all pixels, and compiled."""
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             action()
             history = dr.kernel_history((dr.KernelType.JIT,))
-        return len(history), sum(not entry["cache_hit"] for entry in history)
+        pixels = self.job.width * self.job.height * self.job.poses
+        wide = sum(entry["size"] == pixels for entry in history)
+        return len(history), wide, sum(not entry["cache_hit"] for entry in history)
 
 
 def _timed(action: Callable[[], Any]) -> dict[str, float]:

@@ -75,7 +75,8 @@ def remarks(document: dict[str, Any]) -> list[str]:
             f"{facts['object_share_max']:.1%} at most",
             f"{size}: launches a control period: "
             + ", ".join(
-                f"{way} {some['iteration']:.1f} (rollout {some['rollout']:.1f})"
+                f"{way} {some['iteration']:.1f} (rollout {some['rollout']:.1f}, of "
+                f"them {some['rollout_over_pixels']:.1f} over all pixels)"
                 for way, some in launches.items()
             )
             + f"; compiled after the warm-up: {row['kernels_compiled_after_warmup']}",
@@ -85,7 +86,8 @@ def remarks(document: dict[str, Any]) -> list[str]:
         lines.append(
             f"{size}: {batch['poses']} poses cost {batch['iteration']:.2f} single ones "
             f"(CPU {batch['iteration_cpu']:.2f}; rollout {batch['rollout']:.2f}), "
-            f"in {batch['launches_per_step']['iteration']:.1f} launches a period"
+            f"in {batch['launches_per_step']['rollout_over_pixels']:.1f} launches a "
+            "period over all pixels of all poses"
         )
     for size, row in _sizes(document, "peak_memory_mb_by_horizon"):
         kept = row["kept_backgrounds"]

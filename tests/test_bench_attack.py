@@ -267,7 +267,8 @@ def test_a_quick_benchmark_prints_the_promised_keys(capsys, tmp_path):
     assert kept == pytest.approx(20 * 32 * 16 / 1e6)
     assert row["batch"]["poses"] == 2
     single = row["launches_per_step"]["kept_backgrounds"]
-    assert row["batch"]["launches_per_step"]["rollout"] == single["rollout"]
+    batch = row["batch"]["launches_per_step"]
+    assert batch["rollout_over_pixels"] == single["rollout_over_pixels"]
     assert time_table(document).row_count == 5
     assert memory_table(document).row_count == 6
     assert len(remarks(document)) == 4
