@@ -71,7 +71,9 @@ class _RolloutFunction(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *outputs: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *outputs: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
         _install(ctx.rollout, *ctx.parameters)
         initial, offsets, textures = ctx.like
         found = ctx.rollout.gradient(
