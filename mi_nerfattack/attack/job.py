@@ -15,6 +15,7 @@ from mi_nerfattack.attack.run_folder import RunFolder
 from mi_nerfattack.attack.setup import build_attack
 from mi_nerfattack.attack.stages import OnProgress, Stages
 from mi_nerfattack.attack.world import (
+    Appearance,
     World,
     build_world,
 )
@@ -101,17 +102,17 @@ class Job:
             return effort().about()
 
         stages = Stages(world, folder.drives, self.on_progress, remarks)
-        original = [grid.texture.numpy().copy() for grid in world.fields]
+        original = world.appearance()
         stages.drive_all(world.surrogate, "unperturbed")
         stages.drive_random(world.surrogate)
-        world.set_textures(original)
+        world.show(original)
         attack = self._attack(world, folder, remarks)
-        attacked = attack.best
+        attacked = Appearance(attack.best, attack.best_offsets)
         stages.drive_all(world.surrogate, "gradient")
-        world.set_textures(original)
+        world.show(original)
         stages.drive_all(world.deployment, "unperturbed")
         stages.drive_random(world.deployment)
-        world.set_textures(attacked)
+        world.show(attacked)
         stages.drive_all(world.deployment, "gradient")
         from mi_nerfattack.attack.results import write_results  # it loads the plots
 

@@ -11,7 +11,7 @@ import numpy as np
 from mi_nerfattack import files
 from mi_nerfattack.attack.attribution import attribute, write_attribution
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.world import World, object_footprints
+from mi_nerfattack.attack.world import Appearance, World, object_footprints
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.render.camera import mount_matrix
 from mi_nerfattack.render.march import March
@@ -32,7 +32,7 @@ def write_results(
     world: World,
     drives: list[Drive],
     attack: GradientAttack,
-    textures: dict[str, list[np.ndarray]],
+    looks: dict[str, Appearance],
     scenario_text: str,
     cost: dict[str, Any],
     ignored: list[str],
@@ -45,7 +45,7 @@ def write_results(
         world: what was driven in; its textures are changed.
         drives: all drives.
         attack: the finished attack.
-        textures: per case, one texture an object.
+        looks: how the objects look and where they stand, per case.
         scenario_text: the scenario file.
         cost: of the run, as `metrics.json` holds it.
         ignored: changes between interruption and resumption that were ignored.
@@ -62,6 +62,8 @@ def write_results(
     document = metrics_document(
         scenario.model_dump(mode="json"), scenario.seed, drives, limits, cost
     )
+    if attack.freedom.pose_rate is not None:
+        document["object_poses"] = _poses(world, looks["gradient"])
     if ignored:
         document["ignored_changes"] = ignored
     files.write_json(output / "metrics.json", document)
@@ -70,7 +72,7 @@ def write_results(
     files.write_json(output / "attack.json", history)
     files.make_folder(output / "objects")
     for grid, item, texture in zip(
-        world.fields, scenario.objects, textures["gradient"], strict=True
+        world.fields, scenario.objects, looks["gradient"].textures, strict=True
     ):
         grid.set_parameter("texture", texture)
         save_field(output / "objects" / f"{item.id}.safetensors", grid)
@@ -79,10 +81,26 @@ def write_results(
     found = attribute(attack, names, limit, on_step)
     images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = output / "strip.png"
-    first_person_strip(images["First-person frames"], *_strip(world, drives, textures))
-    _write_frames(output / "frames", world, drives, textures)
+    first_person_strip(images["First-person frames"], *_strip(world, drives, looks))
+    _write_frames(output / "frames", world, drives, looks)
     write_report(output / "report.html", document, images, scenario_text, versions())
     return document
+
+
+def _poses(world: World, look: Appearance) -> dict[str, Any]:
+    """Say where the attacked objects stand, by their ids."""
+    world.show(look)
+    poses = {}
+    for item, posed, offset in zip(
+        world.scenario.objects, world.surrogate.objects, look.offsets, strict=True
+    ):
+        poses[item.id] = {
+            "shift_m": offset[:3].tolist(),
+            "rotation_vector": offset[3:].tolist(),
+            "position_m": posed.placed.translation.tolist(),
+            "rotation": posed.placed.rotation.tolist(),
+        }
+    return poses
 
 
 def _write_plots(
@@ -126,11 +144,11 @@ def _steps(drive: Drive, count: int) -> np.ndarray:
 
 
 def _strip(
-    world: World, drives: list[Drive], textures: dict[str, list[np.ndarray]]
+    world: World, drives: list[Drive], looks: dict[str, Appearance]
 ) -> tuple[dict[str, list[np.ndarray]], list[float]]:
     rows, times = {}, []
     for (environment, case), drive in sorted(_first_drives(drives).items()):
-        world.set_textures(textures[case])
+        world.show(looks[case])
         sensor = world.surrogate if environment == "surrogate" else world.deployment
         steps = _steps(drive, STRIP_FRAMES)
         times = [float(step) * world.scenario.vehicle.dt_s for step in steps]
@@ -146,11 +164,11 @@ def _write_frames(
     folder: Path,
     world: World,
     drives: list[Drive],
-    textures: dict[str, list[np.ndarray]],
+    looks: dict[str, Appearance],
 ) -> None:
     files.make_folder(folder)
     for (environment, case), drive in _first_drives(drives).items():
-        world.set_textures(textures[case])
+        world.show(looks[case])
         for step in _steps(drive, EXR_FRAMES):
             state = drive.states[step]
             layers = (

@@ -29,6 +29,20 @@ from mi_nerfattack.vehicle.route import Route
 
 
 @dataclass(frozen=True, eq=False)
+class Appearance:
+    """How all objects look, and where they stand.
+
+    Attributes:
+        textures: (n_vertices, 3) raw colours an object.
+        offsets: (k, 6), shift (metres) and rotation vector (radians) of each object
+            from where the scenario puts it.
+    """
+
+    textures: list[np.ndarray]
+    offsets: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class World:
     """A scenario brought to life.
 
@@ -65,6 +79,16 @@ class World:
             vehicle.substeps,
             vehicle.delay_steps,
         )
+
+    def appearance(self) -> Appearance:
+        """Return how the objects look, and where they stand."""
+        textures = [grid.texture.numpy().copy() for grid in self.fields]
+        return Appearance(textures, self.surrogate.offsets())
+
+    def show(self, appearance: Appearance) -> None:
+        """Give the objects their textures and places, in both environments."""
+        self.set_textures(appearance.textures)
+        self.surrogate.set_offsets(appearance.offsets)
 
     def set_textures(self, textures: list[np.ndarray]) -> None:
         """Give each object a texture, (n_vertices, 3) raw colours."""
