@@ -47,8 +47,23 @@ class AbstractAdjoint(ABC):
         """
 
 
+class AbstractCostates(AbstractAdjoint):
+    """Solves for the costates, period by period."""
+
+    def gradient(
+        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
+        """See :meth:`AbstractAdjoint.gradient`."""
+        visits = self.visit(loop, drive)
+        return backward(loop, drive, visits, cost.by_states(drive), options)
+
+    @abstractmethod
+    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        """Go through the control periods of a drive, last one first."""
+
+
 @dataclass(frozen=True)
-class Replay(AbstractAdjoint):
+class Replay(AbstractCostates):
     """Keeps states, and the policy's memory where it has one; renders all again.
 
     Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
@@ -62,14 +77,8 @@ class Replay(AbstractAdjoint):
         del loop
         return step.memory
 
-    def gradient(
-        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
-    ) -> Gradient:
-        """See :meth:`AbstractAdjoint.gradient`."""
-        visits = self._visit(loop, drive)
-        return backward(loop, drive, visits, cost.by_states(drive), options)
-
-    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        """See :meth:`AbstractCostates.visit`."""
         for index in reversed(range(drive.horizon)):
             state = drive.states[index]
             seen = loop.sensor.observe(state, index)
@@ -77,7 +86,7 @@ class Replay(AbstractAdjoint):
 
 
 @dataclass(frozen=True)
-class KeptBackgrounds(AbstractAdjoint):
+class KeptBackgrounds(AbstractCostates):
     """Keeps how the scene looked in each frame; renders the objects again.
 
     Memory: what :class:`Replay` keeps and 20 bytes a pixel and period (colour, opacity
@@ -92,14 +101,8 @@ class KeptBackgrounds(AbstractAdjoint):
         """See :meth:`AbstractAdjoint.keep`."""
         return differentiable(loop).keep(step.observation), step.memory
 
-    def gradient(
-        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
-    ) -> Gradient:
-        """See :meth:`AbstractAdjoint.gradient`."""
-        visits = self._visit(loop, drive)
-        return backward(loop, drive, visits, cost.by_states(drive), options)
-
-    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        """See :meth:`AbstractCostates.visit`."""
         sensor = differentiable(loop)
         for index in reversed(range(drive.horizon)):
             kept, memory = drive.kept[index]
@@ -108,7 +111,7 @@ class KeptBackgrounds(AbstractAdjoint):
 
 
 @dataclass(frozen=True)
-class Checkpointed(AbstractAdjoint):
+class Checkpointed(AbstractCostates):
     """Keeps the policy's memory once a segment; drives each segment again.
 
     For policies with a large memory (stacks of frames) and long drives. Memory: states,
@@ -131,14 +134,8 @@ class Checkpointed(AbstractAdjoint):
         del loop
         return step.memory if step.index % self.segment == 0 else None
 
-    def gradient(
-        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
-    ) -> Gradient:
-        """See :meth:`AbstractAdjoint.gradient`."""
-        visits = self._visit(loop, drive)
-        return backward(loop, drive, visits, cost.by_states(drive), options)
-
-    def _visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        """See :meth:`AbstractCostates.visit`."""
         sensor = differentiable(loop)
         starts = range(0, drive.horizon, self.segment)
         for start in reversed(starts):
