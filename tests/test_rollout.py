@@ -139,12 +139,39 @@ def test_gradient_by_the_pose_of_an_object(toy, attached):
 @pytest.mark.parametrize("adjoint", ADJOINTS[1:])
 @pytest.mark.parametrize("horizon", [1, 2, 10])
 def test_adjoints_agree(toy, horizon, adjoint, attached):
-    loop, _ = toy.make_loop(coarse=True)
+    from mi_nerfattack.vehicle.integrators import RK4
+
+    loop, _ = toy.make_loop(RK4(), coarse=True)
+    assert_agree(toy, loop, horizon, attached, adjoint)
+
+
+def test_adjoints_agree_on_objects_in_front_of_each_other(toy):
+    """Two objects that overlap in the image, each with its texture and offset."""
+    from mi_nerfattack.fields import GridLayout
+    from mi_nerfattack.render.posed import Pose, PosedField
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
+    from mi_nerfattack.vehicle.integrators import RK4
+
+    loop, _ = toy.make_loop(RK4(), coarse=True)
+    old = loop.sensor
+    near = toy.blob(GridLayout(2, 6, 9), 0.8, 2.0, 0.2, 3)
+    objects = [*old.objects, PosedField(near, Pose.upright((5.0, 0.3, 0.9), -0.4))]
+    sensor = FieldSensor(old.scene, objects, old.camera, old.mount, stop=0.0)
+    loop = replace(loop, sensor=sensor)
+    seen = sensor.observe(loop.initial(INITIAL), 0).seen
+    both = (seen.layers[1].opacity > 0.1) & (seen.layers[2].opacity > 0.1)
+    assert dr.count(both)[0] > 3
+    for adjoint in ADJOINTS[1:]:
+        assert_agree(toy, loop, 3, True, adjoint)
+
+
+def assert_agree(toy, loop, horizon, attached, adjoint):
     both = np.array([[0.0, 0.35, 0.02], [0.1, -0.2, -0.05]])
     replay = gradient(make_rollout(toy, loop, horizon, attached), both, offsets=True)
     expected = flat(replay)
     rollout = make_rollout(toy, loop, horizon, attached, adjoint)
     for a, b in zip(flat(gradient(rollout, both, offsets=True)), expected, strict=True):
+        assert np.linalg.norm(b) > 0
         assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b)
 
 
@@ -319,6 +346,27 @@ def test_horizon_below_one_and_bad_states_are_refused(toy):
         to_state(np.array([[0.0, np.nan, 0.0]]))
     with pytest.raises(ValueError, match=r"offsets: shape \(2, 6\)"):
         loop.sensor.set_offsets(np.zeros((2, 6)))
+    with pytest.raises(ValueError, match="textures: 2 given for 1 objects"):
+        rollout = make_rollout(toy, loop, 1)
+        rollout.install(2 * loop.sensor.textures(), None)
+
+
+def test_objects_that_share_a_field_are_refused(toy):
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
+
+    old = toy.make_loop()[0].sensor
+    with pytest.raises(ValueError, match="two of them share a field"):
+        FieldSensor(old.scene, 2 * old.objects, old.camera)
+
+
+def test_another_mount_makes_another_image(toy):
+    from mi_nerfattack.render.camera import CameraMount
+
+    loop, _ = toy.make_loop()
+    state = loop.initial(INITIAL)
+    before = loop.sensor.observe(state, 0).image.numpy().copy()
+    loop.sensor.mount = CameraMount(height_m=1.6, forward_m=0.3, pitch_deg=4.0)
+    assert np.abs(loop.sensor.observe(state, 0).image.numpy() - before).max() > 0.01
 
 
 def test_kept_backgrounds_are_not_rendered_again(toy):

@@ -149,10 +149,32 @@ def test_dr_backward_differentiates_the_function(rng):
     dr.enable_grad(textures, start, offsets)
     value = rollout(textures, start, offsets)
     loop.sensor.set_textures([0 * t for t in dr.detach(textures)])  # another's use
+    loop.sensor.set_offsets(OFFSETS)
     dr.backward(3 * value)
     found = [dr.grad(texture).numpy() for texture in textures]
     found += [np.array(dr.grad(start)).T, dr.grad(offsets).numpy()]
     assert_close([value / 3 for value in found], expected)
+
+
+def test_the_function_remembers_where_the_objects_stood():
+    loop, twin = analytic.make_pair(objects=2)
+    loop.sensor.set_offsets(OFFSETS)
+    initial = analytic.random_poses(2)
+    _, expected = expected_gradient(loop, twin, initial, 4, True)
+    rollout = Rollout(loop, Wave(), 4, attached=True)
+    leaves = [
+        torch.tensor(t.numpy(), requires_grad=True) for t in loop.sensor.textures()
+    ]
+    in_torch = torch_rollout(rollout)(leaves, torch.tensor(initial))
+    textures = loop.sensor.textures()
+    dr.enable_grad(textures)
+    value = rollout(textures, to_state(initial))
+    loop.sensor.set_offsets(0 * OFFSETS)  # another's use
+    dr.backward(value)
+    assert_close([dr.grad(texture).numpy() for texture in textures], expected[:2])
+    loop.sensor.set_offsets(0 * OFFSETS)
+    in_torch.backward()
+    assert_close([leaf.grad.numpy() for leaf in leaves], expected[:2])
 
 
 def test_torch_differentiates_the_function():
@@ -214,6 +236,13 @@ def test_the_gradient_comes_apart_by_periods(rng):
     parts = found.attribution
     assert parts.norms.shape == parts.along.shape == (6, 2)
     assert (parts.norms > 0).all()
+    periods = {}
+    recorder = StepRecorder(on_period=periods.__setitem__)
+    rollout.gradient(rollout.run(initial), recorder=recorder)
+    for index, rows in periods.items():
+        norms = [np.linalg.norm(row) for row in rows]
+        np.testing.assert_allclose(norms, parts.norms[index], rtol=1e-6)
+    assert sorted(periods) == list(range(6))
     whole = [
         (gradient.numpy() * direction).sum()
         for gradient, direction in zip(found.textures, directions, strict=True)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import drjit as dr
 import numpy as np
 import torch
 
 from mi_nerfattack.policy.adapter import to_torch
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.loop import to_state
-from mi_nerfattack.rollout.sweep import differentiable
 
 TorchFunction = Callable[..., torch.Tensor]
 
@@ -61,8 +59,9 @@ class _RolloutFunction(torch.autograd.Function):
         *textures: torch.Tensor,
     ) -> torch.Tensor:
         ctx.rollout = rollout
-        ctx.parameters = [_numpy(texture) for texture in textures], _numpy(offsets)
-        _install(rollout, *ctx.parameters)
+        ctx.textures = [_numpy(texture) for texture in textures]
+        rollout.install(ctx.textures, _numpy(offsets))
+        ctx.offsets = rollout.installed()
         ctx.evaluation = rollout.run(to_state(_numpy(initial)))
         if on_run is not None:
             on_run(ctx.evaluation)
@@ -74,7 +73,7 @@ class _RolloutFunction(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *outputs: torch.Tensor
     ) -> tuple[torch.Tensor | None, ...]:
-        _install(ctx.rollout, *ctx.parameters)
+        ctx.rollout.install(ctx.textures, ctx.offsets)  # others may have driven
         initial, offsets, textures = ctx.like
         found = ctx.rollout.gradient(
             ctx.evaluation, offsets is not None, scale=float(outputs[0])
@@ -86,20 +85,6 @@ class _RolloutFunction(torch.autograd.Function):
         pairs = zip(found.textures, textures, strict=True)
         by_textures = [to_torch(value).to(like) for value, like in pairs]
         return None, None, by_initial, by_offsets, *by_textures
-
-
-def _install(rollout: Rollout, textures: list[Any], offsets: Any) -> None:
-    sensor = differentiable(rollout.loop)
-    kinds = [type(texture) for texture in sensor.textures()]
-    pairs = zip(kinds, textures, strict=True)
-    sensor.set_textures([_tensor(kind, texture) for kind, texture in pairs])
-    if offsets is not None:
-        sensor.set_offsets(offsets)
-
-
-def _tensor(kind: Any, values: np.ndarray) -> Any:
-    double = dr.type_v(kind) == dr.VarType.Float64
-    return kind(values.astype(np.float64 if double else np.float32))
 
 
 def _numpy(value: torch.Tensor | None) -> Any:

@@ -68,6 +68,10 @@ class FieldSensor(AbstractDifferentiableSensor):
         for posed in objects:
             if not isinstance(posed.field, GridField):
                 raise TypeError(f"objects: {posed.field.kind}; grid fields are needed")
+        if len({id(posed.field) for posed in objects}) < len(objects):
+            raise ValueError(
+                "objects: two of them share a field, and so a texture; load it twice"
+            )
         self.scene = scene
         self.objects = list(objects)
         self.camera = camera
@@ -200,7 +204,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         # Recordings hold literals of one image's size; a task has none.
         sizes = [dr.width(x) for x in arguments if not isinstance(x, Task)]
         state = [posed.state() for posed in self._fields]
-        return [self.composite, self.stop, sizes, state]
+        view = [self.camera, self.mount, self.jitter_seed]
+        return [self.composite, self.stop, view, sizes, state]
 
     def start_gradient(self, poses: bool = False) -> None:
         """Make every object's packed grid a fresh leaf with gradient zero."""
@@ -282,9 +287,9 @@ class FieldSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.trace`; depth composite only."""
         if not isinstance(self.composite, DepthComposite):
             name = type(self.composite).__name__
-            raise TypeError(f"{name}: cannot be taped; use the depth composite")
+            raise TypeError(f"{name}: cannot be taped; use Replay or depth")
         if not isinstance(self.scene, PosedField):
-            raise TypeError(f"{self.scene.name}: a backdrop cannot be taped")
+            raise TypeError(f"{self.scene.name}: cannot be taped; use Replay")
         count = dr.width(state)
         key = dr.opaque(mi.UInt32, step)
         rays = self._make_rays([state[i] for i in range(3)], key, count)

@@ -147,12 +147,27 @@ class Rollout:
         moved = [] if offsets is None else [offsets]
         return dr.custom(_RolloutOp, _Held(self), list(textures), initial, moved)
 
-    def install(self, textures: Sequence[Any], offsets: Any = None) -> None:
-        """Give the sensor's objects textures and offsets, detached."""
+    def install(self, textures: Sequence[Any], offsets: np.ndarray | None) -> None:
+        """Give the sensor's objects textures and offsets.
+
+        Args:
+            textures: one array (n_vertices, 3) an object.
+            offsets: (k, 6); None leaves them as they are.
+
+        Raises:
+            ValueError: not one texture for each object.
+        """
         sensor = differentiable(self.loop)
-        sensor.set_textures([dr.detach(texture) for texture in textures])
+        count = len(sensor.textures())
+        if len(textures) != count:
+            raise ValueError(f"textures: {len(textures)} given for {count} objects")
+        sensor.set_textures(list(textures))
         if offsets is not None:
-            sensor.set_offsets(np.array(dr.detach(offsets), np.float64))
+            sensor.set_offsets(offsets)
+
+    def installed(self) -> np.ndarray | None:
+        """Return the offsets that the sensor has; None where nothing can move."""
+        return differentiable(self.loop).offsets()
 
 
 class _Held:
@@ -169,18 +184,20 @@ class _RolloutOp(dr.CustomOp):
         self, held: _Held, textures: list[Any], initial: Any, offsets: list[Any]
     ) -> Any:
         self.rollout = held.rollout
-        self.parameters = dr.detach(textures), *dr.detach(offsets)
-        self.rollout.install(*self.parameters)
+        values = [np.array(dr.detach(value), np.float64) for value in offsets]
+        self.offset_type = type(offsets[0]) if offsets else None
+        self.textures = dr.detach(textures)
+        self.rollout.install(self.textures, *(values or [None]))
+        self.offsets = self.rollout.installed()
         self.evaluation = self.rollout.run(dr.detach(initial))
         return dr.value_t(type(initial))([self.evaluation.value])
 
     def backward(self) -> None:
-        self.rollout.install(*self.parameters)
-        moved = len(self.parameters) > 1
+        self.rollout.install(self.textures, self.offsets)  # others may have driven
         scale = float(dr.detach(self.grad_out())[0])
+        moved = self.offset_type is not None
         found = self.rollout.gradient(self.evaluation, offsets=moved, scale=scale)
         self.set_grad_in("textures", found.textures)
         self.set_grad_in("initial", found.initial)
-        if found.offsets is not None:
-            tensor = type(self.parameters[1])
-            self.set_grad_in("offsets", [tensor(found.offsets)])
+        if self.offset_type is not None:
+            self.set_grad_in("offsets", [self.offset_type(found.offsets)])

@@ -85,13 +85,12 @@ class AbstractDifferentiableSensor(AbstractSensor):
     def set_textures(self, textures: list[Any]) -> None:
         """Replace the textures: one array (n_vertices, 3) an object, raw colours."""
 
-    def offsets(self) -> np.ndarray:
+    def offsets(self) -> np.ndarray | None:
         """Return the objects' offsets, as :meth:`set_offsets` takes them.
 
-        Raises:
-            TypeError: the sensor's objects cannot be moved.
+        None where objects cannot be moved.
         """
-        raise TypeError(f"{type(self).__name__}: objects cannot be moved")
+        return None
 
     def set_offsets(self, offsets: np.ndarray) -> None:
         """Move the objects from where they were put.
@@ -103,7 +102,10 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Raises:
             TypeError: the sensor's objects cannot be moved.
         """
-        raise TypeError(f"{type(self).__name__}: objects cannot be moved")
+        raise TypeError(
+            f"{type(self).__name__}: objects cannot be moved; leave offsets out, or "
+            "attack textures alone"
+        )
 
     def offset_gradients(self) -> np.ndarray:
         """Return the accumulated derivatives by the offsets, (k, 6).
@@ -111,7 +113,10 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Raises:
             TypeError: the sensor's objects cannot be moved.
         """
-        raise TypeError(f"{type(self).__name__}: has no derivative by object pose")
+        raise TypeError(
+            f"{type(self).__name__}: has no derivative by object pose; attack textures "
+            "alone"
+        )
 
     def keep(self, observation: Observation) -> Any:
         """Return what a backward pass must have kept to call :meth:`restore`."""
@@ -143,7 +148,7 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Raises:
             TypeError: the sensor has no forward mode.
         """
-        raise TypeError(f"{type(self).__name__}: has no forward-mode derivative")
+        raise TypeError(f"{type(self).__name__}: has no forward mode; use gradient")
 
     def start_tangent(self, textures: list[Any]) -> None:
         """Set the textures' tangents for :meth:`jvp`, each (n_vertices, 3).
@@ -151,7 +156,7 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Raises:
             TypeError: the sensor has no forward mode.
         """
-        raise TypeError(f"{type(self).__name__}: has no forward-mode derivative")
+        raise TypeError(f"{type(self).__name__}: has no forward mode; use gradient")
 
     def trace(
         self,
@@ -174,4 +179,4 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Raises:
             TypeError: the sensor cannot be taped.
         """
-        raise TypeError(f"{type(self).__name__}: cannot be taped")
+        raise TypeError(f"{type(self).__name__}: cannot be taped; use Replay")

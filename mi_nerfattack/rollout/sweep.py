@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,19 +54,28 @@ class StepRecorder:
 
     Args:
         directions: one array (n_vertices, 3) an object, for the inner products.
+        on_period: called with the index of each period, last one first, and its
+            gradients, one array (3 n_vertices,) an object, to do with as one likes.
     """
 
-    def __init__(self, directions: Sequence[Any] = ()) -> None:
+    def __init__(
+        self,
+        directions: Sequence[Any] = (),
+        on_period: Callable[[int, list[np.ndarray]], None] | None = None,
+    ) -> None:
+        self.on_period = on_period
         self.directions = [np.asarray(d, np.float32).ravel() for d in directions]
         self._before: list[np.ndarray] = []
         self._rows: list[tuple[list[float], list[float]]] = []
 
-    def add(self, textures: list[Any]) -> None:
+    def add(self, index: int, textures: list[Any]) -> None:
         """Record one period from the sums so far; periods come last one first."""
         sums = [t.numpy().ravel().copy() for t in textures]
         before = self._before or [np.zeros_like(value) for value in sums]
         parts = [value - old for value, old in zip(sums, before, strict=True)]
         self._before = sums
+        if self.on_period is not None:
+            self.on_period(index, parts)
         norms = [float(np.linalg.norm(part)) for part in parts]
         pairs = zip(parts, self.directions, strict=False)
         self._rows.append((norms, [float(a @ b) for a, b in pairs]))
@@ -171,7 +180,7 @@ def backward(
         d_before = sweep.back(step, d_after)
         costates.append(-np.array(d_after).T)
         if options.recorder is not None:
-            options.recorder.add(sensor.texture_gradients())
+            options.recorder.add(step.index, sensor.texture_gradients())
         if options.on_step is not None:
             options.on_step(step.index)
     textures = sensor.texture_gradients()
@@ -231,7 +240,10 @@ def differentiable(loop: ClosedLoop) -> AbstractDifferentiableSensor:
         TypeError: sensor or policy have no derivatives.
     """
     if not isinstance(loop.sensor, AbstractDifferentiableSensor):
-        raise TypeError(f"{type(loop.sensor).__name__}: has no derivatives")
+        raise TypeError(
+            f"{type(loop.sensor).__name__}: has no derivatives; use a FieldSensor, "
+            "or use a gradient-free method"
+        )
     if not loop.policy.differentiable:
         raise TypeError(
             f"{type(loop.policy).__name__}: a black box has no derivatives; use a "

@@ -46,6 +46,14 @@ class FullTape(AbstractAdjoint):
             name = type(loop.policy).__name__
             raise TypeError(f"FullTape: the memory of {name} is not taped; use Replay")
         tape = _Tape(loop, drive, options)
+        try:
+            return self._record(tape, drive, cost, options)
+        finally:  # takes the sensor off the tape
+            sensor.set_textures([dr.detach(texture) for texture in tape.textures])
+
+    def _record(
+        self, tape: _Tape, drive: Trajectory, cost: Cost, options: Options
+    ) -> Gradient:
         for step in range(drive.horizon):
             if options.on_step is not None:
                 options.on_step(step)
@@ -54,7 +62,6 @@ class FullTape(AbstractAdjoint):
             _stack(tape.states[1:]), drive.count, drive.horizon, drive.dt
         )
         dr.backward(cost.scale * cost.attached(history), flags=dr.ADFlag.ClearEdges)
-        sensor.set_textures([dr.detach(texture) for texture in tape.textures])
         return Gradient(
             [dr.grad(texture) for texture in tape.textures],
             np.array(dr.grad(tape.offsets), np.float64) if options.offsets else None,

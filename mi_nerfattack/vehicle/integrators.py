@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import drjit as dr
 
@@ -25,8 +25,6 @@ class AbstractIntegrator(ABC):
     `explicit` says that `dG/dx` is the identity, in which case the adjoint has no
     system to solve.
     """
-
-    explicit: ClassVar[bool]
 
     @abstractmethod
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
@@ -64,8 +62,6 @@ class AbstractIntegrator(ABC):
 class ExplicitEuler(AbstractIntegrator):
     """`x + dt f(x, u)`: first order, one evaluation. Cheapest; cuts every arc."""
 
-    explicit: ClassVar[bool] = True
-
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
         """Advance (m, n) by dt seconds."""
         return x + dt * dynamics.derivative(x, u)
@@ -80,8 +76,6 @@ class ExplicitEuler(AbstractIntegrator):
 @dataclass(frozen=True)
 class RK4(AbstractIntegrator):
     """Classical Runge-Kutta method: fourth order, four evaluations."""
-
-    explicit: ClassVar[bool] = True
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
         """Advance (m, n) by dt seconds."""
@@ -110,7 +104,6 @@ class ImplicitMidpoint(AbstractIntegrator):
         iterations: Newton iterations; the error squares with each.
     """
 
-    explicit: ClassVar[bool] = False
     iterations: int = 6
 
     def __post_init__(self) -> None:
