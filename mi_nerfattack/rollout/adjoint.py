@@ -69,7 +69,7 @@ class Replay(AbstractCostates):
     Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
     independent of the horizon. Time: a backward pass renders every frame once more,
     then costs one product with the policy's derivative and one march derivative a
-    period; forward and backward together about 2.3 forward passes.
+    period; forward and backward together about 2.2 forward passes.
     """
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
@@ -116,7 +116,7 @@ class Checkpointed(AbstractCostates):
 
     For policies with a large memory (stacks of frames) and long drives. Memory: states,
     the policy's memory once every `segment` periods, and what :class:`KeptBackgrounds`
-    keeps for one segment; least near ``segment = sqrt(T)``. Time: as Replay, and the
+    keeps, that memory included, for one segment; least near ``segment = sqrt(T)``. Time: as Replay, and the
     policy is evaluated once more.
 
     Args:
