@@ -275,20 +275,9 @@ def march_derivative(  # noqa: D417  one entry describes seven
         the tangent of the march (forward mode; zeros otherwise), and the objective's
         derivative by origin and direction (3, n) (backward mode).
     """
+    rays = Rays(origin, direction, t_max, jitter, active)
     with dr.suspend_grad(), private_gradients():
-        return _march_derivative(
-            mode,
-            posed,
-            origin,
-            direction,
-            t_max,
-            jitter,
-            active,
-            primal,
-            cotangent,
-            stop,
-            t_rays,
-        )
+        return _march_derivative(mode, posed, rays, primal, cotangent, stop, t_rays)
 
 
 @dr.syntax
@@ -327,11 +316,7 @@ def _march(
 def _march_derivative(
     mode: dr.ADMode,
     posed: PosedField,
-    origin: mi.Point3f,
-    direction: mi.Vector3f,
-    t_max: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
+    rays: Rays,
     primal: March,
     cotangent: March,
     stop: float,
@@ -339,10 +324,11 @@ def _march_derivative(
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     backward = mode == dr.ADMode.Backward
     moving = t_rays is not None
-    o, d = posed.to_local(origin, direction)
-    near, far = posed.interval(o, d, t_max)
+    o, d = posed.to_local(rays.origin, rays.direction)
+    near, far = posed.interval(o, d, rays.t_max)
     heading = dr.normalize(d)
-    active = mi.Bool(active) & (near < far)
+    jitter = rays.jitter
+    active = mi.Bool(rays.active) & (near < far)
 
     index = dr.floor(posed.lattice_index(near))
     tau = mi.Float(0)
