@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch.autograd import forward_ad
 
-from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.checks import (
     check_hidden,
     check_images,
@@ -19,6 +19,7 @@ from mi_nerfattack.policy.checks import (
     steering,
 )
 from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal
+from mi_nerfattack.policy.module_call import call_module
 from mi_nerfattack.policy.preprocess import Preprocess
 from mi_nerfattack.policy.tensors import to_row, to_tensor, to_torch
 
@@ -135,9 +136,8 @@ class TorchPolicy(AbstractPolicy):
     """Policy given by a torch module; memory is shared, not copied, both ways.
 
     The module is called as ``module(image, *goal, *hidden)`` and returns the control,
-    or a tuple of the control and the hidden states for the next image; it changes
-    nothing in place. The memory is the frame stack, where there is one, and the
-    hidden states.
+    or a tuple of the control and the hidden states for the next image. The memory is
+    the frame stack, where there is one, and the hidden states.
 
     Args:
         module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
@@ -271,7 +271,7 @@ class TorchPolicy(AbstractPolicy):
         network_image, past = self.preprocess.stack(planes, past)
         hidden = memory[1:] if self.preprocess.history else memory
         goals = self.goal.arguments(expand_goals(goal, image), image)
-        outputs = self._call(network_image, *goals, *hidden)
+        outputs = call_module(self.module, self.name, network_image, *goals, *hidden)
         control = steering(outputs[0], len(image), self.output, self.name)
         after = outputs[1:]
         shapes = [tuple(part.shape) for part in after]
@@ -283,23 +283,6 @@ class TorchPolicy(AbstractPolicy):
             )
         stack = (past,) if self.preprocess.history else ()
         return self.control_scale * control, (*stack, *after)
-
-    def _call(self, image: torch.Tensor, *rest: torch.Tensor) -> tuple[Any, ...]:
-        """Call the module; what goes wrong in it is told with the input's shape."""
-        try:
-            result = self.module(image, *rest)
-        except (InputError, torch.OutOfMemoryError):
-            raise
-        except (RuntimeError, TypeError, ValueError, IndexError) as err:
-            if is_interrupt(err):
-                raise
-            shapes = [tuple(part.shape) for part in (image, *rest)]
-            raise InputError(
-                f"{self.name}: fails on an input of shape {shapes[0]}, with goal and "
-                f"hidden states {shapes[1:]}: {err}; declare policy.preprocess, goal "
-                "and recurrent as the network needs them"
-            ) from err
-        return tuple(result) if isinstance(result, (tuple, list)) else (result,)
 
     def _plain_layers(self) -> AbstractContextManager[None]:
         """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.
