@@ -1,4 +1,4 @@
-"""Attacks on where objects stand."""
+"""Attacks on where objects stand, from several initial poses."""
 
 from __future__ import annotations
 
@@ -76,3 +76,24 @@ def test_nothing_to_change_is_refused():
         Freedom(None, None)
     with pytest.raises(InputError, match="axes: .'w'.; some of x, y"):
         Freedom(None, 0.1, ("w",))
+
+
+def test_costs_of_the_poses_are_kept():
+    """Each entry is that of a drive of its own; the objective is their mean."""
+    loop, _ = toy.make_loop()
+    rollout = Rollout(loop, StageSum(toy.square_error), 4)
+    poses = np.array([[0.0, 0.35, 0.02], [0.5, -0.2, 0.0]])
+    attack = GradientAttack(rollout, toy.ROUTE, loop.initial(poses))
+    single = [rollout.run(loop.initial(pose[None])).value for pose in poses]
+    record = attack.step()
+    assert record.costs == pytest.approx(single, rel=1e-5)
+    assert record.objective == pytest.approx(np.mean(record.costs))
+    attack.step()
+    resumed = GradientAttack(rollout, toy.ROUTE, loop.initial(poses))
+    resumed.load_tensors(attack.tensors())
+    assert resumed.history == attack.history
+    longer = GradientAttack(rollout, toy.ROUTE, loop.initial(poses[:1]))
+    longer.go_on_from(attack.tensors())
+    longer.judge_best()
+    longer.step()
+    assert [len(entry.costs) for entry in longer.history] == [2, 2, 1]

@@ -14,7 +14,7 @@ from mi_nerfattack.determinism import random_states, restore_random_states
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.resumable import Kept, read_kept, write_kept
 
-FORMAT = "mi_nerfattack attack checkpoint 2"
+FORMAT = "mi_nerfattack attack checkpoint 3"
 REMEDY = (
     "resume with the scenario.toml of the run folder and the same files and versions, "
     "start a new run folder, or ignore this (--force)"
@@ -77,6 +77,9 @@ class CheckpointFile:
     def restore(self, attack: GradientAttack) -> None:
         """Give an attack the state that was read, which is forgotten here.
 
+        Where differences are ignored, the best parameters are still to be judged:
+        :meth:`GradientAttack.judge_best`.
+
         Raises:
             InputError: an entry is missing, or does not fit the objects.
         """
@@ -84,7 +87,10 @@ class CheckpointFile:
         assert kept is not None, "read() has found a checkpoint"
         self._check_shapes(attack.tensors(), kept.tensors)
         try:
-            attack.load_tensors(kept.tensors)
+            if kept.ignored:
+                attack.go_on_from(kept.tensors)
+            else:
+                attack.load_tensors(kept.tensors)
             restore_random_states(kept.tensors)
         except KeyError as err:
             raise InputError(

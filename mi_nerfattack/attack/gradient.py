@@ -14,8 +14,8 @@ from drjit.opt import Adam
 from mi_nerfattack.attack.parameters import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.cost import Cost
-from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.loop import Trajectory, simulate
+from mi_nerfattack.rollout.function import Evaluation, Rollout
+from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route import Route
 
@@ -31,12 +31,14 @@ class IterationRecord:
         objective: the cost that is minimised, reduced over the poses.
         cross_track_mean_m: mean |e| over steps and poses, metres.
         cross_track_max_m: largest |e|, metres.
+        costs: of each pose, before their reduction.
     """
 
     iteration: int
     objective: float
     cross_track_mean_m: float
     cross_track_max_m: float
+    costs: tuple[float, ...]
 
 
 class GradientAttack:
@@ -59,6 +61,7 @@ class GradientAttack:
         best: textures of the iteration with the least objective.
         best_offsets: (k, 6) object offsets of the same.
         best_mean_m: mean |e| of the same, metres.
+        whole: False while an update is half done, when the state must not be kept.
     """
 
     def __init__(
@@ -81,9 +84,9 @@ class GradientAttack:
         if self.freedom.texture_rate is not None:
             for i, texture in enumerate(self.sensor.textures()):
                 self.optimiser[str(i)] = texture
-        self.best_offsets = np.zeros((len(self.best), 6))
+        self.best_offsets = self._offsets()
+        self.whole = True
         if self.freedom.pose_rate is not None:
-            self.best_offsets = self.sensor.offsets()
             self.optimiser[OFFSETS] = _tensor(self.best_offsets)
             self.optimiser.set_learning_rate({OFFSETS: self.freedom.pose_rate})
 
@@ -103,28 +106,51 @@ class GradientAttack:
         """
         self._install()
         evaluation = self.rollout.run(self.initial, on_step)
-        record = self._record(evaluation.trajectory, evaluation.value)
+        record = self._record(evaluation)
         moved = self.freedom.pose_rate is not None
         gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
-        self._update(gradient, record.iteration)
+        values = self._values(gradient)
+        self.whole = False
+        self._update(values)
         self.history.append(record)
+        self.whole = True
         return record
 
     def measure(self) -> IterationRecord:
         """Drive with the present parameters, so that the last update counts too."""
         self._install()
-        rollout = self.rollout
-        drive = simulate(rollout.loop, self.initial, rollout.horizon)
-        value, _ = Cost(rollout.objective, rollout.reduction).of(drive)
-        return self._record(drive, value)
+        return self._record(self._drive())
+
+    @property
+    def best_is_judged(self) -> bool:
+        """Whether the best parameters were measured by this attack's objective."""
+        return not self.history or np.isfinite(self.best_objective)
+
+    def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
+        """Measure the best parameters anew; costs one drive.
+
+        Args:
+            on_step: called after each control period.
+        """
+        self.restore_best()
+        self.best_objective = np.inf
+        self._record(self._drive(on_step))
 
     def restore_best(self) -> None:
         """Give the objects the parameters of the iteration with the least objective."""
         self.sensor.set_textures(self.best)
-        if self.freedom.pose_rate is not None:
+        if self.sensor.offsets() is not None:
             self.sensor.set_offsets(self.best_offsets)
 
-    def _update(self, gradient: Gradient, iteration: int) -> None:
+    def _drive(self, on_step: Callable[[int], None] | None = None) -> Evaluation:
+        """Drive without keeping what a derivative needs."""
+        rollout = self.rollout
+        drive = simulate(rollout.loop, self.initial, rollout.horizon, on_step)
+        value, costs = Cost(rollout.objective, rollout.reduction).of(drive)
+        return Evaluation(value, costs, drive)
+
+    def _values(self, gradient: Gradient) -> dict[str, Any]:
+        """Return the gradient by the optimiser's keys, checked."""
         values = {str(i): value for i, value in enumerate(gradient.textures)}
         if gradient.offsets is not None:
             values[OFFSETS] = _tensor(gradient.offsets * self.freedom.mask)
@@ -133,9 +159,12 @@ class GradientAttack:
             if not np.isfinite(value.numpy()).all():
                 what = "the poses" if key == OFFSETS else f"object {key}"
                 raise InputError(
-                    f"attack iteration {iteration}: the gradient of {what} is not "
+                    f"attack iteration {self.iteration}: the gradient of {what} is not "
                     "finite; check policy and field for NaN"
                 )
+        return values
+
+    def _update(self, values: dict[str, Any]) -> None:
         for key, value in values.items():
             dr.set_grad(self.optimiser[key], value)
         self.optimiser.step()
@@ -155,11 +184,20 @@ class GradientAttack:
     def _textures(self) -> list[np.ndarray]:
         return [texture.numpy().copy() for texture in self.sensor.textures()]
 
+    def _offsets(self) -> np.ndarray:
+        """Return the objects' offsets, (k, 6); zeros where they cannot be moved."""
+        offsets = self.sensor.offsets()
+        return np.zeros((len(self.best), 6)) if offsets is None else offsets
+
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
-        rows = [list(asdict(record).values()) for record in self.history]
+        rows = [list(asdict(record).values())[:4] for record in self.history]
+        costs = [cost for record in self.history for cost in record.costs]
+        counts = [len(record.costs) for record in self.history]
         result: dict[str, np.ndarray] = {
             "history": np.array(rows, np.float64).reshape(-1, 4),
+            "costs": np.array(costs, np.float64),  # of all iterations, end to end
+            "cost_counts": np.array(counts, np.int64),
             "best_mean_m": np.array([self.best_mean_m]),
             "best_objective": np.array([self.best_objective]),
             "best_offsets": self.best_offsets,
@@ -175,41 +213,74 @@ class GradientAttack:
         return result
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
-        """Take over a state written by :meth:`tensors`.
+        """Take over a state written by :meth:`tensors`, and install its best.
 
         Raises:
             KeyError: an entry is missing.
         """
-        self.history = [
-            IterationRecord(int(row[0]), *map(float, row[1:]))
-            for row in tensors["history"]
-        ]
+        self._load_history(tensors)
         self.best_mean_m = float(tensors["best_mean_m"][0])
         self.best_objective = float(tensors["best_objective"][0])
         self.best_offsets = np.array(tensors["best_offsets"])
         self.best = [np.array(tensors[f"best.{i}"]) for i in range(len(self.best))]
         for key in list(self.optimiser):
-            self.optimiser[key] = mi.TensorXf(np.array(tensors[f"texture.{key}"]))
-            value, promoted, rate, extra = self.optimiser.state[key]
-            if f"first.{key}" in tensors:
-                count = type(extra[0])([int(tensors[f"count.{key}"][0])])
-                first = _like(extra[1], value, tensors[f"first.{key}"])
-                second = _like(extra[2], value, tensors[f"second.{key}"])
-                extra = (count, first, second, extra[3])
-            self.optimiser.state[key] = (value, promoted, rate, extra)
+            self._load_parameter(key, tensors)
+        self.restore_best()
 
-    def _record(self, drive: Trajectory, value: float) -> IterationRecord:
+    def go_on_from(self, tensors: dict[str, np.ndarray]) -> None:
+        """Take over the state of an attack that differed from this one.
+
+        Parameters that it did not change start as they are, those that this one may
+        not change stay as they are. The best ones are not judged yet: call
+        :meth:`judge_best` before the next iteration.
+
+        Args:
+            tensors: its :meth:`tensors`.
+
+        Raises:
+            KeyError: an entry is missing.
+        """
+        self._load_history(tensors)
+        self.best_objective = np.inf
+        for key in [key for key in self.optimiser if f"texture.{key}" in tensors]:
+            if key == OFFSETS:
+                names = ("best_offsets", f"texture.{OFFSETS}")
+                near = {name: self.freedom.project(tensors[name]) for name in names}
+                self.best_offsets = near["best_offsets"]
+                self._load_parameter(key, {**tensors, **near})
+            else:
+                self.best[int(key)] = np.array(tensors[f"best.{key}"])
+                self._load_parameter(key, tensors)
+
+    def _load_history(self, tensors: dict[str, np.ndarray]) -> None:
+        ends = np.cumsum(tensors["cost_counts"])
+        costs = np.split(tensors["costs"], ends[:-1])
+        self.history = [
+            IterationRecord(int(row[0]), *map(float, row[1:]), tuple(map(float, part)))
+            for row, part in zip(tensors["history"], costs, strict=False)
+        ]
+
+    def _load_parameter(self, key: str, tensors: dict[str, np.ndarray]) -> None:
+        self.optimiser[key] = _tensor(tensors[f"texture.{key}"])
+        value, promoted, rate, extra = self.optimiser.state[key]
+        if f"first.{key}" in tensors:
+            count = type(extra[0])([int(tensors[f"count.{key}"][0])])
+            first = _like(extra[1], value, tensors[f"first.{key}"])
+            second = _like(extra[2], value, tensors[f"second.{key}"])
+            extra = (count, first, second, extra[3])
+        self.optimiser.state[key] = (value, promoted, rate, extra)
+
+    def _record(self, seen: Evaluation) -> IterationRecord:
         """Judge a drive; keep the present parameters if they are the best."""
-        states = drive.states_numpy()[:, 1:]
+        states = seen.trajectory.states_numpy()[:, 1:]
         error = self.route.cross_track_numpy(states.reshape(-1, states.shape[2]))
         error = np.abs(error)
-        mean = float(error.mean())
+        mean, value = float(error.mean()), seen.value
         if value < self.best_objective:
+            self.best, self.best_offsets = self._textures(), self._offsets()
             self.best_objective, self.best_mean_m = value, mean
-            self.best = self._textures()
-            if self.freedom.pose_rate is not None:
-                self.best_offsets = self.sensor.offsets()
-        return IterationRecord(self.iteration, value, mean, float(error.max()))
+        costs = tuple(map(float, seen.costs))
+        return IterationRecord(self.iteration, value, mean, float(error.max()), costs)
 
 
 def _tensor(value: np.ndarray) -> Any:

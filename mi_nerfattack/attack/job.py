@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,7 @@ from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.run_folder import RunFolder
 from mi_nerfattack.attack.setup import build_attack
 from mi_nerfattack.attack.stages import OnProgress, Stages
-from mi_nerfattack.attack.world import (
-    Appearance,
-    World,
-    build_world,
-)
+from mi_nerfattack.attack.world import World, build_world
 from mi_nerfattack.determinism import deterministic
 from mi_nerfattack.interrupts import held_interrupts
 from mi_nerfattack.report.metrics import departure_limit
@@ -54,7 +50,6 @@ class Job:
     output: Path
     on_progress: OnProgress = _quiet
     on_notice: OnNotice = _quiet
-    _at_rest: bool = field(default=True, init=False, repr=False)
 
     def run(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
         """Do the whole job and write the run folder.
@@ -107,7 +102,7 @@ class Job:
         stages.drive_random(world.surrogate)
         world.show(original)
         attack = self._attack(world, folder, remarks)
-        attacked = Appearance(attack.best, attack.best_offsets)
+        attacked = world.appearance()
         stages.drive_all(world.surrogate, "gradient")
         world.show(original)
         stages.drive_all(world.deployment, "unperturbed")
@@ -125,12 +120,12 @@ class Job:
             self.text,
             asdict(effort()),
             folder.checkpoint.ignored,
-            self._counter("surrogate: attribution", 3 * self.scenario.drive.horizon),
+            self._counter("surrogate: attribution", 3),
         )
 
-    def _counter(self, stage: str, total: int) -> Callable[[int], None]:
-        """Report the progress of a stage each time that the result is called."""
-        done = 0
+    def _counter(self, stage: str, sweeps: int) -> Callable[[int], None]:
+        """Report the progress of some sweeps through a drive, step by step."""
+        done, total = 0, sweeps * self.scenario.drive.horizon
 
         def on_step(step: int) -> None:
             nonlocal done
@@ -148,6 +143,9 @@ class Job:
         section, checkpoint = self.scenario.attack, folder.checkpoint
         if checkpoint.found:
             checkpoint.restore(attack)
+        if not attack.best_is_judged:
+            attack.judge_best(self._counter("surrogate: best so far", 1))
+            checkpoint.save(attack, remarks())
         try:
             with held_interrupts() as check:
                 while attack.iteration < section.iterations:
@@ -157,7 +155,7 @@ class Job:
                     check()
         finally:
             done = attack.iteration > checkpoint.iteration
-            if done and self._at_rest and not checkpoint.failed:
+            if done and attack.whole and not checkpoint.failed:
                 checkpoint.save(attack, remarks())
         attack.measure()
         attack.restore_best()
@@ -176,11 +174,7 @@ class Job:
             nonlocal done
             del step
             done += 1
-            self._at_rest = True  # between time steps nothing is half updated
             self.on_progress("surrogate: attack", done, total, remark)
             check()
-            self._at_rest = False
 
-        self._at_rest = False
         attack.step(on_step)
-        self._at_rest = True
