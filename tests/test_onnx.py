@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("onnx", reason="the extra onnx is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 
 from onnx import helper  # noqa: E402
 from onnx_models import FLOAT, INT64, check, model  # noqa: E402
+
+from mi_nerfattack.errors import InputError  # noqa: E402
+from mi_nerfattack.policy.onnx_network import OnnxNetwork  # noqa: E402
 
 
 def single(operator, x, constants=(), opset=17, extra=(), **attributes):
@@ -159,6 +163,67 @@ def test_constant_inputs(operator, constants, attributes, rng):
     count = 1 if operator in ("Squeeze", "Expand") else 2
     x = rng.normal(size=(count, 3, 5, 7)).astype("f4")
     single(operator, x, constants, **attributes)
+
+
+HALF = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+FLOOR = {
+    "mode": "nearest",
+    "coordinate_transformation_mode": "asymmetric",
+    "nearest_mode": "floor",
+}
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.3, 0.7, 1.7, 3.0])
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        HALF,
+        FLOOR,
+        HALF | {"coordinate_transformation_mode": "align_corners"},
+        HALF | {"coordinate_transformation_mode": "asymmetric"},
+        HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
+    ],
+)
+def test_resize_by_scales_that_do_not_divide(attributes, scale, rng):
+    """The scale is used as given, and 10 times float32(0.7) is 7 in float32."""
+    x = rng.normal(size=(2, 3, 10, 33)).astype("f4")
+    scales = np.array([1, 1, scale, 0.9 * scale], "f4")
+    single("Resize", x, [None, scales], **attributes)
+
+
+@pytest.mark.parametrize("mode", ["nearest", "linear"])
+def test_upsample_reads_at_asymmetric_places(mode, rng):
+    x = rng.normal(size=(1, 2, 5, 7)).astype("f4")
+    scales = np.array([1, 1, 2, 3], "f4")
+    single("Upsample", x, [scales], opset=9, mode=mode)
+
+
+@pytest.mark.parametrize(
+    ("constants", "opset", "attributes", "message"),
+    [
+        (
+            [None, None, integers(1, 1, 1, 4)],
+            17,
+            HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
+            "Resize: to a size of 1 by pytorch_half_pixel",
+        ),
+        (
+            [None, None, integers(1, 1, 3, 4)],
+            18,
+            HALF | {"keep_aspect_ratio_policy": "not_larger"},
+            "keep_aspect_ratio_policy = 'not_larger' is not supported",
+        ),
+        ([np.ones(4, "f4")], 10, {}, "operator set 10.*with operator set 11"),
+    ],
+)
+def test_resizing_that_is_refused(constants, opset, attributes, message):
+    names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
+    values = {n: c for n, c in zip(names, constants, strict=True) if n}
+    node = helper.make_node("Resize", ["x", *names], ["y"], **attributes)
+    shape = [1, 1, 5, 7]
+    made = model([node], {"x": (FLOAT, shape)}, {"y": (FLOAT, None)}, values, opset)
+    with pytest.raises(InputError, match=message):
+        OnnxNetwork(made, "net.onnx")(torch.zeros(shape))
 
 
 @pytest.mark.parametrize(

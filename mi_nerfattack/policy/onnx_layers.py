@@ -1,4 +1,4 @@
-"""ONNX operators with weights or windows: convolution, pooling, resizing, padding.
+"""ONNX operators with weights or windows: convolution, pooling, padding.
 
 Source: the operators' specification at onnx.ai/onnx/operators.
 """
@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.onnx_call import Call, Operator
+from mi_nerfattack.policy.onnx_resize import resize
 
 _CONVOLUTIONS = {1: functional.conv1d, 2: functional.conv2d, 3: functional.conv3d}
 _MAX_POOLS = {1: functional.max_pool1d, 2: functional.max_pool2d}
@@ -99,37 +100,6 @@ def pad(call: Call) -> torch.Tensor:
     while len(flat) > 2 and flat[-2:] == [0, 0]:  # torch pads the last axes alone
         flat = flat[:-2]
     return functional.pad(call.x, flat, _PAD_MODES[mode])
-
-
-def resize(call: Call) -> torch.Tensor:
-    """Resize of the last two axes: nearest (asymmetric, floor) and linear."""
-    mode = call.attribute("mode", "nearest")
-    rule = call.attribute("coordinate_transformation_mode", "half_pixel")
-    call.only("antialias", 0)
-    call.only("axes")
-    last = len(call.inputs) - 1
-    sizes = call.integers(3, "sizes") if last >= 3 else None
-    if sizes is None:
-        index = 1 if call.operator == "Upsample" else 2
-        scales = call.need(index).flatten().tolist()
-        sizes = [int(s * k) for s, k in zip(call.x.shape, scales, strict=True)]
-    if len(sizes) != 4 or sizes[:2] != list(call.x.shape[:2]):
-        raise InputError(f"{call.operator}: to {sizes}; only height and width change")
-    if mode == "linear" and rule in ("half_pixel", "pytorch_half_pixel"):
-        return functional.interpolate(call.x, sizes[2:], mode="bilinear")
-    if mode == "linear" and rule == "align_corners":
-        return functional.interpolate(
-            call.x, sizes[2:], mode="bilinear", align_corners=True
-        )
-    rounding = call.attribute("nearest_mode", "round_prefer_floor")
-    floor = call.operator == "Upsample" or (rule, rounding) == ("asymmetric", "floor")
-    if mode == "nearest" and floor:
-        return functional.interpolate(call.x, sizes[2:], mode="nearest")
-    raise InputError(
-        f"{call.operator}: mode {mode!r} with coordinates {rule!r} and nearest_mode "
-        f"{rounding!r}; linear by half_pixel or align_corners, and nearest by "
-        "asymmetric and floor are supported"
-    )
 
 
 def _window(call: Call) -> tuple[list[int], list[int], int]:
