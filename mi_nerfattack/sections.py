@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, NoReturn
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -15,6 +16,7 @@ Whole = Annotated[int, Field(ge=0)]
 Part = Annotated[float, Field(ge=0, lt=1)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Matrix = tuple[Row, Row, Row, Row]
+Triple = tuple[Finite, Finite, Finite]
 
 
 class Section(BaseModel):
@@ -147,8 +149,8 @@ class VehicleSection(Section):
     @model_validator(mode="after")
     def _check_keys(self) -> Any:
         """Refuse keys that do not go together, and steps that oscillate."""
-        for key in _CUSTOM_KEYS:
-            _check_pair(self, key, "model", ("custom",))
+        for key, models in _MODEL_KEYS.items():
+            _check_pair(self, key, "model", models)
         if len(self.rest_state) not in (0, self.state_size - 3):
             _refuse(
                 "rest_state",
@@ -167,8 +169,22 @@ class VehicleSection(Section):
         return self
 
 
-#: Keys of a vehicle that belong to a function of the user's own.
-_CUSTOM_KEYS = ("function", "framework", "state_size", "control_limit", "rest_state")
+#: Models that each key of a vehicle belongs to; the others belong to all.
+_MODEL_KEYS = {
+    "speed_ms": ("dubins", "ackermann", "ackermann_rate", "bicycle"),
+    "wheelbase_m": ("ackermann", "ackermann_rate"),
+    "front_axle_m": ("bicycle",),
+    "rear_axle_m": ("bicycle",),
+    "max_heading_rate": ("dubins",),
+    "max_steer_deg": ("ackermann", "ackermann_rate", "bicycle"),
+    "max_steer_rate_deg_s": ("ackermann_rate",),
+    "steer_time_s": ("ackermann_rate",),
+    "function": ("custom",),
+    "framework": ("custom",),
+    "state_size": ("custom",),
+    "control_limit": ("custom",),
+    "rest_state": ("custom",),
+}
 #: Ratio of step and time constant at which the integration of a lag diverges.
 _STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 
@@ -180,6 +196,26 @@ class DriveSection(Section):
     runs: Count = 4  # drives of the unperturbed and the attacked case
     lateral_sd_m: NonNegative = 0.1
     heading_sd_deg: NonNegative = 0.5
+    covariance: tuple[Triple, Triple, Triple] | None = None  # see _check_covariance
+
+    @model_validator(mode="after")
+    def _check_covariance(self) -> Any:
+        """Refuse what is no covariance of metres along, metres to the left, radians."""
+        if self.covariance is None:
+            return self
+        for key in ("lateral_sd_m", "heading_sd_deg"):
+            if getattr(self, key) != type(self).model_fields[key].default:
+                _refuse("covariance", f"stands beside {key}; give one of them")
+        matrix = np.array(self.covariance)
+        if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
+            _refuse("covariance", "is not symmetric; entry (i, j) must equal (j, i)")
+        least, *_, most = np.linalg.eigvalsh(matrix)
+        if least < -1e-12 * max(most, 0.0) or most < 0:
+            _refuse(
+                "covariance",
+                f"has the eigenvalue {least:.3g}; a covariance has none below 0",
+            )
+        return self
 
 
 class AttackSection(Section):
@@ -201,6 +237,20 @@ class AttackSection(Section):
     jitter: bool = False
     checkpoint_every: Count = 10
     deterministic: bool = False  # equal bits from run to run, on one thread
+
+    @model_validator(mode="after")
+    def _check_keys(self) -> Any:
+        """Refuse keys that do not go together."""
+        _check_pair(self, "learning_rate", "parameters", ("texture", "both"))
+        for key in (
+            "pose_learning_rate",
+            "pose_axes",
+            "pose_limit_m",
+            "pose_limit_deg",
+        ):
+            _check_pair(self, key, "parameters", ("pose", "both"))
+        _check_pair(self, "segment", "adjoint", ("checkpointed",))
+        return self
 
 
 class BaselineSection(Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from mi_nerfattack.errors import InputError
@@ -85,6 +86,40 @@ def test_digest_tells_scenarios_apart(write):
         ("[policy]", "[polisy]", 19, ["polisy"]),
         ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
         ("[attack]", "[attack", None, ["scenario.toml"]),
+        ("[attack]", "[attack]\nsegment = 8", 22, ["segment", "checkpointed"]),
+        ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
+        (
+            "[attack]",
+            '[attack]\nparameters = "pose"\nlearning_rate = 0.1',
+            23,
+            ["learning_rate", "pose"],
+        ),
+        ("[attack]", "[vehicle]\nwheelbase_m = 3.0\n[attack]", 22, ["ackermann"]),
+        (
+            "[attack]",
+            '[vehicle]\nmodel = "bicycle"\nmax_heading_rate = 3.0\n[attack]',
+            23,
+            ["max_heading_rate", "dubins"],
+        ),
+        (
+            "[attack]",
+            "[drive]\ncovariance = [[1, 0, 0], [0, 1, 0.5], [0, 0, 1]]\n[attack]",
+            22,
+            ["covariance", "symmetric"],
+        ),
+        (
+            "[attack]",
+            "[drive]\ncovariance = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]\n[attack]",
+            22,
+            ["covariance", "eigenvalue -1;"],
+        ),
+        (
+            "[attack]",
+            "[drive]\nlateral_sd_m = 0.2\ncovariance = [[1, 0, 0], [0, 1, 0], "
+            "[0, 0, 1]]\n[attack]",
+            23,
+            ["covariance", "lateral_sd_m"],
+        ),
     ],
 )
 def test_errors_name_key_and_line(write, old, new, line, words):
@@ -133,3 +168,23 @@ def test_quotes_in_paths_survive():
     lines = portable_text(text, "/base").splitlines()
     assert lines[0] == """field = "/base/it's/x.st\""""
     assert lines[1] == 'file = "/base/a \\"b\\".st"'
+
+
+@pytest.mark.parametrize("rank", [1, 3])
+def test_initial_poses_scatter_by_the_covariance(write, rank):
+    from mi_nerfattack.attack.world import initial_states
+    from mi_nerfattack.vehicle.route import Route
+
+    root = np.random.default_rng(0).normal(size=(3, rank)) * [[0.5], [0.2], [0.02]]
+    wanted = root @ root.T
+    text = f"[drive]\ncovariance = {wanted.tolist()}\n[attack]"
+    scenario, _ = load_scenario(write(MINIMAL.replace("[attack]", text)))
+    route = Route("north", 0, np.array([[2.0, 1.0], [2.0, 9.0], [4.0, 20.0]]))
+    states = initial_states(scenario, route, 20001, 0)
+    np.testing.assert_allclose(states[0], [2.0, 1.0, np.pi / 2])
+    # along the lane is +y, to the left of it -x
+    shifts = (states[1:] - states[0])[:, [1, 0, 2]] * [1, -1, 1]
+    deviation = np.sqrt(wanted.diagonal())
+    scale = np.outer(deviation, deviation)
+    np.testing.assert_allclose(np.cov(shifts.T) / scale, wanted / scale, atol=0.04)
+    np.testing.assert_allclose(shifts.mean(axis=0) / deviation, 0, atol=0.04)

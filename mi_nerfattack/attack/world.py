@@ -167,7 +167,7 @@ def initial_states(
     """Draw initial states normally around the route's start.
 
     Args:
-        scenario: gives seed and standard deviations.
+        scenario: gives seed, and standard deviations or covariance.
         route: its first point is the nominal pose.
         count: number of states.
         stream: different streams give independent states.
@@ -178,10 +178,16 @@ def initial_states(
     Source: appendix A.4.
     """
     rng = np.random.default_rng([scenario.seed, stream])
-    lateral = rng.normal(0, scenario.drive.lateral_sd_m, count)
-    heading = rng.normal(0, np.radians(scenario.drive.heading_sd_deg), count)
-    lateral[0] = heading[0] = 0.0
-    return route.pose_at(np.zeros(count), lateral, heading)
+    section, shifts = scenario.drive, np.zeros((3, count))
+    if section.covariance is None:
+        shifts[1] = rng.normal(0, section.lateral_sd_m, count)
+        shifts[2] = rng.normal(0, np.radians(section.heading_sd_deg), count)
+    else:  # which may be singular
+        values, vectors = np.linalg.eigh(section.covariance)
+        factor = vectors * np.sqrt(values.clip(min=0))
+        shifts[:] = factor @ rng.standard_normal((3, count))
+    shifts[:, 0] = 0.0
+    return route.pose_at(*shifts)
 
 
 def build_camera(scenario: Scenario) -> tuple[Camera, CameraMount]:
