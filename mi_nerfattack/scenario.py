@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,6 +35,11 @@ from mi_nerfattack.sections import (
 )
 from mi_nerfattack.user_code import split_reference
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 BUNDLED = "bundled:"
 #: Keys that name files, in any section.
 FILE_KEYS = (
@@ -47,6 +53,7 @@ FILE_KEYS = (
 )
 _REFERENCE = re.compile(r"\.py:\w+$")
 _MODULE = re.compile(r"(?!bundled:)[A-Za-z_][\w.]*(?<!\.py):\w+")  # of Python
+_STRING = r"""(?!\"{3}|'{3})(?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""  # on one line
 
 
 class Scenario(Section):
@@ -124,6 +131,7 @@ def load_scenario(path: str | Path) -> tuple[Scenario, str]:
     names = [item.id for item in scenario.objects]
     if len(set(names)) != len(names) or "scene" in names:
         raise InputError(f"{path}: objects: ids {names}; must differ, and not be scene")
+    _check_portable(path, text, data)
     return scenario, text
 
 
@@ -150,7 +158,7 @@ def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenari
     )
     changed = scenario.model_copy(update={"objects": objects})
     head, *blocks = re.split(r"(?m)^(?=[ \t]*\[\[\s*objects\s*\]\])", text)
-    line = re.compile(r'(?m)^(\s*field\s*=\s*)(?:"[^"\n]*"|\'[^\'\n]*\')')
+    line = re.compile(rf"(?m)^(\s*field\s*=\s*)(?:{_STRING})")
     blocks = [
         line.sub(lambda match: match.group(1) + json.dumps(name), block, count=1)
         for block in blocks
@@ -161,15 +169,38 @@ def replace_objects(scenario: Scenario, text: str, field: Path) -> tuple[Scenari
 def portable_text(text: str, base: str | Path) -> str:
     """Make the relative paths in a scenario's text absolute, to replay it anywhere."""
     keys = "|".join(FILE_KEYS)
-    line = re.compile(rf'(?m)^(\s*(?:{keys})\s*=\s*)(["\'])((?:(?!\2)[^\n])+)\2')
+    line = re.compile(rf"(?m)^(\s*(?:{keys})\s*=\s*)({_STRING})")
 
     def absolute(match: re.Match[str]) -> str:
-        value = match.group(3)
-        if not value.startswith(BUNDLED) and not _MODULE.fullmatch(value):
-            value = str(resolve(value, base).resolve())
-        return match.group(1) + json.dumps(value)
+        value = tomllib.loads(f"value = {match.group(2)}")["value"]
+        return match.group(1) + json.dumps(_absolute(value, base), ensure_ascii=False)
 
     return line.sub(absolute, text)
+
+
+def _absolute(value: str, base: str | Path) -> str:
+    """Make the value of a key of `FILE_KEYS` independent of the folder."""
+    if value.startswith(BUNDLED) or _MODULE.fullmatch(value):
+        return value
+    return str(resolve(value, base).resolve())
+
+
+def _check_portable(path: str | Path, text: str, data: dict[str, Any]) -> None:
+    """Refuse files that :func:`portable_text` does not find, in inline tables."""
+    base = Path(path).parent
+    moved = dict(_leaves("", tomllib.loads(portable_text(text, base))))
+    for key, value in _leaves("", data):
+        name = key.rpartition(".")[2]
+        wanted = _absolute(value, base) if name in FILE_KEYS else value
+        if moved.get(key) != wanted:
+            lines = text.splitlines()
+            number = next((i for i, row in enumerate(lines, 1) if str(value) in row), 0)
+            where = f"{path}:{number}" if number else f"{path}"
+            raise InputError(
+                f"{where}: {key[1:]}: stands in an inline table, a dotted or quoted "
+                f'key or a long string; write {name} = "..." on a line of its own, '
+                "under the [section]"
+            )
 
 
 def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:

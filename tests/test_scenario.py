@@ -188,3 +188,45 @@ def test_initial_poses_scatter_by_the_covariance(write, rank):
     scale = np.outer(deviation, deviation)
     np.testing.assert_allclose(np.cov(shifts.T) / scale, wanted / scale, atol=0.04)
     np.testing.assert_allclose(shifts.mean(axis=0) / deviation, 0, atol=0.04)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ('[policy]\nfile = "policy.safetensors"\n', "", 1),
+        ('file = "policy.safetensors"', '"file" = "policy.safetensors"', 20),
+        ('file = "policy.safetensors"', 'file = """\npolicy.safetensors"""', 21),
+        ('name = "test"', 'name = """\nfield = "x"\n"""', None),
+    ],
+)
+def test_files_that_could_not_be_made_absolute_are_refused(write, old, new, line):
+    """They would be looked for beside the scenario.toml of the run folder."""
+    text = MINIMAL.replace(old, new)
+    if not new:
+        text = 'policy = { file = "policy.safetensors" }\n' + text
+    with pytest.raises(InputError, match="on a line of its own") as caught:
+        load_scenario(path := write(text))
+    assert f"{path}:{line or ''}" in str(caught.value)
+
+
+def test_a_dotted_key_is_refused(write):
+    text = 'policy.file = "policy.safetensors"\n' + MINIMAL.replace(
+        '[policy]\nfile = "policy.safetensors"\n', ""
+    )
+    with pytest.raises(
+        InputError, match=r"toml:1: policy\.file: .*under the \[section\]"
+    ):
+        load_scenario(write(text))
+
+
+def test_escapes_in_paths_survive(write, tmp_path):
+    text = MINIMAL.replace("object.safetensors", r"it\u0073 \"ö\".st")
+    scenario, text = load_scenario(write(text))
+    portable = tmp_path / "elsewhere.toml"
+    portable.write_text(portable_text(text, tmp_path))
+    again, _ = load_scenario(portable)
+    wanted = str(tmp_path / 'its "ö".st')
+    assert [item.field for item in again.objects] == [wanted, wanted]
+    changed, text = replace_objects(scenario, text, tmp_path / "mine")
+    portable.write_text(text)
+    assert load_scenario(portable)[0].objects == changed.objects
