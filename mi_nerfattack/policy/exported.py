@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import io
-import json
 import warnings
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from mi_nerfattack import files
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.policy.export_archive import check_archive, check_script
 
 MAX_PROGRAM_BYTES = 1 << 31
-#: Parts of a program that torch would unpickle, or load as native code.
-_UNSAFE = ("custom_obj", "opaque_obj", "data/aotinductor")
 
 
 class ExportedNetwork(torch.nn.Module):
@@ -45,14 +42,16 @@ def load_exported(path: Path) -> ExportedNetwork:
     """Read a ``.pt2`` file of ``torch.export.save``.
 
     Raises:
-        InputError: no such file, another format, or one with pickled objects.
+        InputError: no such file, another format, or one with pickled objects or code.
     """
     raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
-    _check_archive(path, raw)
+    check_archive(path, raw)
     try:
         program = torch.export.load(io.BytesIO(raw))
         network = ExportedNetwork(program)
-    except (RuntimeError, ValueError, KeyError, AssertionError, TypeError) as err:
+    except Exception as err:
+        if is_interrupt(err):
+            raise
         raise InputError(
             f"{path}: torch {torch.__version__} cannot load the program ({err}); "
             "export it again with this version"
@@ -64,9 +63,10 @@ def load_torchscript(path: Path) -> torch.nn.Module:
     """Read a file of ``torch.jit.save``, onto the CPU.
 
     Raises:
-        InputError: no such file, or another format.
+        InputError: no such file, another format, or a program that opens files.
     """
     raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
+    check_script(path, raw)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit.load`", DeprecationWarning)
@@ -75,7 +75,7 @@ def load_torchscript(path: Path) -> torch.nn.Module:
         reason = str(err).strip().splitlines()[0]
         raise InputError(
             f"{path}: is no TorchScript program ({reason}); save one with "
-            "torch.jit.save, or give weights to a FILE.py:NAME as policy.weights"
+            "torch.jit.save, or give weights to a FILE.py:NAME as policy.weights_file"
         ) from err
 
 
@@ -87,50 +87,3 @@ def _batch(program: torch.export.ExportedProgram) -> int | None:
             size = node.meta["val"].shape[0]
             return size if isinstance(size, int) else None
     return None
-
-
-def _check_archive(path: Path, raw: bytes) -> None:
-    """Refuse everything but plain tensors: torch would unpickle the rest."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            names = archive.namelist()
-            contents = {
-                name: archive.read(name)
-                for name in names
-                if name.endswith("_config.json") or "/sample_inputs/" in name
-            }
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as err:
-        raise InputError(
-            f"{path}: is no .pt2 file ({err}); write it with torch.export.save"
-        ) from err
-    if len(set(names)) < len(names) or not any("/models/" in n for n in names):
-        raise InputError(
-            f"{path}: holds no exported program; write it with torch.export.save of "
-            "torch 2.9 or later"
-        )
-    unsafe = [n for n in names if any(part in n for part in _UNSAFE)]
-    unsafe += [n for n in names if "/data/weights/" in n and n.endswith(".pt")]
-    unsafe += [n for n in names if "/data/constants/" in n and n.endswith(".pt")]
-    unsafe += [n for n, data in contents.items() if not _is_plain(n, data)]
-    if unsafe:
-        raise InputError(
-            f"{path}: {unsafe[0]}: pickled objects or native code, which are not "
-            "loaded; export a program whose inputs and weights are plain tensors"
-        )
-
-
-def _is_plain(name: str, data: bytes) -> bool:
-    """Tell a list of plain tensors, or example inputs without other objects."""
-    if name.endswith("_config.json"):
-        try:
-            entries = json.loads(data).get("config", {})
-            return not any(entry.get("use_pickle") for entry in entries.values())
-        except (ValueError, AttributeError):
-            return False
-    if not data:
-        return True
-    try:
-        torch.load(io.BytesIO(data), weights_only=True)
-    except Exception:
-        return False
-    return True
