@@ -33,7 +33,7 @@ from mi_nerfattack.sections import (
     TermSection,
     VehicleSection,
 )
-from mi_nerfattack.user_code import split_reference
+from mi_nerfattack.user_code import module_file, split_reference
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -88,7 +88,7 @@ class Scenario(Section):
         result = {}
         for key, value in _leaves("scenario", self.model_dump(mode="json")):
             name = key.rpartition(".")[2]
-            if name in FILE_KEYS and value and not _MODULE.fullmatch(value):
+            if name in FILE_KEYS and value:
                 value = _content(value, base)
             result[key] = json.dumps(value, sort_keys=True)
         return result
@@ -218,8 +218,16 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
 def _content(value: str, base: str | Path) -> dict[str, str]:
     """Hash the content of ``FILE`` or ``FILE.py:NAME``, and the name.
 
-    An XML file counts with the files that it names itself, meshes and pictures.
+    An XML file counts with the files that it names itself, meshes and pictures. Of
+    ``package.module:NAME``, the module's own source counts; the name where it has none.
     """
+    if _MODULE.fullmatch(value):
+        source = module_file(value.partition(":")[0])
+        raw = (
+            b"" if source is None else files.read_bytes(source, files.MAX_TENSOR_BYTES)
+        )
+        digest = hashlib.sha256(raw + value.encode())
+        return {"file": value, "sha256": digest.hexdigest()}
     file, name = (value, "") if not _REFERENCE.search(value) else split_reference(value)
     path = resolve(file, base)
     raw = files.read_bytes(path, files.MAX_TENSOR_BYTES)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import importlib.util
 import sys
 from collections.abc import Callable
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -89,6 +91,30 @@ def import_function(reference: str) -> Callable[..., Any]:
     if not callable(found):
         raise InputError(f"{reference!r}: {module} has no function {name!r}")
     return found
+
+
+def module_file(name: str) -> Path | None:
+    """Find the source of an installed module without running it or its packages.
+
+    Args:
+        name: ``package.module``.
+
+    Returns:
+        the file that importing it would run; None where there is none.
+    """
+    top, *rest = name.split(".")
+    try:
+        spec = importlib.util.find_spec(top)
+    except ValueError:  # a module of this process without a specification
+        return None
+    for part in rest:
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        path = list(spec.submodule_search_locations)
+        spec = PathFinder.find_spec(f"{spec.name}.{part}", path)
+    if spec is None or not spec.has_location or spec.origin is None:
+        return None
+    return Path(spec.origin)
 
 
 def _own(value: Any, module: ModuleType) -> bool:

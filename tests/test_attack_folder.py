@@ -61,6 +61,16 @@ def test_folder_of_something_else_is_left_alone(folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_results")
+def test_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_path):
+    (tmp_path / "scenario.toml").write_text("# a scenario of a run killed early")
+    notices = []
+    job(folder, tmp_path, notices=notices).run(resume=True, force=True)
+    assert any("replaced, as told" in notice for notice in notices)
+    assert 'name = "kill"' in (tmp_path / "scenario.toml").read_text()
+    assert (tmp_path / "metrics.json").exists()
+
+
+@pytest.mark.usefixtures("no_results")
 def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
     output = tmp_path / "run"
     interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.resumable import differences
 from mi_nerfattack.scenario import (
     load_scenario,
     portable_text,
@@ -230,3 +231,32 @@ def test_escapes_in_paths_survive(write, tmp_path):
     changed, text = replace_objects(scenario, text, tmp_path / "mine")
     portable.write_text(text)
     assert load_scenario(portable)[0].objects == changed.objects
+
+
+def test_module_of_a_vehicle_counts_with_its_source(write, tmp_path, monkeypatch):
+    package = tmp_path / "cars_of_this_test"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise AssertionError('was imported')")
+    source = package / "slow.py"
+    source.write_text("speed = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    vehicle = '[vehicle]\nmodel = "custom"\ncontrol_limit = 1.0\nfunction = '
+    folder = write("").parent
+    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
+        (folder / name).write_bytes(name.encode())
+    (folder / "routes.json").write_text("{}")
+
+    def identity(reference):
+        text = MINIMAL.replace("[attack]", f'{vehicle}"{reference}"\n[attack]')
+        return load_scenario(write(text))[0].identity(folder)
+
+    before = identity("cars_of_this_test.slow:car")
+    assert before == identity("cars_of_this_test.slow:car")
+    source.write_text("speed = 2")
+    assert differences(before, identity("cars_of_this_test.slow:car")) == [
+        "scenario.vehicle.function: the content of cars_of_this_test.slow:car has "
+        "changed"
+    ]
+    identity("cars_of_this_test.absent:car")  # refused later, where it is imported
+    identity("absent_package.absent:car")
+    identity("math.absent:car")

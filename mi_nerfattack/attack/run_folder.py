@@ -73,7 +73,7 @@ class RunFolder:
             InputError: the folder is no run's, another process works in it, a file is
                 damaged, or the run was of another scenario or other versions.
         """
-        if not self._holds_run():
+        if not self._holds_run(force, on_notice):
             on_notice(f"{self.path}: holds no run yet; it starts from the beginning")
             return
         self._enter()
@@ -98,7 +98,7 @@ class RunFolder:
             self._lock.enter_context(folders.exclusive(self.path))
             self._locked = True
 
-    def _holds_run(self) -> bool:
+    def _holds_run(self, force: bool, on_notice: Callable[[str], None]) -> bool:
         """Tell a run from nothing; InputError for something else."""
         if not self.path.exists():
             return False
@@ -113,8 +113,11 @@ class RunFolder:
         kept = {self.checkpoint.path, self.drives.path}
         if present and not kept & set(present):
             if files.read_text(scenario) != self._text:
-                raise InputError(
-                    f"{scenario}: is another scenario, and nothing was done of it; "
-                    "choose another folder, or remove the file"
-                )
+                what = f"{scenario}: is another scenario, and nothing was done of it"
+                if not force:
+                    raise InputError(
+                        f"{what}; choose another folder, remove the file, or replace "
+                        "it (--force)"
+                    )
+                on_notice(f"{what}; replaced, as told")
         return bool(present)
