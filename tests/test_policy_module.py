@@ -11,6 +11,7 @@ from torch import nn
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.goals import NoGoal
+from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -111,3 +112,70 @@ def test_modules_that_fail_are_told(function, message, rng):
 def test_what_is_no_fault_of_the_module_goes_through(error, rng):
     with pytest.raises(type(error)):
         policy(lambda x: raise_(error)).step(images(rng), 0, ())
+
+
+class Counting(nn.Module):
+    """Keeps a state in itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.level = None
+
+    def forward(self, image):
+        mean = image.mean((1, 2, 3))
+        self.level = mean if self.level is None else 0.5 * (self.level + 2 * mean)
+        return self.level
+
+
+class Buffered(nn.Module):
+    """Changes a buffer that no answer shows yet."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+
+    def forward(self, image):
+        self.count.add_(1)
+        return image.mean((1, 2, 3)) + torch.relu(self.count - 10)
+
+
+class Random(nn.Module):
+    def forward(self, image):
+        return nn.functional.dropout(image, 0.5, training=True).mean((1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (Counting, "its controls are"),
+        (Random, "its controls are"),
+        (Buffered, "its buffer 'count' changes"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["step", "step_vjp", "step_jvp"])
+def test_modules_that_are_not_repeatable_are_refused(module, message, mode, rng):
+    made, image = TorchPolicy(module(), NoGoal(), name="mine.py"), images(rng)
+    rest = {"step": (), "step_vjp": (mi.Float(1, 1), ()), "step_jvp": (image, ())}
+    with pytest.raises(InputError, match=f"mine.py: .*{message}.*training mode.*recur"):
+        getattr(made, mode)(image, 0, (), *rest[mode])
+
+
+def test_the_check_is_made_once(rng):
+    calls = []
+
+    def mean(x):
+        calls.append(len(x))
+        return x.mean((1, 2, 3))
+
+    made = policy(mean)
+    for _ in range(3):
+        made.step(images(rng), 0, ())
+    assert len(calls) == 2 + 3
+
+
+@pytest.mark.parametrize("wrap", [nn.Identity, OneImage])
+def test_a_second_output_is_not_dropped(wrap, rng):
+    module = Wrap(lambda x: (x.mean((1, 2, 3)), x.mean((1, 2, 3))))
+    network = OneImage(module) if wrap is OneImage else module
+    with pytest.raises(InputError, match="policy.recurrent.*policy.output"):
+        TorchPolicy(network, NoGoal()).step(images(rng), 0, ())

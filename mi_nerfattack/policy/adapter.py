@@ -19,7 +19,7 @@ from mi_nerfattack.policy.checks import (
     steering,
 )
 from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal
-from mi_nerfattack.policy.module_call import call_module
+from mi_nerfattack.policy.module_call import call_module, check_repeatable
 from mi_nerfattack.policy.preprocess import Preprocess
 from mi_nerfattack.policy.tensors import to_row, to_tensor, to_torch
 
@@ -136,7 +136,8 @@ class TorchPolicy(AbstractPolicy):
     """Policy given by a torch module; memory is shared, not copied, both ways.
 
     The module is called as ``module(image, *goal, *hidden)`` and returns the control,
-    or a tuple of the control and the hidden states for the next image. The memory is
+    or a tuple of the control and the hidden states for the next image. It keeps no
+    state in itself; the very first image is evaluated twice to see that. The memory is
     the frame stack, where there is one, and the hidden states.
 
     Args:
@@ -173,6 +174,7 @@ class TorchPolicy(AbstractPolicy):
         self.recurrent = check_hidden(recurrent)
         self.control_scale, self.output = float(control_scale), output
         self.name = name or type(module).__name__
+        self._checked = False
 
     def control(self, image: Any, goal: Any) -> Any:
         """Evaluate the module on first images, without recording a graph."""
@@ -200,6 +202,7 @@ class TorchPolicy(AbstractPolicy):
 
     def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
         """Evaluate the module without recording a graph."""
+        self._check(image, goal, memory)
         with torch.no_grad():
             control, after = self._evaluate(to_torch(image), goal, memory)
         return to_row(control, image), after
@@ -215,6 +218,7 @@ class TorchPolicy(AbstractPolicy):
         self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
     ) -> tuple[Any, Memory]:
         """Evaluate the module on dual numbers."""
+        self._check(image, goal, memory)
         primals = (to_torch(image), *memory)
         tangents = (to_torch(t_image), *(t_memory or map(torch.zeros_like, memory)))
         with torch.no_grad(), forward_mode():
@@ -230,6 +234,7 @@ class TorchPolicy(AbstractPolicy):
         self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Return the control, and derivatives by the image and each part of memory."""
+        self._check(image, goal, memory)
         leaves = [
             part.detach().requires_grad_(True) for part in (to_torch(image), *memory)
         ]
@@ -258,6 +263,15 @@ class TorchPolicy(AbstractPolicy):
         ]
         return control, tuple(filled)
 
+    def _check(self, image: Any, goal: Any, memory: Memory) -> None:
+        """Evaluate the very first image twice; a state in the module shows itself."""
+        if not self._checked:
+            images = to_torch(image)
+            check_repeatable(
+                self.module, lambda: self._evaluate(images, goal, memory)[0], self.name
+            )
+            self._checked = True
+
     def _evaluate(
         self, image: torch.Tensor, goal: Any, memory: Memory
     ) -> tuple[torch.Tensor, Memory]:
@@ -279,7 +293,8 @@ class TorchPolicy(AbstractPolicy):
             raise InputError(
                 f"{self.name}: hidden states {shapes} come out where "
                 f"{[tuple(part.shape) for part in hidden]} went in; declare their "
-                "shapes as policy.recurrent"
+                "shapes as policy.recurrent, or return several controls as one tensor "
+                "(n, k) and tell the column by policy.output"
             )
         stack = (past,) if self.preprocess.history else ()
         return self.control_scale * control, (*stack, *after)

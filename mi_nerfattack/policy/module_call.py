@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -52,6 +53,45 @@ def call_module(
             "policy.preprocess, goal and recurrent as the network needs them"
         ) from err
     return _tensors(result, name)
+
+
+def check_repeatable(
+    module: torch.nn.Module, evaluate: Callable[[], torch.Tensor], name: str
+) -> None:
+    """Refuse a module that answers the same image twice differently.
+
+    The loop evaluates a control period anew for its derivative, and begins every
+    drive with the same module. Buffers that change betray what no answer shows yet.
+
+    Args:
+        module: the module; `PilotNet` is known to be repeatable.
+        evaluate: gives the control (n,).
+        name: for messages.
+
+    Raises:
+        InputError: the two controls differ, or a buffer has changed.
+    """
+    if isinstance(module, PilotNet):
+        return
+    with torch.no_grad():
+        before = {key: value.clone() for key, value in module.named_buffers()}
+        first, second = evaluate(), evaluate()
+        changed = [
+            key
+            for key, value in module.named_buffers()
+            if key in before and not torch.equal(before[key].to(value), value)
+        ]
+        difference = float((first - second).abs().max())
+        limit = TOLERANCE * float(torch.maximum(first.abs(), second.abs()).max())
+    if changed or difference > limit:
+        what = f"its buffer {changed[0]!r} changes" if changed else "its controls are"
+        values = "" if changed else f" {first.tolist()[:2]}, then {second.tolist()[:2]}"
+        raise InputError(
+            f"{name}: evaluated twice on one image, {what}{values}; it was exported in "
+            "training mode (dropout, batch statistics): export network.eval(); or it "
+            "keeps a state in itself: take and return it as a hidden state, "
+            "policy.recurrent"
+        )
 
 
 def _tensors(result: Any, name: str) -> tuple[torch.Tensor, ...]:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import torch
 
+from mi_nerfattack.errors import InputError
+
 
 class OneImage(torch.nn.Module):
     """Call a network once for each vehicle and put its answers side by side.
@@ -27,7 +29,11 @@ class OneImage(torch.nn.Module):
     def forward(
         self, image: torch.Tensor, *rest: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return the control and the hidden states of all vehicles."""
+        """Return the control and the hidden states of all vehicles.
+
+        Raises:
+            InputError: the network gives more outputs, or fewer.
+        """
         goals = len(rest) - len(self.axes)
         axes = [0] * (1 + goals) + self.axes
         answers = []
@@ -38,7 +44,14 @@ class OneImage(torch.nn.Module):
             ]
             result = self.network(*one)
             result = result if isinstance(result, (tuple, list)) else (result,)
+            if len(result) != 1 + len(self.axes):
+                raise InputError(
+                    f"policy.recurrent: {len(self.axes)} hidden states; the network "
+                    f"gives {len(result)} outputs, the control and {len(result) - 1} "
+                    "hidden states: declare their shapes, or return several controls "
+                    "as one tensor (n, k) and tell the column by policy.output"
+                )
             answers.append((result[0].reshape(1, -1), *result[1:]))
         columns = zip(*answers, strict=True)
-        joined = zip(columns, [0, *self.axes], strict=False)
+        joined = zip(columns, [0, *self.axes], strict=True)
         return tuple(torch.cat(parts, axis) for parts, axis in joined)
