@@ -10,6 +10,7 @@ from small_fields import homogeneous, small_ngp
 
 from mi_nerfattack.fields import NGPField, NGPLayout, Occupancy, load_field
 from mi_nerfattack.fields.packed_grid import PackedGrid
+from mi_nerfattack.fields.packed_words import LongWords, ShortWords
 from mi_nerfattack.render.camera import CameraMount, from_fov, generate_rays, mount_pose
 from mi_nerfattack.render.march import STOP, Rays, march
 from mi_nerfattack.render.posed import Pose, PosedField
@@ -116,11 +117,16 @@ def test_numbers_for_all_rays_stay_one_entry():
     assert dr.width(seen.opacity) == dr.width(rays.direction)
 
 
-def test_features_are_those_of_the_encoding(rng):
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_features_are_those_of_the_encoding(rng, kind):
     field = small_ngp()
+    table = rng.normal(size=field.encoding.n_params).astype(kind)
+    field.set_parameter("table", mi.Float(table.astype(np.float32)))
     point = rng.uniform(0, 0.999, (3, 200)).astype(np.float32).tolist()
     unit, active = mi.Point3f(point), mi.Bool((rng.random(200) < 0.5).tolist())
-    found = PackedGrid(field.encoding).encode(unit, active)
+    grid = PackedGrid(field.encoding)
+    assert isinstance(grid.table, ShortWords if kind == np.float16 else LongWords)
+    found = grid.encode(unit, active)
     expected = list(field.encoding(unit, active))
     assert len(found) == len(expected) == field.encoding.n_output_features
     for a, b in zip(found, expected, strict=True):
@@ -148,6 +154,19 @@ def test_new_parameters_are_noticed(rng):
     assert np.abs(after - before).max() > 0.01
     expected = np.array(march(posed, *rays).radiance)
     np.testing.assert_allclose(after, expected, atol=2e-5)
+
+
+def test_parameters_may_lose_half_precision(rng):
+    """A table that short words hold is followed by one that they do not, and back."""
+    field = small_ngp()
+    posed, rays = PosedField(field), random_rays(rng)
+    scene = PackedMarch(posed, STOP)
+    table = field.encoding.data.numpy().astype(np.float16).astype(np.float32)
+    for factor in (1.0, 0.7, 0.5):
+        field.set_parameter("table", mi.Float(np.float32(factor) * table))
+        found, expected = scene.march(rays), march(posed, *rays)
+        pair = np.array(found.radiance), np.array(expected.radiance)
+        np.testing.assert_allclose(*pair, atol=2e-5)
 
 
 def test_nothing_is_compiled_for_other_rays():

