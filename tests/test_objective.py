@@ -11,7 +11,6 @@ from mi_nerfattack.attack.horizon import (
     last_seconds,
     linear,
     listed,
-    uniform,
 )
 from mi_nerfattack.attack.objective import (
     AbsoluteDeviation,
@@ -284,7 +283,6 @@ def test_no_kernel_is_compiled_twice(rng):
 
 
 def test_weights(rng):
-    assert uniform(3).tolist() == [1, 1, 1]
     np.testing.assert_allclose(linear(4), [0.25, 0.5, 0.75, 1])
     assert last_seconds(5, 0.1, 0.2).tolist() == [0, 0, 0, 1, 1]
     assert last_seconds(5, 0.1, 0.3).sum() == 3  # 0.3 / 0.1 is below 3

@@ -9,6 +9,7 @@ import pytest
 import toy_loop as toy
 from test_attack import folder, run  # noqa: F401  a fixture
 
+from mi_nerfattack.attack.attribution import attribute, write_attribution
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.parameters import Freedom
 from mi_nerfattack.errors import InputError
@@ -69,6 +70,17 @@ def test_a_run_says_where_the_objects_stand(folder, tmp_path):  # noqa: F811
     shift = np.array(pose["shift_m"])
     assert shift[:2].any() and shift[2] == 0
     np.testing.assert_allclose(pose["position_m"], np.add([7.0, 2.4, 1.0], shift))
+
+
+def test_attribution_says_that_the_texture_was_not_attacked(tmp_path):
+    attack = make_attack(Freedom(None, 0.05))
+    attack.measure()
+    found = attribute(attack, ["ball"], 0.85)
+    assert "texture, which was not changed" in found.subject
+    titles = write_attribution(tmp_path, found, [attack.sensor.objects[0].field])
+    assert all("which was not changed" in title for title in titles)
+    both = attribute(make_attack(Freedom(0.3, 0.05)), ["ball"], 0.85)
+    assert both.subject == "gradient"
 
 
 def test_nothing_to_change_is_refused():

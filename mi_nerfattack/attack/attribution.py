@@ -16,6 +16,9 @@ from mi_nerfattack.report.heat import side_views, write_heat
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.rollout.sweep import StepRecorder
 
+#: The gradient of an attack on poses alone.
+UNCHANGED = "gradient by the texture, which was not changed"
+
 
 @dataclass(frozen=True, eq=False)
 class FailureAttribution:
@@ -25,11 +28,13 @@ class FailureAttribution:
         times: by control periods.
         norms: (T, k), Euclidean norms of each period's texture gradients.
         textures: (n_vertices, 3) an object, the gradient by its texture.
+        subject: what the gradient is, in words.
     """
 
     times: TimeAttribution
     norms: np.ndarray
     textures: list[np.ndarray]
+    subject: str = "gradient"
 
 
 def attribute(
@@ -68,7 +73,8 @@ def attribute(
         limit_m,
         list(objects),
     )
-    return FailureAttribution(times, parts.attribution.norms, textures)
+    subject = "gradient" if attack.freedom.texture_rate is not None else UNCHANGED
+    return FailureAttribution(times, parts.attribution.norms, textures, subject)
 
 
 def write_attribution(
@@ -94,10 +100,12 @@ def write_attribution(
     }
     files.write_json(folder / "attribution.json", data)
     when, where = folder / "attribution.png", folder / "attribution_object.png"
-    plot_attribution(when, times)
+    plot_attribution(when, times, found.subject)
     pairs = zip(times.objects, fields, found.textures, strict=True)
     write_heat(where, {name: side_views(grid, g) for name, grid, g in pairs})
-    return {"When the failure is made": when, "Where the failure is made": where}
+    note = f" ({UNCHANGED})" if found.subject == UNCHANGED else ""
+    titles = (f"{word} the failure is made{note}" for word in ("When", "Where"))
+    return dict(zip(titles, (when, where), strict=True))
 
 
 def _columns(names: Sequence[str], table: np.ndarray) -> dict[str, list[float]]:

@@ -13,11 +13,6 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 
 
-def uniform(horizon: int) -> np.ndarray:
-    """Weigh all times equally: 1."""
-    return np.ones(horizon)
-
-
 def linear(horizon: int) -> np.ndarray:
     """Weigh late times more: ``t / T``, up to 1 at the end."""
     return np.arange(1, horizon + 1) / horizon

@@ -68,7 +68,9 @@ class TimeAttribution:
         return self.along / total if total else np.zeros_like(self.along)
 
 
-def plot_attribution(path: str | Path, data: TimeAttribution) -> None:
+def plot_attribution(
+    path: str | Path, data: TimeAttribution, subject: str = "gradient"
+) -> None:
     """Plot how sensitive the objective is and when its gradient is made, over time.
 
     Three panels with one time axis: the lengths of the costates (what a shift or a
@@ -78,6 +80,7 @@ def plot_attribution(path: str | Path, data: TimeAttribution) -> None:
     Args:
         path: PNG file.
         data: of one drive, or of a batch: then a thin line a vehicle, and the mean.
+        subject: what the shares are of.
     """
     with chart(path, 6.6) as figure:
         ratios = {"height_ratios": [1, 1, 1]}
@@ -88,7 +91,7 @@ def plot_attribution(path: str | Path, data: TimeAttribution) -> None:
         axes[0].set_title(
             "When the failure is made: sensitivity to the state", loc="left"
         )
-        axes[1].set_title("Share of each control period in the gradient", loc="left")
+        axes[1].set_title(f"Share of each control period in the {subject}", loc="left")
         axes[2].set_title("Distance from the lane centre", loc="left")
         axes[2].set_xlabel("time (s)")
         for axis in axes:
