@@ -5,12 +5,20 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise ValueError("must not be 0")
+    return value
+
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+NonZero = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
 Count = Annotated[int, Field(ge=1)]
 Whole = Annotated[int, Field(ge=0)]
 Part = Annotated[float, Field(ge=0, lt=1)]
@@ -95,7 +103,7 @@ class PolicySection(Section):
     recurrent: tuple[tuple[int, ...], ...] = ()  # shapes, -1 for the vehicles
     batch: Literal[1] | None = None  # where it takes one image at a time
     output: Whole | None = None  # column of the control, where there are several
-    control_scale: Finite = 1.0  # to rad/s (dubins) or rad, positive to the left
+    control_scale: NonZero = 1.0  # to rad/s (dubins) or rad, positive to the left
     preprocess: PreprocessSection = PreprocessSection()
 
     @model_validator(mode="after")
