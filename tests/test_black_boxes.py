@@ -142,6 +142,7 @@ def test_http_protocol_and_retries(served, rng, monkeypatch):
     ("answers", "message"),
     [
         ([(404, b"", 0)], "status 404 Not Found, after 1 attempts"),
+        ([(302, b"", 0)], "status 302 Found, after 1 attempts"),
         ([(500, b"", 0)] * 2, "status 500 Internal Server Error, after 2 attempts"),
         ([(200, b"", 9)] * 2, "no answer in 0.5 s, after 2 attempts"),
         ([(200, b"hello", 0)], "answers 'hello'.*must be JSON"),
@@ -157,6 +158,53 @@ def test_http_errors(answers, message, served, rng, monkeypatch):
     policy = HttpPolicy(url, timeout_s=0.5, retries=1)
     with pytest.raises(InputError, match=f"{url}: {message}"):
         policy.control(camera(2, rng), 0)
+
+
+class Dripping(BaseHTTPRequestHandler):
+    """Sends a byte now and then, each in time."""
+
+    def do_POST(self):
+        self.send_response(200)
+        self.end_headers()
+        try:
+            for _ in range(100):
+                self.wfile.write(b" ")
+                threading.Event().wait(0.05)
+        except OSError:
+            pass
+
+
+def test_the_timeout_is_of_the_whole_answer(served, rng):
+    policy = HttpPolicy(served(Dripping), timeout_s=0.3, retries=0)
+    with pytest.raises(InputError, match="no answer in 0.3 s, after 1 attempts"):
+        policy.control(camera(1, rng), 0)
+
+
+def test_local_servers_are_asked_without_proxies(served, rng, monkeypatch):
+    url = served(handler(GOOD)[0])
+    monkeypatch.delenv("no_proxy")
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    np.testing.assert_array_equal(
+        HttpPolicy(url).control(camera(2, rng), 0), [0.5, -0.25]
+    )
+
+
+def test_functions_may_write_into_their_image(tmp_path, rng):
+    (tmp_path / "mine.py").write_text(
+        "def drive(image, goal, step):\n"
+        "    image *= 0; goal += 1\n"
+        "    return image.mean((1, 2, 3)) + goal\n"
+    )
+    policy = load_policy(section(kind="callable", file="mine.py:drive"), tmp_path)
+    for frames in (1, 2):
+        policy.preprocess.frames = frames
+        image = camera(2, rng)
+        before, memory = image.numpy().copy(), policy.initial_memory(2)
+        for _ in range(2):
+            control, memory = policy.step(image, [0, 3], memory)
+            np.testing.assert_array_equal(control, [1, 4])
+        np.testing.assert_array_equal(image.numpy(), before)
+        assert frames == 1 or memory[1].any()
 
 
 def test_no_server(served, rng, monkeypatch):

@@ -73,8 +73,10 @@ class AbstractBlackBox(AbstractPolicy):
         with torch.no_grad():
             planes = self.preprocess.stage(images.to("cpu", torch.float32))
             seen, past = self.preprocess.stack(planes, past)
-            goals = expand_goals(goal, planes).numpy()
-            answer = self.answer(np.ascontiguousarray(seen.numpy()), goals, step)
+            goals = expand_goals(goal, planes).numpy().copy()
+            # a copy: functions may write into their image
+            given = np.array(seen.numpy(), order="C")
+            answer = self.answer(given, goals, step)
             values = torch.from_numpy(np.array(answer, np.float64))
             control = steering(values, len(images), self.output, self.name)
         return to_row(self.control_scale * control, image), (step + 1, past)

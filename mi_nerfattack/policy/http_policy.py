@@ -25,6 +25,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,16 @@ from mi_nerfattack.policy.preprocess import Preprocess
 MAX_ANSWER_BYTES = 1 << 20
 #: Seconds before the first repetition; doubled for each further one.
 PAUSE_S = 0.1
+#: Hosts that are asked without a proxy, whatever the environment says.
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Take a redirect for the error that it is: it would turn POST into GET."""
+
+    def redirect_request(self, *args: Any, **kwargs: Any) -> None:
+        """Follow no redirect."""
+        del args, kwargs
 
 
 class HttpPolicy(AbstractBlackBox):
@@ -42,7 +53,7 @@ class HttpPolicy(AbstractBlackBox):
 
     Args:
         url: http or https.
-        timeout_s: longest wait for an answer.
+        timeout_s: longest wait for a whole answer.
         retries: how often a failed request is repeated.
         preprocess: as for `AbstractBlackBox`; the rest likewise.
     """
@@ -60,6 +71,10 @@ class HttpPolicy(AbstractBlackBox):
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise InputError(f"policy.url: {url!r}; must be http://HOST... or https://")
         self.url, self.timeout_s, self.retries = url, timeout_s, retries
+        handlers: list[urllib.request.BaseHandler] = [_NoRedirects()]
+        if parts.hostname in LOCAL_HOSTS:
+            handlers.append(urllib.request.ProxyHandler({}))
+        self._opener = urllib.request.build_opener(*handlers)
         AbstractBlackBox.__init__(self, url, preprocess, control_scale, output)
 
     def answer(self, image: np.ndarray, goals: np.ndarray, step: int) -> np.ndarray:
@@ -93,8 +108,19 @@ class HttpPolicy(AbstractBlackBox):
         )
 
     def _post(self, request: urllib.request.Request) -> bytes:
-        with urllib.request.urlopen(request, timeout=self.timeout_s) as response:
-            return response.read(MAX_ANSWER_BYTES + 1)
+        """Send one request; the whole answer must be there in time."""
+        end = time.monotonic() + self.timeout_s
+        with self._opener.open(request, timeout=self.timeout_s) as response:
+            parts, size = [], 0
+            while size <= MAX_ANSWER_BYTES:
+                if time.monotonic() > end:
+                    raise TimeoutError
+                part = response.read1(1 << 16)  # returns with what has come
+                if not part:
+                    break
+                parts.append(part)
+                size += len(part)
+            return b"".join(parts)
 
     def _controls(self, raw: bytes) -> np.ndarray:
         """Read ``{"control": [numbers]}``."""

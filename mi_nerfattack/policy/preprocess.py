@@ -315,7 +315,11 @@ class Preprocess:
         if self.frames > 1:
             earlier = [known[:, max(0, last - age), None] for age in ages[:-1]]
             frames = torch.cat([*earlier, frames], dim=1)
-        return self.layout(frames), known[:, max(0, last + 1 - self.history) :]
+        kept = known[:, max(0, last + 1 - self.history) :]
+        # a view would keep the frame that has dropped out
+        return self.layout(frames), kept if len(kept[0]) == len(
+            known[0]
+        ) else kept.clone()
 
 
 def _cut(planes: torch.Tensor, margins: Sequence[int]) -> torch.Tensor:
