@@ -128,6 +128,7 @@ def test_the_guide_lists_every_key():
     ("keys", "message"),
     [
         ({"file": "net.bin"}, "suffix tells no kind"),
+        ({"file": "mypkg.policy:Net"}, "code is given as FILE.py:NAME"),
         ({"file": "net.onnx", "kind": "http"}, "a url belongs to"),
         ({"url": "http://x", "kind": "onnx"}, "a url belongs to"),
         ({"url": "ftp://x"}, "policy.url: 'ftp://x'; must be http"),
@@ -156,6 +157,7 @@ def test_keys_and_files_that_do_not_fit(keys, message, tmp_path):
         ('file = "a.pt"\ngoals = 2', "policy.goals: needs goal"),
         ('file = "a.pt"\nkind = "keras"', "policy.kind"),
         ('file = "a.pt"\nbatch = 2', "policy.batch"),
+        ('file = "a.pt"\ncontrol_scale = 0.0', "policy.control_scale"),
         (
             'file = "a.pt"\n[policy.preprocess]\nresize = [1, 2]',
             "policy.preprocess.resize: unknown key; allowed: crop_px",
@@ -216,6 +218,11 @@ def test_weights_of_a_module(tmp_path, rng):
     [
         (SimpleNamespace(a=1), "is no state dict of plain tensors"),
         ([1, 2], "holds a list"),
+        (
+            {"state_dict": {"1.bias": torch.zeros(1)}, "epoch": 3},
+            r"checkpoint of state_dict, epoch; save its 'state_dict' alone",
+        ),
+        ({"1.weight": torch.zeros(1, 39600)}, "the very module that policy.file"),
         ({"1.weight": 3}, "'1.weight' is no tensor"),
         ({"1.weight": torch.full((1, 39600), torch.nan)}, "no tensor of finite"),
         ({"1.weight": torch.zeros(1, 39600)}, "Missing key.*1.bias"),

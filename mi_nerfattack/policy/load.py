@@ -105,6 +105,11 @@ def policy_kind(section: PolicySection) -> str:
         named = ".py:" in section.file
         suffix = ".py" if named else Path(section.file).suffix.lower()
         kind = section.kind or SUFFIXES.get(suffix)
+    if kind is None and ":" in (section.file or ""):
+        raise InputError(
+            f"policy.file: {section.file}: code is given as FILE.py:NAME, with the "
+            "path of a Python file; a module of a package is imported inside of such a file"
+        )
     if kind is None:
         raise InputError(
             f"policy.file: {section.file}: its suffix tells no kind; give policy.kind, "
@@ -303,13 +308,24 @@ def _load_weights(module: torch.nn.Module, path: Path) -> None:
             ) from err
     if not isinstance(state, dict):
         raise InputError(f"{path}: holds a {type(state).__name__}; a state dict needed")
+    wrappers = [
+        key for key in ("state_dict", "model", "model_state_dict") if key in state
+    ]
+    if wrappers and isinstance(state[wrappers[0]], dict):
+        raise InputError(
+            f"{path}: is a checkpoint of {', '.join(map(str, state))}; save its "
+            f"{wrappers[0]!r} alone: torch.save(checkpoint[{wrappers[0]!r}], FILE)"
+        )
     for name, value in state.items():
         if not isinstance(value, torch.Tensor) or not torch.isfinite(value).all():
             raise InputError(f"{path}: {name!r} is no tensor of finite values")
     try:
         module.load_state_dict(state)
     except RuntimeError as err:
-        raise InputError(f"{path}: {err}") from err
+        raise InputError(
+            f"{path}: {err}; save the state_dict() of the very module that policy.file "
+            "names"
+        ) from err
 
 
 def _load_drjit_weights(network: Any, path: Path) -> None:
