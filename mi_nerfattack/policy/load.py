@@ -108,7 +108,7 @@ def policy_kind(section: PolicySection) -> str:
     if kind is None and ":" in (section.file or ""):
         raise InputError(
             f"policy.file: {section.file}: code is given as FILE.py:NAME, with the "
-            "path of a Python file; a module of a package is imported inside of such a file"
+            "path of a Python file; import modules of a package in such a file"
         )
     if kind is None:
         raise InputError(
