@@ -135,6 +135,8 @@ CONSTANTS = [
     ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1), np.float32(2.5)], {}),
     ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "reflect"}),
     ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "edge"}),
+    ("ReduceSum", [integers()], {"noop_with_empty_axes": 1}),
+    ("ReduceSum", [integers()], {"keepdims": 0}),
     ("Split", [integers(2, 5)], {"axis": 3, "extra": ["z"]}),
     (
         "Resize",
@@ -326,3 +328,21 @@ def test_shapes_computed_in_the_graph(rng):
     }
     made = model(nodes, {"x": (FLOAT, ["n", 3, 4])}, {"y": (FLOAT, None)}, constants)
     check(made, rng.normal(size=(5, 3, 4)).astype("f4"))
+
+
+def test_constant_of_no_axes(rng):
+    nodes = [
+        helper.make_node("ConstantOfShape", ["empty"], ["zero"]),
+        helper.make_node("Add", ["x", "zero"], ["y"]),
+    ]
+    constants = {"empty": integers()}
+    made = model(nodes, {"x": (FLOAT, [2])}, {"y": (FLOAT, None)}, constants)
+    check(made, rng.normal(size=2).astype("f4"))
+
+
+def test_pools_that_reach_over_the_edge_are_refused():
+    keys = {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1}
+    node = helper.make_node("MaxPool", ["x"], ["y"], **keys)
+    made = model([node], {"x": (FLOAT, [1, 1, 5, 5])}, {"y": (FLOAT, None)})
+    with pytest.raises(InputError, match=r"ceil_mode with strides \[3, 3\]"):
+        OnnxNetwork(made, "net.onnx")(torch.zeros(1, 1, 5, 5))

@@ -154,3 +154,23 @@ def test_without_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(SetupError, match=r"net.onnx.*pip install .mi-nerfattack\[onnx"):
         load_onnx(tmp_path / "net.onnx")
+
+
+def test_data_of_constants_in_other_files_are_refused(tmp_path):
+    value = onnx.numpy_helper.from_array(np.ones(2, "f4"), "k")
+    value.ClearField("raw_data")
+    value.data_location = onnx.TensorProto.EXTERNAL
+    value.external_data.add(key="location", value="weights.bin")
+    nodes = [
+        helper.make_node("Constant", [], ["k"], value=value),
+        helper.make_node("Mul", ["x", "k"], ["y"]),
+    ]
+    made = model(nodes, {"x": (FLOAT, [1, 2])}, {"y": (FLOAT, [1, 2])})
+    refused(made, tmp_path, "'k' in another file")
+
+
+def test_images_of_integers_are_refused(tmp_path):
+    node = helper.make_node("Cast", ["image"], ["y"], to=FLOAT)
+    uint8 = onnx.TensorProto.UINT8
+    made = model([node], {"image": (uint8, [1, 3, 4, 4])}, {"y": (FLOAT, [1, 3, 4, 4])})
+    refused(made, tmp_path, "'image', the image, is of integers.*preprocess.scale")

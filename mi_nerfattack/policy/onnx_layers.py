@@ -40,6 +40,11 @@ def max_pool(call: Call) -> torch.Tensor:
     dilations = call.attribute("dilations", [1] * axes)
     x = _padded(call, call.x, kernel, strides, dilations, float("-inf"))
     ceil = bool(call.attribute("ceil_mode", 0))
+    if ceil and any(s > k for s, k in zip(strides, kernel, strict=True)):
+        raise InputError(
+            f"MaxPool: ceil_mode with strides {strides} above the kernel {kernel} is "
+            "not supported; export it without ceil_mode"
+        )
     return _MAX_POOLS[axes](x, kernel, strides, 0, list(dilations), ceil_mode=ceil)
 
 

@@ -179,13 +179,23 @@ def load_onnx(path: Path) -> OnnxNetwork:
             f"{path}: keeps {outside[0]!r} in another file; save it with the weights "
             "inside: onnx.save(onnx.load(FILE), FILE)"
         )
-    return OnnxNetwork(model, str(path))
+    network = OnnxNetwork(model, str(path))
+    if network.inputs[0].whole:
+        raise InputError(
+            f"{path}: input {network.inputs[0].name!r}, the image, is of integers, "
+            "which have no derivative; export the network with a float input, and "
+            "scale the image by policy.preprocess.scale"
+        )
+    return network
 
 
 def _outside(model: Any) -> list[str]:
     """Return names of tensors whose data is in other files."""
     external = 1  # TensorProto.EXTERNAL
-    return [t.name for t in model.graph.initializer if t.data_location == external]
+    tensors = list(model.graph.initializer)
+    for node in model.graph.node:
+        tensors += [t for item in node.attribute for t in (item.t, *item.tensors)]
+    return [t.name or "a constant" for t in tensors if t.data_location == external]
 
 
 def _opset(model: Any, name: str) -> int:

@@ -123,7 +123,7 @@ def constant_of_shape(call: Call) -> torch.Tensor:
     value = call.attribute("value", torch.zeros(1))
     if value.is_floating_point():
         value = value.to(call.device, call.dtype)
-    return value.expand([int(size) for size in call.x.tolist()])
+    return value.reshape(()).expand([int(size) for size in call.x.tolist()])
 
 
 def reshape(call: Call) -> torch.Tensor:
@@ -226,9 +226,9 @@ def _reduction(function: Callable[..., torch.Tensor]) -> Operator:
 
     def run(call: Call) -> torch.Tensor:
         axes = call.integers(1, "axes")
-        if axes is None and call.attribute("noop_with_empty_axes", 0):
+        if not axes and call.attribute("noop_with_empty_axes", 0):
             return call.x
-        axes = list(range(call.x.ndim)) if axes is None else axes
+        axes = axes or list(range(call.x.ndim))
         return function(call.x, axes, keepdim=bool(call.attribute("keepdims", 1)))
 
     return run
