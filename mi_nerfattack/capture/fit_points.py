@@ -27,9 +27,9 @@ from mi_nerfattack.fields.ngp_rows import (
     rows,
     scatter,
 )
+from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.render.march import STOP, Rays, private_gradients
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.frozen import freeze_method
 
 
 class PointStep:

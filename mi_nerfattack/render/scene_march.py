@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.packed_ngp import PackedNGP
+from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.render.march import (
     MAX_INTERVALS,
     March,
@@ -19,7 +20,6 @@ from mi_nerfattack.render.march import (
     seek,
 )
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.frozen import freeze_method
 
 
 class AbstractSceneMarch(ABC):

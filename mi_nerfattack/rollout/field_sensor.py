@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_nerfattack.colour import linear_to_srgb
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
 from mi_nerfattack.render.composite import (
@@ -29,7 +30,6 @@ from mi_nerfattack.render.offset import (
 )
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.taped import taped_march
-from mi_nerfattack.rollout.frozen import freeze_method
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_nerfattack.rollout.frozen import freeze_method
+from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
 
