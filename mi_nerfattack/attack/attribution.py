@@ -17,7 +17,7 @@ from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.rollout.sweep import StepRecorder
 
 #: The gradient of an attack on poses alone.
-UNCHANGED = "gradient by the texture, which was not changed"
+UNCHANGED = "gradient by the unchanged texture"
 
 
 @dataclass(frozen=True, eq=False)
