@@ -220,8 +220,7 @@ def _allowed(node: ast.AST, called: set[int], quoted: set[int]) -> bool:
     if isinstance(node, ast.Attribute):
         return id(node) in called or _is_math(node)
     if isinstance(node, ast.Constant):
-        text = isinstance(node.value, str)
-        if text:
+        if isinstance(node.value, str):
             return id(node) in quoted and _name(node.value)
         return isinstance(node.value, (int, float))
     return isinstance(node, _NODES)
