@@ -115,9 +115,9 @@ class Checkpointed(AbstractCostates):
     """Keeps the policy's memory once a segment; drives each segment again.
 
     For policies with a large memory (stacks of frames) and long drives. Memory: states,
-    the policy's memory once every `segment` periods, and what :class:`KeptBackgrounds`
-    keeps, that memory included, for one segment; least near ``segment = sqrt(T)``. Time: as Replay, and the
-    policy is evaluated once more.
+    the policy's memory once every `segment` periods, and for one segment what
+    :class:`KeptBackgrounds` keeps, that memory included; least near ``segment =
+    sqrt(T)``. Time: as Replay, and the policy is evaluated once more.
 
     Args:
         segment: control periods, at least 1.
