@@ -156,10 +156,10 @@ def test_results_are_evaluated_and_parameters_frozen(rng):
     assert not any(p.requires_grad for p in network.parameters())
 
 
-def test_images_reach_torch_without_a_copy(rng):
+def test_images_reach_pilotnet_without_a_copy(rng):
     seen = []
 
-    class Spy(Constant):
+    class Spy(PilotNet):
         def forward(self, image, goal):
             seen.append(image.data_ptr())
             return super().forward(image, goal)
