@@ -33,8 +33,8 @@ from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.placement import Roadside, Scatter, scene_ground
 from mi_nerfattack.render.camera import from_fov
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.loop import to_state
 from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.loop import to_state
 from mi_nerfattack.vehicle.expert import LaneFollower
 
 pytestmark = pytest.mark.usefixtures("variant")

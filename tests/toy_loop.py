@@ -9,8 +9,8 @@ from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.render.camera import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.posed import Pose, PosedField
-from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.integrators import ExplicitEuler
 from mi_nerfattack.vehicle.route import Route
