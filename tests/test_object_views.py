@@ -205,7 +205,7 @@ class TestCommand:
         kept = tmp_path / "box.checkpoint.safetensors"
         assert kept.is_file() and not out.exists()
         source = str(tmp_path / "box.obj")
-        with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*: fit is"):
+        with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*\n  fit: "):
             Asset(source, out, resume=True, **settings | {"turn_deg": 1.0}).run()
         assert Asset(source, out, resume=True, **settings).run() == 0
         assert out.is_file() and not kept.exists()

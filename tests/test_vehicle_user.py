@@ -325,9 +325,17 @@ def test_functions_that_are_refused(folder, monkeypatch, name, framework, words)
 
 SCENARIO = """\
 name = "test"
-scene = {field = "a", deployment = "a", routes = "a", route = "right"}
-policy = {file = "a"}
-objects = [{id = "one", field = "a", position_m = [1.0, 2.0, 0.0]}]
+[scene]
+field = "a"
+deployment = "a"
+routes = "a"
+route = "right"
+[policy]
+file = "a"
+[[objects]]
+id = "one"
+field = "a"
+position_m = [1.0, 2.0, 0.0]
 [vehicle]
 model = "custom"
 function = "car.py:car"
@@ -346,19 +354,19 @@ def load(folder, text):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('"custom"', '"dubins"', r":7: vehicle.function: has no meaning with model"),
+        ('"custom"', '"dubins"', r":15: vehicle.function: has no meaning with model"),
         ('function = "car.py:car"\n', "", r"vehicle.function: is missing; model"),
         ("control_limit = 1.5\n", "", r"vehicle.control_limit: is missing"),
-        ("car.py:car", "car.py", r":7: vehicle.function: .*pattern"),
-        ("= 1.5", "= -1.5", r":8: vehicle.control_limit: "),
-        ("= 4", "= 2", r":9: vehicle.state_size: .*greater than or equal to 3"),
-        ("= 4", "= 5", r":10: vehicle.rest_state: has 1 numbers; .* needs 2 or none"),
-        ("[5.0]", "[5.0]\nsubsteps = 0", r":11: vehicle.substeps: "),
-        ("[5.0]", "[5.0]\ndelay_steps = -1", r":11: vehicle.delay_steps: "),
+        ("car.py:car", "car.py", r":15: vehicle.function: .*pattern"),
+        ("= 1.5", "= -1.5", r":16: vehicle.control_limit: "),
+        ("= 4", "= 2", r":17: vehicle.state_size: .*greater than or equal to 3"),
+        ("= 4", "= 5", r":18: vehicle.rest_state: has 1 numbers; .* needs 2 or none"),
+        ("[5.0]", "[5.0]\nsubsteps = 0", r":19: vehicle.substeps: "),
+        ("[5.0]", "[5.0]\ndelay_steps = -1", r":19: vehicle.delay_steps: "),
         (
             SCENARIO[SCENARIO.index("model") :],
             'model = "ackermann_rate"\nsteer_time_s = 0.03\n',
-            r":7: vehicle.steer_time_s: .* diverge with rk4: .* raise substeps",
+            r":15: vehicle.steer_time_s: .* diverge with rk4: .* raise substeps",
         ),
     ],
 )
