@@ -295,23 +295,14 @@ def _see(item: Layer, rays: Rays, stop: float) -> March:
 def select(
     wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
 ) -> list[Task]:
-    """Return the task of marching the wanted rays again; none without such rays.
-
-    Their number is rounded up to a power of two by masked rays: Dr.Jit keeps memory
-    that it has freed, size by size, so that with a size of its own for each frame a
-    long drive would take ever more.
-    """
-    found = dr.compress(wanted)
-    count, total = dr.width(found), dr.width(wanted)
-    if not count:
+    """Return the task of marching the wanted rays again; none without such rays."""
+    index = dr.compress(wanted)
+    if not dr.width(index):
         return []
-    slot = dr.arange(mi.UInt32, min(total, 1 << (count - 1).bit_length()))
-    real = slot < dr.opaque(mi.UInt32, count)
-    index = dr.gather(mi.UInt32, found, slot, real)
+
     gains = [rays.gains[k] for k in which] if rays.gains else []
-    rays = pick_rays(replace(rays, gains=gains), index)
-    rays.active &= real
-    return [Task(rays, pick_rays(primal, index), pick_rays(cotangent, index), which)]
+    rays = replace(rays, gains=gains)
+    return [Task(*(pick_rays(x, index) for x in (rays, primal, cotangent)), which)]
 
 
 def depth_composite(layers: list[March]) -> March:
