@@ -28,7 +28,7 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
@@ -41,6 +41,10 @@ from mi_nerfattack.render.posed import PosedField
 MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
 STOP = 1e-3
 PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
+
+
+#: Maps local points, directions in a form of its own, and a mask to density and colour.
+Evaluate = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 @dataclass
@@ -233,7 +237,9 @@ def march(
     Source: appendix A.1 to A.3, with the signs of Mildenhall et al. 2020, eq. 3.
     """
     with dr.suspend_grad():
-        return _march(posed, origin, direction, t_max, jitter, active, stop)
+        rays = Rays(origin, direction, t_max, jitter, active)
+        heading = dr.normalize(posed.turn(direction))
+        return integrate(posed, rays, posed.eval, heading, stop)
 
 
 def march_derivative(  # noqa: D417  one entry describes seven
@@ -280,28 +286,43 @@ def march_derivative(  # noqa: D417  one entry describes seven
         return _march_derivative(mode, posed, rays, primal, cotangent, stop, t_rays)
 
 
-@dr.syntax
-def _march(
-    posed: PosedField,
-    origin: mi.Point3f,
-    direction: mi.Vector3f,
-    t_max: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
-    stop: float,
-) -> March:
-    o, d = posed.to_local(origin, direction)
-    near, far = posed.interval(o, d, t_max)
-    heading = dr.normalize(d)
-    active = mi.Bool(active) & (near < far)
+def enter(
+    posed: PosedField, rays: Rays
+) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool]:
+    """Take rays into a field's frame.
 
+    Returns:
+        local origins and directions, the interval inside the field's box (metres), and
+        which rays have one; each (n,).
+    """
+    o, d = posed.to_local(rays.origin, rays.direction)
+    near, far = posed.interval(o, d, rays.t_max)
+    return o, d, near, far, mi.Bool(rays.active) & (near < far)
+
+
+@dr.syntax
+def integrate(
+    posed: PosedField, rays: Rays, evaluate: Evaluate, towards: Any, stop: float
+) -> March:
+    """Do what :func:`march` does, with an evaluation of the caller's.
+
+    Args:
+        posed: the field's pose, box, steps and occupancy.
+        rays: n rays.
+        evaluate: maps local points (3, n), `towards` and a mask to density, in
+            1/(world metre), and radiance.
+        towards: what `evaluate` needs to know of the rays' directions.
+        stop: transmittance below which a ray ends.
+    """
+    o, d, near, far, active = enter(posed, rays)
+    jitter = rays.jitter
     index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
     tau = mi.Float(0)  # optical depth from the origin to the interval
     radiance = mi.Color3f(0)  # premultiplied radiance so far
     moment = mi.Float(0)  # integral of t sigma T so far
     while active:
         index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        density, colour = posed.eval(o + t * d, heading, active)
+        density, colour = evaluate(mi.Point3f(o + t * d), towards, active)
         x = dr.select(active, density * width, 0)
         weight = dr.exp(-tau) * x * absorption(x)[0]
         radiance += weight * colour
@@ -324,11 +345,8 @@ def _march_derivative(
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     backward = mode == dr.ADMode.Backward
     moving = t_rays is not None
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    heading = dr.normalize(d)
-    jitter = rays.jitter
-    active = mi.Bool(rays.active) & (near < far)
+    o, d, near, far, active = enter(posed, rays)
+    heading, jitter = dr.normalize(d), rays.jitter
 
     index = dr.floor(posed.lattice_index(near))
     tau = mi.Float(0)

@@ -11,14 +11,7 @@ import mitsuba as mi
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.packed_ngp import PackedNGP
 from mi_nerfattack.frozen import freeze_method
-from mi_nerfattack.render.march import (
-    MAX_INTERVALS,
-    March,
-    Rays,
-    absorption,
-    march,
-    seek,
-)
+from mi_nerfattack.render.march import March, Rays, integrate, march
 from mi_nerfattack.render.posed import PosedField
 
 
@@ -103,39 +96,21 @@ class PackedMarch(AbstractSceneMarch):
 
     def _record(self, rays: Rays) -> March:
         with dr.suspend_grad():
-            result = _march(self.posed, self._packed, rays, self.stop)
+            view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
+            result = integrate(self.posed, rays, self._evaluate, view, self.stop)
             for (gain,) in [rays.gains] if rays.gains else []:
                 result.radiance *= gain
         return result
 
+    def _evaluate(
+        self, point: mi.Point3f, view: Any, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        density, colour = self._packed.eval(point, view, active)
+        return self.posed.in_world(density), colour
+
     def _state(self, rays: Rays) -> list[Any]:
         sizes = [dr.width(rays.direction), self._field.layout]
         return [self, self.stop, sizes, self._packed.arrays(), self.posed.state()]
-
-
-@dr.syntax
-def _march(posed: PosedField, packed: PackedNGP, rays: Rays, stop: float) -> March:
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    view = packed.view(dr.normalize(d))
-    jitter = rays.jitter
-    active = mi.Bool(rays.active) & (near < far)
-
-    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
-    tau = mi.Float(0)  # optical depth from the origin to the interval
-    radiance = mi.Color3f(0)  # premultiplied radiance so far
-    moment = mi.Float(0)  # integral of t sigma T so far
-    while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        density, colour = packed.eval(mi.Point3f(o + t * d), view, active)
-        x = dr.select(active, posed.in_world(density) * width, 0)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
-        radiance += weight * colour
-        moment += weight * t
-        tau += x
-        index += 1
-        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
-    return March(radiance, tau * absorption(tau)[0], moment)
 
 
 def _opaque(rays: Rays) -> Rays:
