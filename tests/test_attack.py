@@ -204,7 +204,7 @@ def make_attack(folder):
 
     scenario, _ = load_scenario(folder / "scenario.toml")
     policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
-    return build_attack(build_world(scenario, folder, policy), folder)
+    return build_attack(build_world(scenario, folder, policy))
 
 
 def test_a_checkpoint_continues_bit_for_bit(folder, tmp_path, single_thread):

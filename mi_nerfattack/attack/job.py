@@ -139,7 +139,7 @@ class Job:
         self, world: World, folder: RunFolder, remarks: Callable[[], dict[str, str]]
     ) -> GradientAttack:
         """Do the iterations that are missing; whatever stops them, keep those done."""
-        attack = build_attack(world, self.base)
+        attack = build_attack(world)
         section, checkpoint = self.scenario.attack, folder.checkpoint
         if checkpoint.found:
             checkpoint.restore(attack)

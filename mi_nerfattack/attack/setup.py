@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.objective_builder import build_objective, build_reduction
+from mi_nerfattack.attack.objective_builder import build_reduction
 from mi_nerfattack.attack.parameters import Freedom
 from mi_nerfattack.attack.world import World, initial_states
 from mi_nerfattack.rollout.adjoint import (
@@ -20,15 +18,13 @@ from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.sections import AttackSection
 
 
-def build_attack(world: World, base: str | Path) -> GradientAttack:
+def build_attack(world: World) -> GradientAttack:
     """Make the attack of a scenario, before its first iteration.
 
     Args:
         world: what the scenario describes.
-        base: folder that the scenario's relative paths start from.
 
     Raises:
-        InputError: the objective cannot be made.
         TypeError: the policy has no derivatives.
     """
     scenario, section = world.scenario, world.scenario.attack
@@ -36,7 +32,7 @@ def build_attack(world: World, base: str | Path) -> GradientAttack:
     poses = initial_states(scenario, world.route, section.poses, 2)
     rollout = Rollout(
         loop,
-        build_objective(scenario, world.route, loop.dynamics, base),
+        world.objective,
         scenario.drive.horizon,
         build_reduction(scenario.objective),
         build_adjoint(section),

@@ -22,6 +22,7 @@ from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.render.splats import SplatBackground
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario import Scenario, resolve
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
@@ -54,6 +55,7 @@ class World:
         deployment: sensor in the path-traced scene.
         policy: a policy.AbstractPolicy.
         dynamics: the vehicle.
+        objective: what an attack makes smaller.
         initial: (runs, 3) initial states, the first one nominal.
     """
 
@@ -64,6 +66,7 @@ class World:
     deployment: PathTracedSensor
     policy: Any
     dynamics: AbstractDynamics
+    objective: AbstractObjective
     initial: np.ndarray
 
     def loop(self, sensor: AbstractSensor) -> ClosedLoop:
@@ -118,7 +121,7 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
     camera, mount = build_camera(scenario)
     route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
     dynamics = build_dynamics(scenario.vehicle, base)
-    build_objective(scenario, route, dynamics, base)  # refused before it is driven
+    objective = build_objective(scenario, route, dynamics, base)
     xml = load_scene(resolve(scenario.scene.deployment, base))
     jitter = scenario.seed if scenario.attack.jitter else None
     return World(
@@ -138,6 +141,7 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
         ),
         policy,
         dynamics,
+        objective,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )
 

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import drjit as dr
-import numpy as np
 import torch
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.adapter import to_torch
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 from mi_nerfattack.vehicle.function import (
-    append_rows,
+    AbstractUserDynamics,
     call_model,
-    describe_function,
     require_finite,
-    require_model,
 )
 
 
 @dataclass(frozen=True)
-class TorchDynamics(AbstractDynamics):
+class TorchDynamics(AbstractUserDynamics):
     """Vehicle model `dx/dt = function(state, control)` with derivatives by autograd.
 
     Cost: a call and, in reverse mode, one graph an evaluation; forward mode and an
@@ -40,29 +35,7 @@ class TorchDynamics(AbstractDynamics):
         rest: initial values of the m - 3 columns after theta; zeros if left out.
     """
 
-    function: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-    size: int = 3
-    limit: float = 1.0
-    rest: tuple[float, ...] = ()
-
     recordable: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        require_model("TorchDynamics", self.size, self.limit, self.rest)
-
-    @property
-    def name(self) -> str:
-        """Class and function, as errors call them."""
-        return f"TorchDynamics({describe_function(self.function)})"
-
-    @property
-    def state_size(self) -> int:
-        """Number of columns m."""
-        return self.size
-
-    def extend(self, poses: np.ndarray) -> np.ndarray:
-        """Append `rest` to poses (n, 3): (n, m)."""
-        return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Call the function.
@@ -85,10 +58,6 @@ class TorchDynamics(AbstractDynamics):
             for unit in torch.eye(self.size).to(result)
         ]
         return [_to_state(column, state) for column in torch.stack(rows, 1).unbind(2)]
-
-    def saturate(self, control: Any) -> Any:
-        """Limit the control (n,) with `soft_limit`."""
-        return soft_limit(control, self.limit)
 
     def evaluate(self, state: torch.Tensor, control: torch.Tensor) -> torch.Tensor:
         """Call the function with (n, m) and (n,), and check what it returned."""

@@ -16,7 +16,38 @@ from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 
 
 @dataclass(frozen=True)
-class FunctionDynamics(AbstractDynamics):
+class AbstractUserDynamics(AbstractDynamics):
+    """Vehicle model given as a function, with what describes its state and control."""
+
+    function: Callable[[Any, Any], Any]
+    size: int = 3
+    limit: float = 1.0
+    rest: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_model(type(self).__name__, self.size, self.limit, self.rest)
+
+    @property
+    def name(self) -> str:
+        """Class and function, as errors call them."""
+        return f"{type(self).__name__}({describe_function(self.function)})"
+
+    @property
+    def state_size(self) -> int:
+        """Number of rows m."""
+        return self.size
+
+    def extend(self, poses: np.ndarray) -> np.ndarray:
+        """Append `rest` to poses (n, 3): (n, m)."""
+        return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
+
+    def saturate(self, control: Any) -> Any:
+        """Limit the control (n,) with `soft_limit`."""
+        return soft_limit(control, self.limit)
+
+
+@dataclass(frozen=True)
+class FunctionDynamics(AbstractUserDynamics):
     """Vehicle model `dx/dt = function(state, control)`.
 
     Example, a car that speeds up with the fourth row as its speed:
@@ -38,28 +69,6 @@ class FunctionDynamics(AbstractDynamics):
         rest: initial values of the m - 3 rows after theta; zeros if left out.
     """
 
-    function: Callable[[Any, Any], Any]
-    size: int = 3
-    limit: float = 1.0
-    rest: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_model("FunctionDynamics", self.size, self.limit, self.rest)
-
-    @property
-    def name(self) -> str:
-        """Class and function, as errors call them."""
-        return f"FunctionDynamics({describe_function(self.function)})"
-
-    @property
-    def state_size(self) -> int:
-        """Number of rows m."""
-        return self.size
-
-    def extend(self, poses: np.ndarray) -> np.ndarray:
-        """Append `rest` to poses (n, 3): (n, m)."""
-        return append_rows(poses, self.rest or (0.0,) * (self.size - 3))
-
     def derivative(self, state: Any, control: Any) -> Any:
         """Call the function.
 
@@ -75,10 +84,6 @@ class FunctionDynamics(AbstractDynamics):
                 "write it in Dr.Jit operations, without NumPy and dr.detach"
             )
         return result
-
-    def saturate(self, control: Any) -> Any:
-        """Limit the control (n,) with `soft_limit`."""
-        return soft_limit(control, self.limit)
 
     def check(self, state: Any) -> None:
         """Raise `InputError` where a state (m, n) is not finite."""

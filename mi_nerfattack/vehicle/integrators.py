@@ -20,11 +20,7 @@ from mi_nerfattack.vehicle.linear import solve_columns
 
 @dataclass(frozen=True)
 class AbstractIntegrator(ABC):
-    """One-step method with a zero-order hold on the control.
-
-    `explicit` says that `dG/dx` is the identity, in which case the adjoint has no
-    system to solve.
-    """
+    """One-step method with a zero-order hold on the control."""
 
     @abstractmethod
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
