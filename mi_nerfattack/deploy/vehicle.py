@@ -1,0 +1,66 @@
+"""The interface of simulated vehicles."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+
+
+class AbstractVehicle(ABC):
+    """Vehicle that holds a control for a while.
+
+    Attributes:
+        max_control: largest control that has an effect.
+        control_unit: "rad/s" of a heading rate, or "rad" of a steering angle.
+    """
+
+    max_control: float
+    control_unit: str
+
+    @abstractmethod
+    def reset(self, pose: np.ndarray, speed: float, seed: int = 0) -> None:
+        """Put the vehicle on the ground, driving at its nominal speed.
+
+        Args:
+            pose: (3,), x and y in metres, heading in radians.
+            speed: metres per second, to be kept.
+            seed: of what is random in the vehicle, if anything is.
+        """
+
+    @abstractmethod
+    def advance(self, control: float) -> None:
+        """Hold a control for one period.
+
+        Raises:
+            InputError: the control is not finite, or the vehicle was not reset.
+        """
+
+    @property
+    @abstractmethod
+    def state(self) -> np.ndarray:
+        """State (m,) float64, m >= 3: x, y (metres), heading (radians), others."""
+
+    @property
+    @abstractmethod
+    def body_to_world(self) -> np.ndarray:
+        """Pose (4, 4): x forward, y left, z up, origin on the ground at x, y."""
+
+
+def planar_body(state: np.ndarray) -> np.ndarray:
+    """Return body_to_world (4, 4) of a state (m,) on the ground z = 0."""
+    x, y, theta = state[:3]
+    matrix = np.eye(4)
+    matrix[:2, 0] = np.cos(theta), np.sin(theta)
+    matrix[:2, 1] = -np.sin(theta), np.cos(theta)
+    matrix[:2, 3] = x, y
+    return matrix
+
+
+def require_control(control: float) -> None:
+    """Raise `InputError` unless a control is finite."""
+    if not math.isfinite(control):
+        raise InputError(f"control: {control}; a policy must return finite numbers")
