@@ -101,5 +101,6 @@ class AbstractEnvironment(ABC):
             objects: PosedField each; may be empty.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Let go of what a window, a process or a connection holds."""

@@ -38,5 +38,6 @@ class AbstractView(ABC):
             objects: PosedField each; may be empty.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Let go of what a window or a process holds."""
