@@ -19,6 +19,7 @@ def load_scene(
     path: str | Path,
     parameters: Mapping[str, str] | None = None,
     size_px: tuple[int, int] | None = None,
+    shapes: Mapping[str, Any] | None = None,
 ) -> Any:
     """Load a Mitsuba scene in the active variant.
 
@@ -27,6 +28,7 @@ def load_scene(
         parameters: values of its `$NAME`s, in place of the `<default>` ones.
         size_px: width and height of all films, as if the file gave them; None keeps
             the file's.
+        shapes: `mi.Shape`s by name that the scene gets besides its own.
 
     Returns:
         `mi.Scene`.
@@ -45,6 +47,8 @@ def load_scene(
             state = mi.parser.parse_file(config, str(path), **(parameters or {}))
             if size_px is not None:
                 _resize_films(path, state, size_px)
+            for name, shape in (shapes or {}).items():
+                state.nodes[0].props[name] = shape
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
     except RuntimeError as error:
