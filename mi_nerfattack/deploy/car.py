@@ -1,0 +1,67 @@
+"""Numbers of the cars that drive in the environments."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mi_nerfattack.errors import InputError
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car with front-wheel steering; its state refers to the middle of the rear axle.
+
+    Args:
+        wheelbase: between the axles, metres.
+        width: metres, of departures from the lane.
+        length: metres.
+        track: between the wheels of an axle, metres.
+        wheel_radius: metres.
+        mass: kilograms.
+        max_steer: largest steering angle, radians, below pi / 2.
+        control_unit: of the control that a policy gives: "rad/s" of a heading rate, or
+            "rad" of a steering angle.
+        max_control: largest control that has an effect, in that unit.
+    """
+
+    wheelbase: float = 2.7
+    width: float = 1.8
+    length: float = 4.4
+    track: float = 1.55
+    wheel_radius: float = 0.32
+    mass: float = 1400.0
+    max_steer: float = 0.75
+    control_unit: str = "rad/s"
+    max_control: float = 1.5
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        lengths = ("wheelbase", "width", "length", "track", "wheel_radius")
+        for name in (*lengths, "mass", "max_steer", "max_control"):
+            value = getattr(self, name)
+            if not 0 < value < float("inf"):
+                raise InputError(f"car.{name}: {value!r}; a positive number")
+        if self.max_steer >= math.pi / 2:
+            raise InputError(f"car.max_steer: {self.max_steer!r} rad; below pi / 2")
+        if self.control_unit not in ("rad/s", "rad"):
+            raise InputError(
+                f"car.control_unit: {self.control_unit!r}; 'rad/s' or 'rad'"
+            )
+
+
+#: The full-size car of the intersection, driven by its heading rate.
+CAR = Car()
+
+#: A car of a tenth of the size, as the RACECAR/J, driven by its steering angle.
+SMALL_CAR = Car(
+    wheelbase=0.325,
+    width=0.296,
+    length=0.45,
+    track=0.24,
+    wheel_radius=0.054,
+    mass=4.0,
+    max_steer=0.34,
+    control_unit="rad",
+    max_control=0.34,
+)
