@@ -44,8 +44,8 @@ class Scatter:
         """Draw states (n, 3) at arc lengths (n,), metres."""
         count = len(arc)
         factor = np.where(rng.uniform(size=count) < self.close_share, 0.2, 1.0)
-        lateral = _cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng)
-        heading = _cut_normal(self.heading_sd, self.heading_max, count, rng)
+        lateral = cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng)
+        heading = cut_normal(self.heading_sd, self.heading_max, count, rng)
         states = route.pose_at(arc, factor * lateral)
         # the route's own heading jumps at the vertices of the polyline
         states[:, 2] = route.heading_at(arc) + factor * heading
@@ -126,8 +126,9 @@ def scene_ground(scene: Any, highest_m: float = 0.3) -> Ground:
     return height
 
 
-def _cut_normal(
+def cut_normal(
     sd: float, largest: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
+    """Draw (count,) normal numbers of standard deviation `sd` within +-largest."""
     cut = largest / sd
     return sd * np.asarray(truncnorm.rvs(-cut, cut, size=count, random_state=rng))
