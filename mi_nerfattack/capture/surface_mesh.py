@@ -60,7 +60,7 @@ def field_surface(field: GridField) -> ColouredMesh:
     """
     from skimage.measure import marching_cubes
 
-    voxel = _voxel(field)
+    voxel = voxel_m(field)
     solid = _solid(_voxel_opacity(field, voxel))
     found, faces, _, _ = marching_cubes(solid, _OPAQUE)
     smooth = ndimage.gaussian_filter(solid, _NORMALS_OVER)
@@ -93,8 +93,8 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     Raises:
         InputError: the mesh's box is not that of the object, or it is too fine.
     """
-    voxel = _voxel(field)
-    _check_box(field, mesh, _BOX_OFF * voxel)
+    voxel = voxel_m(field)
+    check_same_box(field, mesh)
     corners = _divided(mesh, voxel)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -105,9 +105,7 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = faces.reshape(-1, 3)
     vertices, normals = rows[first, :3], rows[first, 3:]
-    outside = _density(field, vertices + voxel * normals)
-    inside_out = outside > _density(field, vertices - voxel * normals)
-    side = np.where(inside_out[:, None], -1.0, 1.0)
+    side = np.where(inside_out(field, vertices, normals)[:, None], -1.0, 1.0)
     # a little inside of its triangles, so that a ray at an edge meets their side
     middle, count = np.zeros_like(vertices), np.zeros(len(vertices))
     for corner in range(3):
@@ -118,8 +116,8 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     return ColouredMesh(vertices, faces, normals, colours)
 
 
-def _check_box(field: GridField, mesh: TexturedMesh, margin_m: float) -> None:
-    """Raise InputError unless the mesh has the box of the object.
+def check_same_box(field: GridField, mesh: TexturedMesh) -> None:
+    """Raise InputError unless the mesh has the box of the object, up to two voxels.
 
     A field whose header tells no object is larger than the mesh by an unknown amount.
     """
@@ -127,12 +125,24 @@ def _check_box(field: GridField, mesh: TexturedMesh, margin_m: float) -> None:
     beyond = np.concatenate([lower - low, high - upper])
     if set(OBJECT_BOX) <= field.info.keys():
         beyond = np.abs(beyond)
-    if beyond.max() > margin_m:
+    if beyond.max() > _BOX_OFF * voxel_m(field):
         raise InputError(
             f"{mesh.name}: reaches from {low.round(3)} to {high.round(3)} m, the "
             f"field's object from {lower.round(3)} to {upper.round(3)} m; give the "
             "size and axes that the field was made with"
         )
+
+
+def inside_out(field: GridField, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Tell where a field is denser in front of a surface than behind it, (n,).
+
+    Args:
+        field: the object.
+        points: (n, 3) on the surface, metres.
+        normals: (n, 3), unit vectors.
+    """
+    step = voxel_m(field) * normals
+    return _density(field, points + step) > _density(field, points - step)
 
 
 def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
@@ -176,7 +186,7 @@ def seen_colours(
     Returns:
         (n, 3), float64, linear.
     """
-    voxel, posed = _voxel(field), PosedField(field)
+    voxel, posed = voxel_m(field), PosedField(field)
     far, half = mi.Float((_OUTSIDE + _BEHIND) * voxel), mi.Float(0.5)
     dr.make_opaque(far, half)
     result = np.empty((len(points), 3))
@@ -195,7 +205,8 @@ def seen_colours(
     return result
 
 
-def _voxel(field: GridField) -> float:
+def voxel_m(field: GridField) -> float:
+    """Return the edge of a voxel of the finest level, metres."""
     return float((field.upper - field.lower).max()) / field.layout.max_resolution
 
 

@@ -4,12 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.capture.atlas import Atlas, lay_out
 from mi_nerfattack.capture.mesh import MeshPart, TexturedMesh, mitsuba_shapes
+from mi_nerfattack.capture.object_views import Placement
+from mi_nerfattack.capture.surface_mesh import (
+    check_same_box,
+    field_surface,
+    inside_out,
+    seen_colours,
+    voxel_m,
+)
+from mi_nerfattack.colour import linear_to_uint8
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.posed import Pose
+
+_INWARD = 0.1  # voxels, and of the way to a triangle's middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,3 +81,101 @@ def built_in_shapes(objects: Sequence[BuiltInObject]) -> dict[str, Any]:
         found = mitsuba_shapes(TexturedMesh("built-in object", (placed,)))
         shapes[f"built_in_{index:03d}"] = found["part_000"]
     return shapes
+
+
+def make_built_in(
+    field: GridField,
+    pose: Pose,
+    mesh: str | Path | None = None,
+    placement: Placement | None = None,
+    captured_irradiance: float = np.pi,
+    texel_m: float | None = None,
+) -> BuiltInObject:
+    """Bake the colours of an object's field into a texture of real geometry.
+
+    The colours of a field are radiance in the light of its capture, `L = albedo E /
+    pi`. With one `E = captured_irradiance` for the whole surface, the albedo is
+    `pi L / E`, cut to [0, 1]: shading of the capture stays in the texture.
+
+    Args:
+        field: the object, as attacked.
+        pose: object to world.
+        mesh: the object's own geometry (glTF, OBJ, PLY), which the field was fitted
+            to; None for the surface of the field, as `export` extracts it.
+        placement: size and axes of the mesh that were given to `asset`.
+        captured_irradiance: E, in the field's unit of radiance times steradian; pi,
+            the default, takes radiance as albedo.
+        texel_m: edge of a texel in the object's frame; None for half a voxel.
+
+    Raises:
+        InputError: the mesh cannot be read, is transparent or not the field's object,
+            the field is nowhere opaque, or a number is not positive.
+    """
+    if not 0 < captured_irradiance < np.inf:
+        raise InputError(
+            f"captured_irradiance: {captured_irradiance}; must be positive and finite"
+        )
+    texel = 0.5 * voxel_m(field) if texel_m is None else texel_m
+    if mesh is None:
+        surface = field_surface(field)
+        corners, normals = surface.vertices[surface.faces], surface.normals
+        corner_normals, is_flat = normals[surface.faces], False
+    else:
+        placed = (placement or Placement()).mesh(mesh)
+        check_same_box(field, placed)
+        corners = _outward(field, _solid_corners(placed))
+        corner_normals, is_flat = _flat_normals(corners), True
+    atlas = lay_out(corners, texel)
+    radiance = _texel_colours(field, atlas, corners, corner_normals)
+    albedo = linear_to_uint8(np.pi / captured_irradiance * radiance)
+    return BuiltInObject(
+        corners.reshape(-1, 3),
+        np.arange(3 * len(corners)).reshape(-1, 3),
+        atlas.uv.reshape(-1, 2),
+        atlas.image(albedo),
+        pose,
+        None if is_flat else corner_normals.reshape(-1, 3),
+    )
+
+
+def _solid_corners(mesh: TexturedMesh) -> np.ndarray:
+    """Return all triangles that have an area, (m, 3, 3)."""
+    if not all(part.is_solid for part in mesh.parts):
+        raise InputError(
+            f"{mesh.name}: is partly transparent, which a built-in object cannot be; "
+            "leave out the mesh for the surface of the field"
+        )
+    corners = np.concatenate([part.vertices[part.faces] for part in mesh.parts])
+    return corners[np.linalg.norm(_cross(corners), axis=1) > 0]
+
+
+def _outward(field: GridField, corners: np.ndarray) -> np.ndarray:
+    """Order corners (m, 3, 3) counter-clockwise from where the field is thin."""
+    turned = inside_out(field, corners.mean(1), _flat_normals(corners)[:, 0])
+    return np.where(turned[:, None, None], corners[:, ::-1], corners)
+
+
+def _cross(corners: np.ndarray) -> np.ndarray:
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def _flat_normals(corners: np.ndarray) -> np.ndarray:
+    normals = _cross(corners)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.repeat(normals[:, None], 3, axis=1)
+
+
+def _texel_colours(
+    field: GridField, atlas: Atlas, corners: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Return the radiance (k, 3) that the field shows at an atlas's texels."""
+    points, facing = atlas.interpolate(corners), atlas.interpolate(normals)
+    length = np.linalg.norm(facing, axis=1, keepdims=True)
+    flat = _flat_normals(corners)[atlas.triangles, 0]
+    facing = np.where(length > 1e-3, facing / np.maximum(length, 1e-3), flat)
+    # a little inward, so that a ray at an edge meets the triangle's side of it
+    offset = corners.mean(1)[atlas.triangles] - points
+    away = np.linalg.norm(offset, axis=1, keepdims=True)
+    reach = np.minimum(_INWARD, _INWARD * voxel_m(field) / np.maximum(away, 1e-30))
+    return seen_colours(field, points + reach * offset, facing)
