@@ -1,72 +1,78 @@
-"""Lane-following expert with access to the true state (appendix B.2)."""
+"""The right expert for a route and a vehicle."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
 
-import numpy as np
-
-from mi_nerfattack.vehicle.dynamics import require_positive
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.abstract_expert import AbstractExpert
+from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.vehicle.lane_follower import LaneFollower, SteeringFollower
+from mi_nerfattack.vehicle.pid import PIDExpert
 from mi_nerfattack.vehicle.route import Route
 
-#: Arc length over which the curvature of a polyline is averaged, metres.
-CURVATURE_WINDOW = 1.0
+__all__ = [
+    "AbstractExpert",
+    "LaneFollower",
+    "PIDExpert",
+    "SteeringFollower",
+    "expert_for",
+]
+
+#: Time in which a vehicle passes the look-ahead distance, seconds.
+LOOK_AHEAD_S = 0.5
+
+#: Time in which it passes what the curvature is averaged over, seconds.
+WINDOW_S = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class LaneFollower:
-    """Feed-forward of the route's curvature with feedback of both errors.
+def expert_for(
+    control_unit: str,
+    route: Route,
+    period: float,
+    max_control: float = 1.5,
+    wheelbase: float = 2.7,
+    lag: float = 0.0,
+) -> AbstractExpert:
+    """Make the expert of a route for a vehicle.
 
-    Heading rate `v (kappa - 2 e / d^2 - 2 sin(psi) / d)` for cross-track error e,
-    heading error psi and look-ahead distance d: linearised, pure pursuit of a point
-    at distance d, so deviations decay over d with a damping ratio of 0.7; but the
-    feed-forward does not cut corners, which allows a gain low enough to be imitated.
+    A heading rate is given by `LaneFollower`; a steering angle by `SteeringFollower`
+    on an open route and by `PIDExpert` on a closed one. Distances grow with the
+    route's speed.
 
     Args:
-        route: lane centre to follow.
-        speed: v, metres per second; the route's nominal speed unless given.
-        look_ahead_m: d, metres. Longer is smoother and slower to recover.
-        preview_m: arc length ahead of the vehicle at which the curvature is read,
-            metres; half of what it travels during one step.
-        heading_preview_m: the same for the heading: 0 for an accurate integrator,
-            half a step for explicit Euler, which moves along the chord.
-        max_heading_rate: limit of the result, radians per second.
+        control_unit: "rad/s" or "rad", as of the environment.
+        route: with the speed of the vehicle.
+        period: seconds that a control is held.
+        max_control: limit of the control, in its unit, as of the environment.
+        wheelbase: of the car, metres; has no effect on heading rates.
+        lag: seconds from a control to the vehicle's answer: its steering's time
+            constant and delay.
+
+    Raises:
+        InputError: unknown unit, or a number out of range.
     """
-
-    route: Route
-    speed: float | None = None
-    look_ahead_m: float = 2.5
-    preview_m: float = 0.25
-    heading_preview_m: float = 0.0
-    max_heading_rate: float = 1.5
-
-    def __post_init__(self) -> None:
-        if self.speed is None:
-            object.__setattr__(self, "speed", float(self.route.speed_ms))
-        require_positive(
-            "LaneFollower",
-            speed=float(self.speed or 0),
-            look_ahead_m=self.look_ahead_m,
-            max_heading_rate=self.max_heading_rate,
+    if control_unit not in ("rad/s", "rad"):
+        raise InputError(f"expert: control unit {control_unit!r}; 'rad/s' or 'rad'")
+    require_positive(
+        "expert", period=period, max_control=max_control, wheelbase=wheelbase
+    )
+    if control_unit == "rad":
+        require_steer("expert", max_control)
+    if not 0 <= lag < math.inf:
+        raise InputError(f"expert.lag: {lag!r}; at least 0 seconds")
+    speed = float(route.speed_ms)
+    look_ahead = speed * (LOOK_AHEAD_S + lag)
+    preview, window = speed * (period / 2 + lag), speed * WINDOW_S
+    if control_unit == "rad" and route.closed:
+        return PIDExpert(
+            route, period, wheelbase, max_control, look_ahead, preview, window_m=window
         )
 
-    def control(self, states: Any) -> np.ndarray:
-        """Compute the heading rate of a Dubins vehicle.
+    def follower(limit: float) -> LaneFollower:
+        return LaneFollower(route, speed, look_ahead, preview, 0.0, limit, window)
 
-        Args:
-            states: (n, 3) or (3,), metres and radians.
-
-        Returns:
-            (n,), radians per second, positive to the left, clipped to the limit.
-        """
-        states = np.atleast_2d(np.asarray(states, np.float64))
-        arc, cross_track, _ = self.route.project_numpy(states)
-        heading = self.route.heading_at(arc + self.heading_preview_m)
-        start = arc + self.preview_m - CURVATURE_WINDOW / 2
-        turn = self.route.heading_at(start + CURVATURE_WINDOW)
-        curvature = (turn - self.route.heading_at(start)) / CURVATURE_WINDOW
-        feedback = 2 / self.look_ahead_m * np.sin(states[:, 2] - heading)
-        feedback += 2 / self.look_ahead_m**2 * cross_track
-        rate = float(self.speed or 0) * (curvature - feedback)
-        return np.clip(rate, -self.max_heading_rate, self.max_heading_rate)
+    if control_unit == "rad":
+        fastest = speed * math.tan(max_control) / wheelbase
+        return SteeringFollower(follower(fastest), wheelbase, max_control)
+    return follower(max_control)

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.polyline import (
+    Measures,
+    Operations,
+    Segment,
+    checked_points,
+    edges_of,
+    measure,
+    segment_rows,
+    square_distance,
+)
+from mi_nerfattack.vehicle.route_files import read_entry, read_table
 
-#: Vehicles closer than this to a bend's vertex (metres) are measured from the
-#: segment instead, because the direction to the vertex is then a rounding error.
-VERTEX_RADIUS = 1e-3
+_NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, lambda x: x)
+_DRJIT = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,14 +33,17 @@ class Route:
 
     The cross-track error is the distance to the nearest point of the polyline,
     positive on its left. Before the first and beyond the last point it is measured
-    from the straight prolongation, so that overshooting costs nothing.
+    from the straight prolongation, so that overshooting costs nothing. A closed route
+    leads from the last point to the first and has no ends: its arc length wraps.
 
     Args:
         name: as in the routes file.
         goal: index of the policy's one-hot goal.
-        points: (n, 2), n >= 2, metres, consecutive points differ.
+        points: (n, 2), metres, consecutive points differ; n >= 2, of a closed route
+            n >= 3, and the first is not repeated.
         lane_width_m: metres.
         speed_ms: nominal speed, metres per second.
+        closed: whether it is a loop.
     """
 
     name: str
@@ -38,9 +51,14 @@ class Route:
     points: np.ndarray
     lane_width_m: float = 3.5
     speed_ms: float = 5.0
+    closed: bool = False
 
     def __post_init__(self) -> None:
-        points = checked_points(f"route {self.name!r}", self.points)
+        if not isinstance(self.closed, bool):
+            raise InputError(
+                f"route {self.name!r}: closed {self.closed!r}; true or false"
+            )
+        points = checked_points(f"route {self.name!r}", self.points, self.closed)
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
         if isinstance(self.goal, bool) or not isinstance(self.goal, int):
@@ -60,22 +78,14 @@ class Route:
         """Read one route of a routes file (JSON).
 
         Args:
-            path: file `{NAME: {"goal", "points_m", "lane_width_m", "speed_ms"}}`.
+            path: file `{NAME: {"goal", "points_m", "lane_width_m", "speed_ms"}}`,
+                optionally with `"closed": true`.
             name: key of the route.
 
         Raises:
             InputError: unreadable file, missing route or key, unusable value.
         """
-        table = files.read_json(path)
-        if not isinstance(table, dict):
-            raise InputError(f"{path}: not an object with one key per route")
-        if name not in table:
-            known = ", ".join(map(repr, table)) or "none"
-            raise InputError(f"{path}: no route {name!r}; it has {known}")
-        entry = table[name]
-        keys = {"goal", "points_m", "lane_width_m", "speed_ms"}
-        if not isinstance(entry, dict) or not keys <= set(entry):
-            raise InputError(f"{path}: route {name!r} needs {sorted(keys)}")
+        entry = read_entry(path, name)
         try:
             return cls(
                 name,
@@ -83,23 +93,36 @@ class Route:
                 entry["points_m"],
                 entry["lane_width_m"],
                 entry["speed_ms"],
+                entry["closed"],
             )
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
+    @classmethod
+    def all_from_file(cls, path: str | Path) -> list[Route]:
+        """Read all routes of a file, in its order; raises as `from_file`."""
+        return [cls.from_file(path, name) for name in read_table(path)]
+
+    @cached_property
+    def segments(self) -> np.ndarray:
+        """Numbers of the k segments, (k, 13), read-only; see `polyline.Segment`."""
+        rows = segment_rows(self.points, self.closed)
+        rows.setflags(write=False)
+        return rows
+
     @property
     def edges(self) -> np.ndarray:
-        """Vectors between consecutive points, (n - 1, 2), metres."""
-        return np.diff(self.points, axis=0)
+        """Vectors from each point to the next, (k, 2), metres."""
+        return edges_of(self.points, self.closed)
 
     @property
     def edge_lengths(self) -> np.ndarray:
-        """Lengths of the segments, (n - 1,), metres."""
-        return np.linalg.norm(self.edges, axis=1)
+        """Lengths of the segments, (k,), metres."""
+        return np.array(Segment(*self.segments.T).length)
 
     @property
     def length(self) -> float:
-        """Arc length from the first to the last point, metres."""
+        """Arc length from the first to the last point, or around, metres."""
         return float(self.edge_lengths.sum())
 
     def pose_at(self, s: Any, lateral: Any = 0.0, heading: Any = 0.0) -> np.ndarray:
@@ -107,7 +130,7 @@ class Route:
 
         Args:
             s: arc length in metres, scalar or (n,); outside [0, length] on the
-                prolongation of the first or last segment.
+                prolongation of the first or last segment, or on another lap.
             lateral: offset to the left of the segment, metres.
             heading: angle to the segment's direction, radians.
 
@@ -117,18 +140,15 @@ class Route:
         s, lateral, heading = np.broadcast_arrays(
             *(np.asarray(value, np.float64) for value in (s, lateral, heading))
         )
-        starts = np.concatenate([[0.0], np.cumsum(self.edge_lengths)])
-        last = len(starts) - 2
-        index = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, last)
-        direction = (self.edges / self.edge_lengths[:, None])[index]
-        normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
-        position = (
-            self.points[index]
-            + (s - starts[index])[..., None] * direction
-            + lateral[..., None] * normal
-        )
-        theta = np.arctan2(direction[..., 1], direction[..., 0]) + heading
-        return np.concatenate([position, theta[..., None]], axis=-1)
+        s = s % self.length if self.closed else s
+        starts = Segment(*self.segments.T).arc
+        index = np.maximum(np.searchsorted(starts, s, side="right") - 1, 0)
+        at = Segment(*np.moveaxis(self.segments[index], -1, 0))
+        along = s - at.arc
+        x = at.x + along * at.tangent_x - lateral * at.tangent_y
+        y = at.y + along * at.tangent_y + lateral * at.tangent_x
+        theta = np.arctan2(at.tangent_y, at.tangent_x) + heading
+        return np.stack([x, y, theta], axis=-1)
 
     def heading_at(self, s: Any) -> np.ndarray:
         """Interpolate the direction of the route between segment centres.
@@ -137,132 +157,136 @@ class Route:
             s: arc length, metres, any shape.
 
         Returns:
-            Radians, same shape, continuous along the route (not wrapped).
+            Radians, same shape, continuous along the route and not wrapped: each lap
+            of a closed one adds its whole turn.
         """
-        edges, lengths = self.edges, self.edge_lengths
+        s, edges, lengths = np.asarray(s, np.float64), self.edges, self.edge_lengths
         centres = np.cumsum(lengths) - lengths / 2
-        return np.interp(s, centres, np.unwrap(np.arctan2(edges[:, 1], edges[:, 0])))
+        direction = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
+        if not self.closed:
+            return np.interp(s, centres, direction)
+        around = np.unwrap([direction[-1], direction[0]])[1] - direction[0]
+        laps = np.floor(s / self.length)
+        return laps * around + np.interp(
+            s - laps * self.length,
+            [centres[-1] - self.length, *centres, centres[0] + self.length],
+            [direction[-1] - around, *direction, direction[0] + around],
+        )
 
-    def project_numpy(self, states: Any) -> tuple[np.ndarray, ...]:
+    def curvature_at(self, s: Any, window: float) -> np.ndarray:
+        """Average the curvature of the route, positive to the left.
+
+        Args:
+            s: arc length, metres, any shape.
+            window: arc length around `s` that counts, metres.
+
+        Returns:
+            1 / metres, same shape.
+        """
+        start = np.asarray(s, np.float64) - window / 2
+        return (self.heading_at(start + window) - self.heading_at(start)) / window
+
+    def project_numpy(self, states: Any) -> Measures:
         """Find the nearest point of the route.
 
         Args:
-            states: (n, 3) or (3,), metres and radians.
+            states: (n, m) or (m,), m >= 3, metres and radians.
 
         Returns:
-            Arc length (m, beyond [0, length] on the prolongations), signed
-            cross-track error (m) and heading error (radians, in [-pi, pi)), each (n,).
+            Arc length (m, beyond [0, length] on the prolongations, in [0, length) of
+            a closed route), signed cross-track error (m) and heading error (radians,
+            in [-pi, pi]), each (n,).
         """
-        states = np.atleast_2d(np.asarray(states, np.float64))
-        edges, lengths = self.edges, self.edge_lengths
-        count, rows = len(lengths), np.arange(len(states))
-        offset = states[:, None, :2] - self.points[None, :-1]
-        along = (offset * edges).sum(-1) / lengths**2
-        miss = offset - np.clip(along, 0, 1)[..., None] * edges
-        index = np.argmin((miss**2).sum(-1), axis=1)
-        t = along[rows, index]
-        t = np.where(index > 0, np.maximum(t, 0), t)
-        t = np.where(index < count - 1, np.minimum(t, 1), t)
-        tangent = edges / lengths[:, None]
-        miss = offset[rows, index] - t[:, None] * edges[index]
-        neighbour = np.where(t == 1, index + 1, np.where(t == 0, index - 1, index))
-        neighbour = np.clip(neighbour, 0, count - 1)
-        side = tangent[index] + tangent[neighbour]
-        distance = np.linalg.norm(miss, axis=1)
-        left = side[:, 0] * miss[:, 1] - side[:, 1] * miss[:, 0] >= 0
-        starts = np.concatenate([[0.0], np.cumsum(lengths)])
-        direction = np.arctan2(tangent[index, 1], tangent[index, 0])
-        turn = np.remainder(states[:, 2] - direction + np.pi, 2 * np.pi) - np.pi
-        arc = starts[index] + t * lengths[index]
-        return arc, np.where(left, distance, -distance), turn
+        x, y, theta = np.atleast_2d(np.asarray(states, np.float64)).T[:3]
+        every = Segment(*self.segments.T)
+        square = square_distance(_NUMPY, every, x[:, None], y[:, None])
+        nearest = Segment(*self.segments[np.argmin(square, axis=1)].T)
+        return measure(_NUMPY, nearest, x, y, theta)
 
     def cross_track_numpy(self, states: Any) -> np.ndarray:
-        """Signed cross-track error (n,) in metres of states (n, 3)."""
-        return self.project_numpy(states)[1]
+        """Signed cross-track error (n,) in metres of states (n, m)."""
+        return self.project_numpy(states).cross_track
 
     def heading_error_numpy(self, states: Any) -> np.ndarray:
-        """Heading (n,) relative to the nearest segment, radians in [-pi, pi)."""
-        return self.project_numpy(states)[2]
+        """Heading (n,) relative to the route at its nearest point, in [-pi, pi]."""
+        return self.project_numpy(states).heading_error
+
+    def project(self, state: Any) -> Measures:
+        """Find the nearest point of the route, differentiably.
+
+        The nearest segment is selected with the state detached, by a recorded loop
+        over segments in device memory: one kernel for every route and state. On a
+        medial axis, where they jump, derivatives are those of the selected side.
+
+        Args:
+            state: Dr.Jit array (m, n), m >= 3, metres and radians.
+
+        Returns:
+            Rows (n,), as those of `project_numpy`.
+        """
+        path = _DevicePath(self, state[0])
+        nearest = path.segment(path.nearest(dr.detach(state)))
+        return measure(_DRJIT, nearest, state[0], state[1], state[2])
+
+    def arc_length(self, state: Any) -> Any:
+        """Arc length of the nearest point, differentiable in the position.
+
+        Args:
+            state: Dr.Jit array (m, n), metres and radians.
+
+        Returns:
+            Row (n,), metres; its derivative is the route's direction, and zero where
+            a bend's vertex is nearest.
+        """
+        return self.project(state).arc_length
 
     def cross_track(self, state: Any) -> Any:
         """Signed cross-track error, differentiable in the position.
 
-        The nearest segment is selected with the state detached, by a recorded loop
-        over segments in device memory: one kernel for every route and state. The
-        derivative is the unit vector from the route to the vehicle; on a medial
-        axis, where it jumps, it is that of the selected side.
-
         Args:
-            state: Dr.Jit array (3, n), metres and radians.
+            state: Dr.Jit array (m, n), metres and radians.
 
         Returns:
-            Row (n,), metres, positive to the left.
+            Row (n,), metres, positive to the left; its derivative is the unit vector
+            from the route to the vehicle.
         """
-        path = _DevicePath(self, state[0])
-        index = path.nearest(dr.detach(state))
-        ax, ay = path.point(index)
-        tx, ty, length = path.tangent(index)
-        dx, dy = state[0] - ax, state[1] - ay
-        lateral = tx * dy - ty * dx
-        along = dr.detach(tx * dx + ty * dy)
-        before = (along < 0) & (index > 0)
-        after = (along > length) & (index < path.count - 1)
-        neighbour = dr.select(after, index + 1, dr.select(before, index - 1, index))
-        nx, ny, _ = path.tangent(neighbour)
-        reach = dr.select(after, length, 0)
-        mx, my = dx - reach * tx, dy - reach * ty
-        square = dr.square(mx) + dr.square(my)
-        at_vertex = (before | after) & (dr.detach(square) > VERTEX_RADIUS**2)
-        distance = dr.sqrt(dr.select(at_vertex, square, 1))
-        side = dr.detach((tx + nx) * my - (ty + ny) * mx)
-        return dr.select(at_vertex, dr.copysign(distance, side), lateral)
+        return self.project(state).cross_track
 
     def heading_error(self, state: Any) -> Any:
-        """Heading relative to the nearest segment.
+        """Heading relative to the route at its nearest point.
 
         Args:
-            state: Dr.Jit array (3, n), metres and radians.
+            state: Dr.Jit array (m, n), metres and radians.
 
         Returns:
-            Row (n,), radians in (-pi, pi], differentiable in the heading.
+            Row (n,), radians in [-pi, pi], differentiable in the heading.
         """
-        path = _DevicePath(self, state[0])
-        tx, ty, _ = path.tangent(path.nearest(dr.detach(state)))
-        sin, cos = dr.sincos(state[2])
-        return dr.atan2(tx * sin - ty * cos, tx * cos + ty * sin)
+        return self.project(state).heading_error
 
 
 class _DevicePath:
-    """The points of a route in the memory of a Dr.Jit backend."""
+    """The segments of a route in the memory of a Dr.Jit backend."""
 
     def __init__(self, route: Route, like: Any) -> None:
         """Upload `route` as arrays of the type of the row `like`."""
         self.real: Any = dr.detached_t(type(like))
         self.integer: Any = dr.uint32_array_t(self.real)
-        # lists: memory from NumPy has an alignment of its own, and so its own kernels
-        self.x, self.y = (self.real(column) for column in route.points.T.tolist())
-        self.count = dr.opaque(self.integer, len(route.points) - 1)
+        # a list: memory from NumPy has an alignment of its own, and so its own kernels
+        self.rows = self.real(route.segments.ravel().tolist())
+        self.count = dr.opaque(self.integer, len(route.segments))
 
-    def point(self, index: Any) -> tuple[Any, Any]:
-        """Look up the coordinates of points."""
-        index = self.integer(index)
-        return dr.gather(self.real, self.x, index), dr.gather(self.real, self.y, index)
-
-    def tangent(self, index: Any) -> tuple[Any, Any, Any]:
-        """Look up the unit direction and the length of segments."""
-        (ax, ay), (bx, by) = self.point(index), self.point(index + 1)
-        length = dr.hypot(bx - ax, by - ay)
-        return (bx - ax) / length, (by - ay) / length, length
+    def segment(self, index: Any) -> Segment:
+        """Look up segments."""
+        start = len(Segment._fields) * self.integer(index)
+        columns = range(len(Segment._fields))
+        return Segment(*(dr.gather(self.real, self.rows, start + i) for i in columns))
 
     def nearest(self, state: Any) -> Any:
         """Find for each vehicle the first of the nearest segments, (n,)."""
         px, py = self.real(state[0]), self.real(state[1])
 
-        def measure(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
-            (ax, ay), (tx, ty, length) = self.point(i), self.tangent(i)
-            dx, dy = px - ax, py - ay
-            along = dr.clip(tx * dx + ty * dy, 0, length)
-            square = dr.square(dx - along * tx) + dr.square(dy - along * ty)
+        def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
+            square = square_distance(_DRJIT, self.segment(i), px, py)
             closer = square < shortest
             return (
                 i + 1,
@@ -274,39 +298,11 @@ class _DevicePath:
         _, best, _ = dr.while_loop(
             (start, dr.zeros_like(start), dr.full(self.real, dr.inf, dr.width(px))),
             lambda i, best, shortest: i < self.count,
-            measure,
+            measure_one,
             labels=("segment", "nearest", "square_distance"),
             mode="symbolic",
         )
         return best
-
-
-def checked_points(owner: str, points: Any) -> np.ndarray:
-    """Copy a polyline to (n, 2) float64.
-
-    Raises:
-        InputError: not numbers of that shape, fewer than two points, a value that
-            is not finite, or two equal consecutive points.
-    """
-    try:
-        array = np.array(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{owner}: points are not pairs of numbers") from error
-    if array.ndim != 2 or array.shape[1] != 2 or len(array) < 2:
-        raise InputError(
-            f"{owner}: points of shape {array.shape}; at least two pairs x, y"
-        )
-    if not np.isfinite(array).all():
-        row = int(np.argmin(np.isfinite(array).all(axis=1)))
-        raise InputError(f"{owner}: point {row} is {array[row].tolist()}; finite only")
-    repeated = np.flatnonzero((np.diff(array, axis=0) == 0).all(axis=1))
-    if len(repeated):
-        row = int(repeated[0])
-        raise InputError(
-            f"{owner}: points {row} and {row + 1} are both {array[row].tolist()}; "
-            "remove one"
-        )
-    return array
 
 
 def smooth_absolute(error: Any, width: float = 0.05) -> Any:
