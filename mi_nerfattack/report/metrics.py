@@ -7,7 +7,7 @@ width: the car then touches the lane's edge.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,17 @@ import pydantic
 from mi_nerfattack.errors import InputError
 
 SCHEMA = 1
-ENVIRONMENTS = ("surrogate", "deployment")
-CASES = ("unperturbed", "random", "gradient")
+#: The first two are those of `metrics.json`, the others those of policy cards.
+ENVIRONMENTS = (
+    "surrogate",
+    "deployment",
+    "mitsuba",
+    "mujoco",
+    "mujoco_gl",
+    "replay",
+    "carla",
+)
+CASES = ("unperturbed", "random", "gradient", "clean", "random_objects")
 BOOTSTRAP_RESAMPLES = 9999
 
 
@@ -27,9 +36,9 @@ class Drive:
     """One closed-loop drive of T >= 1 steps; its arrays are read-only float64 copies.
 
     Args:
-        environment: "surrogate" or "deployment".
+        environment: one of `ENVIRONMENTS`.
         route: name of the reference route.
-        case: "unperturbed", "random" or "gradient".
+        case: one of `CASES`.
         run: index among the drives of one route, environment and case, from 0.
         seed: seed of this drive.
         states: (T+1, 3), x and y in metres and heading in radians, initial state
@@ -155,6 +164,40 @@ def summarise(
         figures = _case_figures(ordered, limit_of(route, limits), seed)
         result.setdefault(route, {}).setdefault(environment, {})[case] = figures
     return result
+
+
+def card_figures(
+    drives: Sequence[Drive], limit: float, seed: int = 0
+) -> dict[str, Any]:
+    """Summarise the drives of one environment, route and case for a policy card.
+
+    - `n`, `cross_track_mean_m`, `cross_track_max_m`, `cross_track_mean_ci95_m`: as of
+      `summarise`;
+    - `departures`: number of drives that left the lane;
+    - `departure_rate_ci95`: 95 % interval of their share (Wilson);
+    - `per_run`: by run its seed and steps, its figures, its start (x, y, heading),
+      where and when its error was largest, and when it left the lane (null if it did
+      not).
+
+    Args:
+        drives: at least one.
+        limit: departure limit, metres.
+        seed: of the bootstrap.
+    """
+    ordered = sorted(drives, key=lambda drive: drive.run)
+    means = np.array([drive.distance_m.mean() for drive in ordered])
+    distances = np.concatenate([drive.distance_m for drive in ordered])
+    left = sum(bool(drive.departed(limit).any()) for drive in ordered)
+    return {
+        "n": len(ordered),
+        "cross_track_mean_m": float(distances.mean()),
+        "cross_track_max_m": float(distances.max()),
+        "departures": left,
+        "cross_track_mean_ci95_m": _mean_interval(means, seed),
+        "departure_rate_ci95": _share_interval(left, len(ordered)),
+        "departure_limit_m": limit,
+        "per_run": [_card_run(drive, limit) for drive in ordered],
+    }
 
 
 def metrics_document(
@@ -298,6 +341,30 @@ def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
         "cross_track_total": float(drive.distance_m.sum()),
         "departures": int(drive.departed(limit).sum()),
     }
+
+
+def _card_run(drive: Drive, limit: float) -> dict[str, Any]:
+    worst = int(drive.distance_m.argmax())
+    out = np.flatnonzero(drive.departed(limit))
+    return {
+        "run": drive.run,
+        "seed": drive.seed,
+        "steps": len(drive.distance_m),
+        "cross_track_mean_m": float(drive.distance_m.mean()),
+        "cross_track_max_m": float(drive.distance_m.max()),
+        "start": drive.states[0].tolist(),
+        "worst_at_m": drive.states[1 + worst, :2].tolist(),
+        "worst_time_s": float(drive.time_s[worst]),
+        "departed": bool(len(out)),
+        "departed_time_s": float(drive.time_s[out[0]]) if len(out) else None,
+    }
+
+
+def _share_interval(count: int, total: int) -> list[float]:
+    import scipy.stats  # it takes a second
+
+    interval = scipy.stats.binomtest(count, total).proportion_ci(method="wilson")
+    return [float(interval.low), float(interval.high)]
 
 
 def _mean_interval(means: np.ndarray, seed: int) -> list[float] | None:
