@@ -60,12 +60,12 @@ class CarlaPose:
 
 def point_from_carla(metres: ArrayLike) -> np.ndarray:
     """Convert points or directions (..., 3) of the client API to our axes, metres."""
-    return np.asarray(metres, np.float64) * _MIRROR
+    return np.asarray(metres, np.float64) * _MIRROR + 0.0  # no -0
 
 
 def point_to_carla(metres: ArrayLike) -> np.ndarray:
     """Convert points or directions (..., 3) of ours to the client API's, metres."""
-    return np.asarray(metres, np.float64) * _MIRROR
+    return np.asarray(metres, np.float64) * _MIRROR + 0.0  # no -0
 
 
 def point_from_unreal(centimetres: ArrayLike) -> np.ndarray:
