@@ -12,73 +12,34 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from carla_stand_in_data import (
+    ROAD_HEIGHT,
+    WALL,
+    Image,
+    Location,
+    Map,
+    Rotation,
+    Transform,
+    Vector2D,
+    Vector3D,
+    VehicleControl,
+    VehiclePhysicsControl,
+    Waypoint,
+    WeatherParameters,
+    WheelPhysicsControl,
+    WorldSettings,
+    along,
+)
 
-ROAD_HEIGHT, WALL = 0.25, 20.0  # metres
 COLOUR = (90, 60, 30)  # red, green, blue
 AXLE, WHEELBASE, MAX_STEER_DEG = 1.45, 2.9, 70.0  # metres, degrees
 STEERING_CURVE = ((0.0, 1.0), (20.0, 0.9), (60.0, 0.8))
 TIMEOUT = "time-out of 500ms while waiting for the simulator"
-
-
-@dataclass
-class Location:
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-Vector3D = type("Vector3D", (Location,), {})
-
-
-@dataclass
-class Vector2D:
-    x: float = 0.0
-    y: float = 0.0
-
-
-@dataclass
-class Rotation:
-    pitch: float = 0.0
-    yaw: float = 0.0
-    roll: float = 0.0
-
-
-@dataclass
-class Transform:
-    location: Location = field(default_factory=Location)
-    rotation: Rotation = field(default_factory=Rotation)
-
-
-@dataclass
-class VehicleControl:
-    throttle: float = 0.0
-    steer: float = 0.0
-    brake: float = 0.0
-    hand_brake: bool = False
-
-
-@dataclass
-class WorldSettings:
-    synchronous_mode: bool = False
-    no_rendering_mode: bool = False
-    fixed_delta_seconds: float | None = None
-    substepping: bool = True
-    max_substep_delta_time: float = 0.01
-    max_substeps: int = 10
-
-
-@dataclass
-class WeatherParameters:
-    cloudiness: float = 0.0
-
-
-WeatherParameters.ClearNoon = WeatherParameters(5.0)  # type: ignore[attr-defined]
-WeatherParameters.CloudyNoon = WeatherParameters(60.0)  # type: ignore[attr-defined]
 
 
 class Server:
@@ -311,16 +272,16 @@ class Vehicle(Actor):
         self._control = control
 
     def set_target_velocity(self, velocity: Location) -> None:
-        x, y = _along(self._place.rotation.yaw)
+        x, y = along(self._place.rotation.yaw)
         self._speed = velocity.x * x + velocity.y * y
         assert math.isclose(self._speed, math.hypot(velocity.x, velocity.y))
 
     def get_velocity(self) -> Location:
-        x, y = _along(self._place.rotation.yaw)
+        x, y = along(self._place.rotation.yaw)
         return Vector3D(self._speed * x, self._speed * y, 0.0)
 
     def get_physics_control(self) -> VehiclePhysicsControl:
-        x, y = _along(self._place.rotation.yaw)
+        x, y = along(self._place.rotation.yaw)
         here, wheels = self._place.location, []
         for ahead, side, angle in (
             (AXLE, -0.8, MAX_STEER_DEG),
@@ -357,27 +318,13 @@ class Vehicle(Actor):
     def _roll(self, seconds: float, steer: float) -> None:
         """Move the rear axle, and the origin with it."""
         place = self._place
-        x, y = _along(place.rotation.yaw)
+        x, y = along(place.rotation.yaw)
         way = seconds * self._speed
         rear_x = place.location.x - AXLE * x + way * x
         rear_y = place.location.y - AXLE * y + way * y
         place.rotation.yaw += math.degrees(way / WHEELBASE * math.tan(steer))
-        x, y = _along(place.rotation.yaw)
+        x, y = along(place.rotation.yaw)
         place.location.x, place.location.y = rear_x + AXLE * x, rear_y + AXLE * y
-
-
-@dataclass
-class WheelPhysicsControl:
-    tire_friction: float = 2.0
-    damping_rate: float = 0.25
-    max_steer_angle: float = 70.0
-    position: Location = field(init=False)
-
-
-@dataclass
-class VehiclePhysicsControl:
-    wheels: list[WheelPhysicsControl]
-    steering_curve: list[Vector2D]
 
 
 class Sensor(Actor):
@@ -412,7 +359,7 @@ class Sensor(Actor):
     def _in_world(self) -> Transform:
         assert self._parent is not None
         base, own = self._parent.get_transform(), self._place
-        x, y = _along(base.rotation.yaw)
+        x, y = along(base.rotation.yaw)
         return Transform(
             Location(
                 base.location.x + own.location.x * x - own.location.y * y,
@@ -421,64 +368,6 @@ class Sensor(Actor):
             ),
             Rotation(own.rotation.pitch, base.rotation.yaw + own.rotation.yaw),
         )
-
-
-@dataclass
-class Image:
-    frame: int
-    width: int
-    height: int
-    raw_data: bytes
-    transform: Transform
-
-
-class Map:
-    """Road 1 along x from 0 to 50 m; then 2 straight on, or 3 to the right.
-
-    Road 3 is a quarter of a circle of 10 m and then straight along +y, which is to
-    the right of +x in CARLA's axes.
-    """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def get_waypoint(self, location: Location) -> Waypoint:
-        if location.y > 5:
-            return Waypoint(3, _ARC + max(location.y - 10, 0.0))
-        x = min(max(location.x, 0.0), 100.0)
-        return Waypoint(1, x) if x < 50 else Waypoint(2, x - 50)
-
-
-_ARC = 5 * math.pi  # metres, a quarter of a circle of radius 10 m
-_LENGTHS = {1: 50.0, 2: 50.0, 3: _ARC + 40}
-
-
-@dataclass
-class Waypoint:
-    road_id: int
-    s: float
-
-    lane_id, section_id, lane_width = -1, 0, 3.5
-
-    @property
-    def transform(self) -> Transform:
-        if self.road_id < 3:
-            x = self.s + 50 * (self.road_id - 1)
-            return Transform(Location(x, 0.0, ROAD_HEIGHT))
-        angle = min(self.s / 10, math.pi / 2)
-        x, y = 50 + 10 * math.sin(angle), 10 - 10 * math.cos(angle)
-        y += max(self.s - _ARC, 0.0)
-        return Transform(Location(x, y, ROAD_HEIGHT), Rotation(0, math.degrees(angle)))
-
-    def next(self, distance: float) -> list[Waypoint]:
-        s, length = self.s + distance, _LENGTHS[self.road_id]
-        if s <= length:
-            return [Waypoint(self.road_id, s)]
-        return [Waypoint(i, s - length) for i in (2, 3)] if self.road_id == 1 else []
-
-
-def _along(yaw_deg: float) -> tuple[float, float]:
-    return math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
 
 
 #: Classes that must not differ from those of the same name in the client.
