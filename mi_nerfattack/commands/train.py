@@ -9,54 +9,74 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from mi_nerfattack.policy.imitate import ImitationSettings
-    from mi_nerfattack.policy.worlds import WorldFiles
+    from mi_nerfattack.deploy.registry import Place
+    from mi_nerfattack.policy.imitate import Imitated, ImitationSettings
+    from mi_nerfattack.policy.presets import Preset
+    from mi_nerfattack.policy.sites import AbstractSite
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a driving policy on frames of the surrogate and of the path-traced scene.
+    """Train a driving policy on frames of any environments of a place.
 
     Collects frames (three quarters with an object of random texture beside the road),
-    trains PilotNet to imitate the expert, on request lets it drive and trains it on
-    what it saw (DAgger), and ends with its closed-loop error. Stopped, it continues
-    from DATA. The validation is written beside the policy, as JSON.
+    trains PilotNet to imitate the expert, lets it drive and trains it on what it saw
+    (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA. The
+    validation is written beside the policy, as JSON, and so is the policy as a program
+    of torch.export.
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Policy file to write (.safetensors)."""
     data: Path
     """Folder of frames and checkpoints; made if missing."""
+    preset: str = "laptop"
+    """Sizes of all that is not given here: laptop (about 10,000 frames), intersection
+    (192,000) or room (21,584), the last two as in the paper."""
     scene: Path | None = None
-    """Mitsuba XML of the scene; the bundled intersection by default."""
+    """Mitsuba XML of the scene; the preset's by default."""
     field: Path | None = None
-    """Field file of the scene; bundled by default."""
+    """Field file of the scene, for the surrogate; the preset's by default."""
     object: tuple[Path, ...] = ()
     """Grid fields that stand beside the road; the bundled hydrant by default."""
     routes: Path | None = None
-    """Routes, JSON; bundled by default."""
-    frames_surrogate: int = 4096
-    """Frames rendered from the fields."""
-    frames_deployment: int = 6144
-    """Path-traced frames."""
+    """Routes, JSON; the preset's by default."""
+    frames: dict[str, int] | None = None
+    """Frames by environment, as in: --frames surrogate 4096 mitsuba 6144."""
+    validation_frames: dict[str, int] | None = None
+    """Frames of a collection of their own for the held-out loss, by environment."""
+    more: tuple[Path, ...] = ()
+    """Folders of earlier collections whose frames are trained on, too."""
+    start: Path | None = None
+    """Policy whose weights training starts with; random ones by default."""
+    skies: tuple[str, ...] = ()
+    """Times of day of rendered frames: day, morning, noon, evening, overcast."""
+    exposures_ev: tuple[float, ...] = ()
+    """Exposures of rendered frames, in powers of two."""
     spp: int = 4
-    """Samples per pixel of the path-traced frames."""
-    epochs: int = 8
+    """Samples per pixel of path-traced frames."""
+    epochs: int | None = None
     """Passes over the frames."""
     batch: int = 64
     """Images a training step."""
     learning_rate: float = 1e-3
     """Largest learning rate."""
-    dagger_rounds: int = 0
-    """Rounds in which the policy drives and the expert labels; if the error is high."""
-    dagger_frames: int = 1024
-    """Frames of each world in a round."""
-    dagger_epochs: int = 3
+    dagger_rounds: int | None = None
+    """Rounds in which the policy drives and the expert labels."""
+    dagger_frames: dict[str, int] | None = None
+    """Frames of each round, by environment."""
+    dagger_epochs: int | None = None
     """Passes over all frames after a round."""
+    validate_every: int = 4
+    """Epochs from one validation in the closed loop to the next."""
+    validate_in: tuple[str, ...] = ()
+    """Environments of these validations; all that are used by default."""
     runs: int = 2
-    """Drives of each case of the validation."""
-    objects: int = 3
-    """Objects of random texture that each route is driven past in the validation."""
+    """Drives of each case of the last validation."""
+    objects: int = 1
+    """Objects of random texture beside the road in the last validation."""
+    workers: int | None = None
+    """Processes that collect; one a core by default."""
     seed: int = 0
     """Of all random numbers."""
 
@@ -64,55 +84,118 @@ class Train:
         """Collect, train, validate and write."""
         from rich.console import Console
 
-        from mi_nerfattack import files, variant
+        from mi_nerfattack import variant
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.fit_report import check_output
-        from mi_nerfattack.policy.evaluate import card_table
         from mi_nerfattack.policy.imitate import imitate
-        from mi_nerfattack.policy.worlds import load_deployment, load_surrogate
+        from mi_nerfattack.policy.pilotnet import PilotNet
+        from mi_nerfattack.policy.presets import find_preset
+        from mi_nerfattack.policy.sites import load_routes
+        from mi_nerfattack.policy.workers import Processes, available_cores
+        from mi_nerfattack.report.table import card_table
 
         check_output(self.output)
         variant.ensure()
-        paths = self._paths()
-        routes = paths.load_routes()
-        deployment = load_deployment(paths, self.spp, self.seed)
-        worlds = [load_surrogate(paths), deployment]
+        preset = find_preset(self.preset)
+        place, settings = self._place(preset), self._settings(preset)
+        routes = load_routes(place.routes)
+        start = None if self.start is None else PilotNet.load(self.start)
         with StageBars() as bars:
-            result = imitate(worlds, routes, self._settings(), self.data, bars.show)
-        result.module.save(self.output)
-        card = {**result.card, "training": result.history}
-        files.write_json(self.output.with_suffix(".json"), card)
+            result = imitate(
+                self._sites(preset, place, settings),
+                routes,
+                settings,
+                self.data,
+                Processes(available_cores() if self.workers is None else self.workers),
+                bars.show,
+                start,
+                self._more(),
+            )
+        self._write(result)
         Console().print(card_table(result.card))
-        print(f"{self.output}: written; the validation is in the .json beside it")
+        print(f"{self.output}: written; program and validation are beside it")
         return 0
 
-    def _paths(self) -> WorldFiles:
-        from mi_nerfattack.policy.worlds import WorldFiles
-        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
+    def _place(self, preset: Preset) -> Place:
+        from dataclasses import replace
 
-        return WorldFiles(
-            self.scene or bundled("intersection/scene.xml"),
-            self.field or bundled("intersection/field.safetensors"),
-            self.object or (bundled("hydrant/field.safetensors"),),
-            self.routes or bundled("intersection/routes.json"),
+        from mi_nerfattack.deploy.registry import bundled_place
+
+        place = bundled_place(preset.place)
+        if self.scene is not None:  # the bundled field is not of this scene
+            place = replace(place, scene=self.scene, field=None)
+        return replace(
+            place,
+            field=self.field or place.field,
+            objects=self.object or place.objects,
+            routes=self.routes or place.routes,
         )
 
-    def _settings(self) -> ImitationSettings:
+    def _sites(
+        self, preset: Preset, place: Place, settings: ImitationSettings
+    ) -> list[AbstractSite]:
+        from mi_nerfattack.policy.sites import PlaceSite, Weather
+
+        weather = Weather(
+            self.skies or preset.weather.skies,
+            self.exposures_ev or preset.weather.exposures_ev,
+            self.spp,
+        )
+        counts = (settings.frames, settings.dagger_frames, settings.validation_frames)
+        names = {name: None for part in counts for name in part if part[name]}
+        names |= dict.fromkeys(self.validate_in)
+        return [PlaceSite(name, place, weather) for name in names]
+
+    def _settings(self, preset: Preset) -> ImitationSettings:
+        from dataclasses import replace
+
         from mi_nerfattack.policy.evaluate import EvaluateSettings
         from mi_nerfattack.policy.imitate import ImitationSettings
         from mi_nerfattack.policy.train import TrainSettings
 
+        def given(mine: object, its: object) -> object:
+            return its if mine is None else mine
+
+        base = EvaluateSettings(runs=self.runs, objects=self.objects)
+        chosen: dict = {
+            name: given(getattr(self, name), getattr(preset, name))
+            for name in (
+                "frames",
+                "validation_frames",
+                "dagger_rounds",
+                "dagger_frames",
+                "dagger_epochs",
+            )
+        }
+        epochs = preset.epochs if self.epochs is None else self.epochs
         return ImitationSettings(
-            frames={
-                "surrogate": self.frames_surrogate,
-                "deployment": self.frames_deployment,
-            },
-            dagger_frames=self.dagger_frames,
-            dagger_rounds=self.dagger_rounds,
-            dagger_epochs=self.dagger_epochs,
+            **chosen,
             seed=self.seed,
+            validate_every=self.validate_every,
+            validate_in=self.validate_in,
+            collecting=preset.collecting,
             training=TrainSettings(
-                self.epochs, self.batch, learning_rate=self.learning_rate
+                epochs, self.batch, learning_rate=self.learning_rate
             ),
-            validation=EvaluateSettings(runs=self.runs, objects=self.objects),
+            validation=replace(base, runs=1, objects=0),
+            final=base,
         )
+
+    def _more(self) -> list[Path]:
+        from mi_nerfattack.policy.collect import find_shards
+
+        return [shard for folder in self.more for shard in find_shards(folder)]
+
+    def _write(self, result: Imitated) -> None:
+        from mi_nerfattack import files
+        from mi_nerfattack.policy.export_program import SUFFIX, export_program
+
+        result.module.save(self.output)
+        export_program(result.module, self.output.with_suffix(SUFFIX))
+        document = {
+            "schema": 2,
+            "environments": result.card,
+            "training": result.history,
+            "best_round": result.best_round,
+        }
+        files.write_json(self.output.with_suffix(".json"), document)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,70 +14,49 @@ import numpy as np
 
 from mi_nerfattack import files
 from mi_nerfattack.attack.textures import random_texture
-from mi_nerfattack.deploy.mitsuba import PathTracedSensor
+from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.dataset import write_shard
-from mi_nerfattack.policy.placement import Ground, Roadside, Scatter
+from mi_nerfattack.policy.placement import Roadside, Scatter
+from mi_nerfattack.policy.sites import AbstractSite, as_json
+from mi_nerfattack.policy.sources import AbstractSource, Labelled, Scenery
+from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
-from mi_nerfattack.rollout.loop import ClosedLoop, simulate, to_state
-from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
-from mi_nerfattack.vehicle.dynamics import Dubins
-from mi_nerfattack.vehicle.expert import LaneFollower
-from mi_nerfattack.vehicle.integrators import RK4
+from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
 
-#: Called with frames done and frames wanted; an exception from it stops the work
-#: without loss of whole shards.
-OnFrames = Callable[[int, int], None]
+#: Called with frames done, frames wanted, and the remaining time in seconds.
+OnFrames = Callable[[int, int, float], None]
 
 _DONE = "shard.json"
-_LARGEST_ERROR_M = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """What frames are rendered of.
-
-    Args:
-        name: of the folder that the shards go to, "surrogate" or "deployment".
-        sensor: renders it; its objects are replaced.
-        objects: stand beside the road with random textures; may be empty. Their own
-            textures come back when the work ends.
-        ground: where objects can stand.
-    """
-
-    name: str
-    sensor: FieldSensor | PathTracedSensor
-    objects: tuple[GridField, ...]
-    ground: Ground
+_MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
 class CollectSettings:
-    """Choices of a collection; the same settings and world give the same frames.
+    """Choices of a collection; the same settings and site give the same frames.
 
     Args:
-        frames: wanted, rounded up to whole groups.
+        frames: wanted.
         seed: of everything random.
-        group: frames that share a place and an object, rendered together.
+        shard: frames that are written together, under the same conditions.
+        group: states that are drawn around one place, with the same object.
         groups_a_texture: groups that share a texture.
-        groups_a_shard: groups that are written together.
         object_share: share of the groups with an object.
         original_share: share of these where it keeps its own texture.
         spread_m: states of a group lie within this arc length of their centre.
         ahead_m: arc length from a group's centre to its object, range.
-        margin_m: arc length before and after the route, from where frames come too.
+        margin_m: arc length before and after an open route, from where frames come
+            too.
         scatter: deviations of the states from the route.
         roadside: sizes and places of the objects.
     """
 
     frames: int = 9000
     seed: int = 0
+    shard: int = 256
     group: int = 8
     groups_a_texture: int = 2
-    groups_a_shard: int = 32
     object_share: float = 0.75
     original_share: float = 0.1
     spread_m: float = 3.0
@@ -86,7 +66,7 @@ class CollectSettings:
     roadside: Roadside = field(default_factory=Roadside)
 
     def __post_init__(self) -> None:
-        for name in ("frames", "group", "groups_a_texture", "groups_a_shard"):
+        for name in ("frames", "shard", "group", "groups_a_texture"):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise InputError(f"CollectSettings.{name}: {value!r}; at least 1")
@@ -99,141 +79,223 @@ class CollectSettings:
     @property
     def shards(self) -> int:
         """Number of shards."""
-        return -(-self.frames // (self.group * self.groups_a_shard))
+        return -(-self.frames // self.shard)
 
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Frames (k, height, width, 3) uint8, goal, controls (k,) rad/s."""
-
-    frames: np.ndarray
-    goal: int
-    controls: np.ndarray
+    def size(self, index: int) -> int:
+        """Return the number of frames of a shard; the last one may have fewer."""
+        return min(self.shard, self.frames - index * self.shard)
 
 
 def collect(
-    world: World,
+    site: AbstractSite,
     routes: Sequence[Route],
+    source: AbstractSource,
     settings: CollectSettings,
     folder: str | Path,
-    origin: str = "",
-    progress: OnFrames = lambda done, total: None,
+    workers: AbstractWorkers,
+    progress: OnFrames = lambda done, total, left_s: None,
 ) -> list[Path]:
     """Render what vehicles near the routes see, and label it by the expert.
 
-    Shards that are complete are kept; each has random numbers of its own, so an
-    interrupted collection continues as if it had not stopped.
+    Shards that are complete are kept; each has random numbers of its own. So the
+    frames depend neither on the number of workers nor on interruptions, however hard.
 
     Args:
-        world: to render.
-        routes: they take turns by chance.
+        site: makes the environments, and gives objects and ground.
+        routes: they take turns by chance, longer ones more often.
+        source: of the states.
         settings: see there.
-        folder: gets `<world.name>/shard_0000` and so on, and a manifest.
-        origin: any text that identifies scene, fields and sensor, for the manifest.
-        progress: called after each group.
+        folder: gets `<site.name>/shard_0000` and so on, and a manifest.
+        workers: who renders.
+        progress: called now and then; an exception from it stops the work.
 
     Returns:
         The folders of the shards, in order.
 
     Raises:
-        InputError: the folder holds frames of other settings or another origin.
+        InputError: the folder holds frames of other settings, files, routes or states;
+            a file cannot be written; a worker ended.
     """
+    root = files.make_folder(Path(folder) / site.name)
+    about = {
+        "settings": asdict(settings),
+        "site": site.describe(),
+        "source": source.describe(),
+        "routes": _digest(routes),
+    }
+    _claim(root, about)
+    paths = [root / f"shard_{index:04d}" for index in range(settings.shards)]
+    missing = [i for i, path in enumerate(paths) if not _is_done(path)]
+    counter = _Counter(settings, missing, progress)
+    work = _Shards(site, tuple(routes), source, settings, root)
+    workers.run(work, missing, counter.add)
+    return paths
 
-    def groups(stage: _Stage, rng: np.random.Generator, step: int) -> Iterator[_Group]:
-        states = _draw_states(routes, settings, rng)
-        for number in range(settings.groups_a_shard):
-            route, arc, poses = next(states)
-            stage.dress(route, arc, number, rng)
-            seen = world.sensor.observe(to_state(poses), step + number)
-            controls = LaneFollower(route).control(poses)
-            yield _Group(to_uint8(seen.image), route.goal, controls)
 
-    about = {"origin": origin, "routes": _digest(routes)}
-    return _write(world, settings, folder, about, groups, progress)
+@dataclass(frozen=True, eq=False)
+class _Shards(AbstractWork):
+    """The shards of a collection, as work for one or more processes."""
+
+    site: AbstractSite
+    routes: tuple[Route, ...]
+    source: AbstractSource
+    settings: CollectSettings
+    root: Path
+
+    def open(self) -> _Stage:
+        """Load objects, ground and what the source needs."""
+        return _Stage(self.site, self.settings, self.source.prepare())
+
+    def do(self, opened: _Stage, index: int, report: OnUnits) -> None:
+        """Render, label and write one shard."""
+        rng = np.random.default_rng(
+            [self.settings.seed, index, *self.site.name.encode()]
+        )
+        conditions = self.site.draw(rng)
+        environment = opened.environment(conditions)
+        wanted, rows = self.settings.size(index), []
+        images: list[np.ndarray] = []
+        for goal, (image, control) in self._rows(opened, environment, rng):
+            rows.append((goal, control))
+            images.append(image)
+            report(1)
+            if len(rows) == wanted:
+                break
+        goals, controls = (np.array(column) for column in zip(*rows, strict=True))
+        self._finish(index, np.stack(images), goals, controls, conditions)
+
+    def close(self, opened: _Stage) -> None:
+        """Close the environment."""
+        opened.close()
+
+    def _rows(
+        self, stage: _Stage, environment: AbstractEnvironment, rng: np.random.Generator
+    ) -> Iterator[tuple[int, Labelled]]:
+        """Yield goals and labelled frames without end."""
+        car, period = self.site.car, environment.period
+        experts = {
+            route.name: expert_for(
+                environment.control_unit,
+                route,
+                period,
+                environment.max_control,
+                car.wheelbase,
+            )
+            for route in self.routes
+        }
+        states = _draw_states(self.routes, self.settings, rng)
+        for number, (route, arc, poses) in enumerate(states):
+            stage.dress(environment, route, arc, number, rng)
+            scenery = Scenery(environment, route, experts[route.name], poses, rng)
+            for labelled in self.source.frames(stage.prepared, scenery):
+                yield route.goal, labelled
+
+    def _finish(
+        self,
+        index: int,
+        images: np.ndarray,
+        goals: np.ndarray,
+        controls: np.ndarray,
+        conditions: Any,
+    ) -> None:
+        """Write one shard and, last, the file that says that it is complete."""
+        shard = self.root / f"shard_{index:04d}"
+        write_shard(shard, images, goals, controls)
+        counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
+        about = {
+            "frames": len(goals),
+            "goals": counts,
+            "conditions": asdict(conditions),
+        }
+        files.write_json(shard / _DONE, about)
 
 
-def collect_visited(
-    world: World,
-    routes: Sequence[Route],
-    policy: Any,
-    settings: CollectSettings,
-    folder: str | Path,
-    origin: str = "",
-    horizon: int = 16,
-    progress: OnFrames = lambda done, total: None,
-) -> list[Path]:
-    """Let the policy drive, and label what it sees by the expert.
-
-    A DAgger round (Ross et al. 2011) with the policy alone at the wheel. Drives
-    start scattered around a place on the route and end after `horizon` steps of
-    0.1 s; states farther than 2 m from the route are dropped.
+class _Stage:
+    """What a worker keeps from shard to shard: one environment, objects, ground.
 
     Args:
-        world: to render.
-        routes: they take turns by chance.
-        policy: AbstractPolicy that drives.
-        settings: a group is the vehicles that drive at the same time.
-        folder: as for `collect`.
-        origin: as for `collect`; must identify the policy too.
-        horizon: steps of a drive.
-        progress: called after each group.
-
-    Returns:
-        The folders of the shards, in order.
+        site: see `collect`.
+        settings: see `collect`.
+        prepared: what the source needs.
     """
-    tape = _Tape(world.sensor)
 
-    def groups(stage: _Stage, rng: np.random.Generator, step: int) -> Iterator[_Group]:
-        tape.seed = step * horizon
-        states = _draw_states(routes, settings, rng)
-        wanted, found, number = settings.group * settings.groups_a_shard, 0, 0
-        while found < wanted:
-            route, arc, poses = next(states)
-            stage.dress(route, arc, number, rng)
-            group = _drive(tape, policy, route, poses, horizon)
-            left = wanted - found
-            group = _Group(group.frames[:left], group.goal, group.controls[:left])
-            found, number = found + len(group.controls), number + 1
-            yield group
+    def __init__(
+        self, site: AbstractSite, settings: CollectSettings, prepared: Any
+    ) -> None:
+        self.site, self.settings, self.prepared = site, settings, prepared
+        self.objects = site.load_objects() if settings.object_share > 0 else []
+        self.own = [item.texture.numpy().copy() for item in self.objects]
+        self.ground = site.load_ground() if self.objects else None
+        self._open: tuple[Any, AbstractEnvironment] | None = None
 
-    about = {"origin": origin, "routes": _digest(routes), "horizon": horizon}
-    return _write(world, settings, folder, about, groups, progress)
+    def environment(self, conditions: Any) -> AbstractEnvironment:
+        """Return the environment under conditions; it is loaded where they differ."""
+        if self._open is None or self._open[0] != conditions:
+            self.close()
+            self._open = conditions, self.site.open(conditions)
+        return self._open[1]
+
+    def close(self) -> None:
+        """Close the environment."""
+        if self._open is not None:
+            self._open[1].close()
+        self._open = None
+
+    def dress(
+        self,
+        environment: AbstractEnvironment,
+        route: Route,
+        arc: float,
+        number: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Put an object beside the road, or none; change its texture now and then.
+
+        Args:
+            environment: shows it.
+            route: beside which it stands.
+            arc: arc length of the group's centre, metres.
+            number: of the group in its shard.
+            rng: source of all draws.
+        """
+        settings = self.settings
+        if self.ground is None:
+            environment.show([])
+            return
+        turn, rest = divmod(number, settings.groups_a_texture)
+        index = turn % len(self.objects)
+        chosen = self.objects[index]
+        if rest == 0:
+            keep = rng.uniform() < settings.original_share
+            texture = random_texture(chosen, "mixed", int(rng.integers(2**31)))
+            chosen.set_parameter("texture", self.own[index] if keep else texture)
+        posed = []
+        if rng.uniform() < settings.object_share:
+            reach = (arc + settings.ahead_m[0], arc + settings.ahead_m[1])
+            pose = settings.roadside.place(chosen, route, reach, self.ground, rng)
+            posed = [PosedField(chosen, pose)]
+        environment.show(posed)
 
 
-def to_uint8(image: Any) -> np.ndarray:
-    """Round an image tensor in [0, 1] to uint8, same shape."""
-    return np.round(255 * np.clip(np.array(image), 0, 1)).astype(np.uint8)
+class _Counter:
+    """Adds up the frames of all workers, and tells how long the rest will take."""
 
+    def __init__(
+        self, settings: CollectSettings, missing: Sequence[int], progress: OnFrames
+    ) -> None:
+        self.total, self.progress = settings.frames, progress
+        self.done = self.total - sum(settings.size(index) for index in missing)
+        self.first, self.start = self.done, time.monotonic()
+        if missing:
+            progress(self.done, self.total, float("nan"))
+        else:
+            progress(self.total, self.total, 0.0)
 
-class _Tape(AbstractSensor):
-    """Sensor that keeps the images it passes on, and counts steps over all drives."""
-
-    def __init__(self, sensor: FieldSensor | PathTracedSensor) -> None:
-        self.sensor = sensor
-        self.frames: list[np.ndarray] = []
-        self.seed = 0
-
-    def observe(self, state: Any, step: int) -> Observation:
-        """Render and keep."""
-        self.seed += 1
-        seen = self.sensor.observe(state, self.seed)
-        self.frames.append(to_uint8(seen.image))
-        return seen
-
-
-def _drive(
-    tape: _Tape, policy: Any, route: Route, poses: np.ndarray, horizon: int
-) -> _Group:
-    """Record one batch of drives and label the states."""
-    tape.frames.clear()
-    dynamics = Dubins(speed=route.speed_ms)
-    loop = ClosedLoop(tape, policy, route.goal, dynamics, RK4(), 0.1)
-    trajectory = simulate(loop, to_state(poses), horizon)
-    # (n, horizon, 3) -> horizon blocks of n, as the frames lie
-    states = trajectory.states_numpy()[:, :-1].transpose(1, 0, 2).reshape(-1, 3)
-    near = np.abs(route.cross_track_numpy(states)) < _LARGEST_ERROR_M
-    frames = np.concatenate(tape.frames)
-    return _Group(frames[near], route.goal, LaneFollower(route).control(states[near]))
+    def add(self, frames: int) -> None:
+        """Count frames that were just rendered."""
+        self.done += frames
+        pace = (time.monotonic() - self.start) / (self.done - self.first)
+        self.progress(self.done, self.total, pace * (self.total - self.done))
 
 
 def _draw_states(
@@ -243,107 +305,34 @@ def _draw_states(
     lengths = np.array([route.length for route in routes])
     while True:
         route = routes[rng.choice(len(routes), p=lengths / lengths.sum())]
-        margin = settings.margin_m
+        margin = 0.0 if route.closed else settings.margin_m
         centre = float(rng.uniform(-margin, route.length + margin))
         spread = rng.uniform(-settings.spread_m, settings.spread_m, settings.group)
         arc = np.clip(centre + spread, -margin, route.length + margin)
         yield route, centre, settings.scatter.states(route, arc, rng)
 
 
-class _Stage:
-    """Changes the objects of a world from group to group.
+def find_shards(folder: str | Path) -> list[Path]:
+    """Return the complete shards anywhere below a folder, in order of their names.
 
-    Args:
-        world: whose sensor and objects are changed.
-        settings: see there.
+    Raises:
+        InputError: there are none.
     """
-
-    def __init__(self, world: World, settings: CollectSettings) -> None:
-        self.world, self.settings = world, settings
-        self.own = [item.texture.numpy() for item in world.objects]
-
-    def dress(
-        self, route: Route, arc: float, number: int, rng: np.random.Generator
-    ) -> None:
-        """Put an object beside the road, or none; change its texture now and then.
-
-        Args:
-            route: beside which it stands.
-            arc: arc length of the group's centre, metres.
-            number: of the group in its shard.
-            rng: source of all draws.
-        """
-        sensor, settings = self.world.sensor, self.settings
-        sensor.objects = []
-        if not self.world.objects:
-            return
-        turn, rest = divmod(number, settings.groups_a_texture)
-        index = turn % len(self.world.objects)
-        chosen = self.world.objects[index]
-        if rest == 0:
-            keep = rng.uniform() < settings.original_share
-            texture = random_texture(chosen, "mixed", int(rng.integers(2**31)))
-            chosen.set_parameter("texture", self.own[index] if keep else texture)
-        if rng.uniform() < settings.object_share:
-            reach = (arc + settings.ahead_m[0], arc + settings.ahead_m[1])
-            place = settings.roadside.place
-            pose = place(chosen, route, reach, self.world.ground, rng)
-            sensor.objects = [PosedField(chosen, pose)]
-
-    def restore(self) -> None:
-        """Give the objects their own textures back."""
-        self.world.sensor.objects = []
-        for item, texture in zip(self.world.objects, self.own, strict=True):
-            item.set_parameter("texture", texture)
+    found = sorted(path.parent for path in Path(folder).rglob(_DONE))
+    if not found:
+        raise InputError(
+            f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
+        )
+    return found
 
 
-def _write(
-    world: World,
-    settings: CollectSettings,
-    folder: str | Path,
-    about: dict[str, Any],
-    groups: Callable[[_Stage, np.random.Generator, int], Iterator[_Group]],
-    progress: OnFrames,
-) -> list[Path]:
-    """Write the shards that are not there yet."""
-    root = files.make_folder(Path(folder) / world.name)
-    _claim(root, {"settings": asdict(settings), **about})
-    stage = _Stage(world, settings)
-    size = settings.group * settings.groups_a_shard
-    done, paths = 0, []
-    try:
-        for index in range(settings.shards):
-            shard = root / f"shard_{index:04d}"
-            paths.append(shard)
-            if (shard / _DONE).is_file():
-                done += size
-                progress(done, settings.shards * size)
-                continue
-            entropy = [settings.seed, index, *world.name.encode()]
-            step = index * settings.groups_a_shard
-            parts = []
-            for part in groups(stage, np.random.default_rng(entropy), step):
-                parts.append(part)
-                done += len(part.controls)
-                progress(done, settings.shards * size)
-            _finish(shard, parts)
-    finally:
-        stage.restore()
-    return paths
-
-
-def _finish(shard: Path, parts: list[_Group]) -> None:
-    """Write one shard and, last, the file that says that it is complete."""
-    goals = np.concatenate([np.full(len(part.controls), part.goal) for part in parts])
-    controls = np.concatenate([part.controls for part in parts])
-    write_shard(shard, np.concatenate([part.frames for part in parts]), goals, controls)
-    counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
-    files.write_json(shard / _DONE, {"frames": len(goals), "goals": counts})
+def _is_done(shard: Path) -> bool:
+    return (shard / _DONE).is_file()
 
 
 def _claim(root: Path, about: dict[str, Any]) -> None:
     """Write the manifest, or compare it with the one that is there."""
-    path, about = root / "manifest.json", json.loads(json.dumps(about))
+    path, about = root / _MANIFEST, as_json(about)
     if path.is_file():
         found = files.read_json(path)
         if found != about:
@@ -353,10 +342,18 @@ def _claim(root: Path, about: dict[str, Any]) -> None:
                 f"{path}: the frames there differ in {', '.join(wrong)}; "
                 "choose another folder or remove this one"
             )
+        return
+    if any(_is_done(shard) for shard in root.glob("shard_*")):
+        raise InputError(
+            f"{root}: holds frames without {_MANIFEST}; choose another folder or "
+            "remove this one"
+        )
     files.write_json(path, about)
 
 
 def _digest(routes: Sequence[Route]) -> str:
-    """Return a checksum of names, goals, points and speeds."""
-    text = json.dumps([[r.name, r.goal, r.speed_ms, r.points.tolist()] for r in routes])
+    """Return a checksum of names, goals, points, speeds and shapes."""
+    text = json.dumps(
+        [[r.name, r.goal, r.speed_ms, r.closed, r.points.tolist()] for r in routes]
+    )
     return hashlib.sha256(text.encode()).hexdigest()

@@ -28,18 +28,24 @@ class PilotNet(nn.Module):
 
     Args:
         goals: number of goals, at least 1.
-        max_control: the output lies in (-max_control, max_control), rad/s.
+        max_control: the output lies in (-max_control, max_control).
+        unit: of the output: "rad/s" of a heading rate, or "rad" of a steering angle.
     """
 
-    def __init__(self, goals: int = 3, max_control: float = 1.5) -> None:
+    def __init__(
+        self, goals: int = 3, max_control: float = 1.5, unit: str = "rad/s"
+    ) -> None:
         """Initialise with torch's global random generator."""
         super().__init__()
         if not isinstance(goals, int) or goals < 1:
             raise InputError(f"PilotNet.goals: {goals!r}; an integer of at least 1")
         if not 0 < max_control < float("inf"):
             raise InputError(f"PilotNet.max_control: {max_control!r}; positive only")
+        if unit not in ("rad/s", "rad"):
+            raise InputError(f"PilotNet.unit: {unit!r}; 'rad/s' or 'rad'")
         self.goals = goals
         self.max_control = float(max_control)
+        self.unit = unit
         self.features = nn.Sequential(
             nn.Conv2d(3, 24, 5, stride=2),
             nn.ELU(),
@@ -73,7 +79,7 @@ class PilotNet(nn.Module):
             goal: (n,) integers in [0, goals).
 
         Returns:
-            (n,), rad/s, positive to the left.
+            (n,), in `unit`, positive to the left.
         """
         one_hot = nn.functional.one_hot(goal, self.goals).to(image.dtype)
         features = self.features(2 * image - 1)
@@ -90,7 +96,7 @@ class PilotNet(nn.Module):
             "architecture": ARCHITECTURE,
             "goals": json.dumps(self.goals),
             "max_control": json.dumps(self.max_control),
-            "unit": "rad/s",
+            "unit": self.unit,
             "image": "sRGB in [0, 1], (n, 3, 66, 200)",
         }
         files.write_safetensors(path, tensors, metadata)
@@ -114,7 +120,7 @@ class PilotNet(nn.Module):
                 raise ValueError(f"goals {goals!r}")
             if not isinstance(max_control, float):
                 raise ValueError(f"max_control {max_control!r}")
-            network = cls(goals, max_control)
+            network = cls(goals, max_control, metadata.get("unit", "rad/s"))
         except (KeyError, ValueError) as error:
             raise InputError(f"{path}: unusable metadata: {error}") from error
         load_checked(network, tensors, str(path))

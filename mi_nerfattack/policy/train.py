@@ -17,6 +17,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.augment import Augmentation
 from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.pilotnet import PilotNet, load_checked
+from mi_nerfattack.policy.validation import AbstractValidation, LossAlone, rank
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class TrainSettings:
         learning_rate: largest rate; warms up linearly over a twentieth of the steps,
             then falls along a cosine to a hundredth.
         weight_decay: of AdamW.
-        held_out: fraction of rows kept for validation.
+        held_out: fraction of rows kept for validation, unless there are others.
         seed: of the split, the order and the augmentation.
         augmentation: changes of the training images.
     """
@@ -70,8 +71,14 @@ def fit_policy(
     checkpoint: str | Path | None = None,
     device: str = "cpu",
     progress: Callable[[Progress], None] | None = None,
-) -> list[dict[str, float]]:
+    held_out: FrameDataset | None = None,
+    validation: AbstractValidation | None = None,
+) -> list[dict[str, Any]]:
     """Train a policy and leave the weights of its best epoch in it.
+
+    Best is the epoch with the fewest departures in the closed loop, among these that of
+    the least mean error to a millimetre, among these that of the least held-out loss.
+    Without a validation in the closed loop the loss alone decides.
 
     The loss is the mean squared difference of control divided by the largest
     control. With a checkpoint, each epoch ends by writing it atomically, and a run
@@ -84,24 +91,33 @@ def fit_policy(
         checkpoint: safetensors file of the whole state, or None.
         device: torch device of the computation.
         progress: called after each step; an exception from it ends the training.
+        held_out: frames of another collection for the loss, in place of a part of
+            `data`.
+        validation: in the closed loop; None for none.
 
     Returns:
-        A row for each epoch: `train_loss`, `held_out_loss`, `held_out_error`, the
-        mean absolute error in rad/s.
+        A row for each epoch: `train_loss`, `held_out_loss`, `held_out_error` (the mean
+        absolute error in rad/s), and what the validation measured.
 
     Raises:
         InputError: goals or controls out of the policy's range; a checkpoint of
             other settings or data; a loss that is not finite.
     """
     _check_labels(module, data)
-    train_rows, held_rows = data.split(settings.held_out, settings.seed)
+    if held_out is None:
+        train_rows, held_rows = data.split(settings.held_out, settings.seed)
+        held = Part(data, held_rows)
+    else:
+        _check_labels(module, held_out)
+        train_rows, held = np.arange(len(data)), Part.of_all(held_out)
     module.to(device).requires_grad_(True)
-    run = _Run(module, data, settings, device, len(train_rows))
+    parts = Part(data, train_rows), held
+    run = _Run(module, parts, settings, device, validation or LossAlone())
     if checkpoint is not None and Path(checkpoint).exists():
         run.restore(checkpoint)
     for epoch in range(len(run.history), settings.epochs):
-        train_loss = run.epoch(epoch, train_rows, progress)
-        held_loss, held_error = run.validate(held_rows)
+        train_loss = run.epoch(epoch, progress)
+        held_loss, held_error = run.validate()
         run.record(train_loss, held_loss, held_error)
         if checkpoint is not None:
             run.save(checkpoint)
@@ -110,37 +126,51 @@ def fit_policy(
     return run.history
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Rows (k,) of a dataset."""
+
+    data: FrameDataset
+    rows: np.ndarray
+
+    @classmethod
+    def of_all(cls, data: FrameDataset) -> Part:
+        """Take all rows of a dataset."""
+        return cls(data, np.arange(len(data)))
+
+    def describe(self) -> list[float]:
+        """Return what tells datasets apart: rows, sums of controls and their sizes."""
+        controls = self.data.controls
+        return [len(self.rows), float(controls.sum()), float(np.abs(controls).sum())]
+
+
 class _Run:
     """State of a training run: weights, best weights, optimiser, history."""
 
     def __init__(
         self,
         module: PilotNet,
-        data: FrameDataset,
+        parts: tuple[Part, Part],
         settings: TrainSettings,
         device: str,
-        rows: int,
+        validation: AbstractValidation,
     ) -> None:
-        self.module, self.data, self.settings = module, data, settings
+        self.module, self.settings, self.validation = module, settings, validation
+        self.part, self.held = parts
         self.device = torch.device(device)
-        self.steps = -(-rows // settings.batch)
+        self.steps = -(-len(self.part.rows) // settings.batch)
         self.optimiser = torch.optim.AdamW(
             module.parameters(),
             lr=settings.learning_rate,
             weight_decay=settings.weight_decay,
         )
         self.best = copy.deepcopy(module.state_dict())
-        self.history: list[dict[str, float]] = []
+        self.history: list[dict[str, Any]] = []
 
-    def epoch(
-        self,
-        epoch: int,
-        rows: np.ndarray,
-        progress: Callable[[Progress], None] | None,
-    ) -> float:
+    def epoch(self, epoch: int, progress: Callable[[Progress], None] | None) -> float:
         """Pass over the rows once, in an order that depends on seed and epoch."""
         entropy = [self.settings.seed, epoch]
-        order = np.random.default_rng(entropy).permutation(rows)
+        order = np.random.default_rng(entropy).permutation(self.part.rows)
         generator = torch.Generator(self.device)
         generator.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
         self.module.train()
@@ -148,8 +178,8 @@ class _Run:
         for step in range(self.steps):
             chosen = order[step * self.settings.batch :][: self.settings.batch]
             self._set_rate(epoch * self.steps + step)
-            image, goal, control = self._batch(chosen)
-            image = self.settings.augmentation.apply(image, generator)
+            frames, goal, control = self._batch(self.part.data, chosen)
+            image = self.settings.augmentation.apply(frames, generator)
             loss = self._error(image, goal, control).square().mean()
             self.optimiser.zero_grad()
             loss.backward()
@@ -165,29 +195,39 @@ class _Run:
         return float(np.mean(losses))
 
     @torch.no_grad()
-    def validate(self, rows: np.ndarray) -> tuple[float, float]:
-        """Compute the loss and the mean absolute error in rad/s on the rows."""
+    def validate(self) -> tuple[float, float]:
+        """Compute the held-out loss and the mean absolute error in rad/s."""
         self.module.eval()
-        parts = [
-            self._error(*self._batch(rows[i : i + 256]))
-            for i in range(0, len(rows), 256)
-        ]
+        rows, parts = self.held.rows, []
+        for start in range(0, len(rows), 256):
+            chosen = rows[start : start + 256]
+            frames, goal, control = self._batch(self.held.data, chosen)
+            image = frames.permute(0, 3, 1, 2).float().div_(255)
+            parts.append(self._error(image, goal, control))
         error = torch.cat(parts)
         mean = error.abs().mean() * self.module.max_control
         return error.square().mean().item(), mean.item()
 
     def record(self, train_loss: float, held_loss: float, held_error: float) -> None:
-        """Append an epoch to the history and keep its weights if they are best."""
-        previous = [row["held_out_loss"] for row in self.history]
-        if not previous or held_loss < min(previous):
-            self.best = copy.deepcopy(self.module.state_dict())
-        self.history.append(
-            {
-                "train_loss": train_loss,
-                "held_out_loss": held_loss,
-                "held_out_error": held_error,
-            }
-        )
+        """Append an epoch to the history and keep its weights if they are best.
+
+        Only epochs that are measured can be best.
+        """
+        row: dict[str, Any] = {
+            "train_loss": train_loss,
+            "held_out_loss": held_loss,
+            "held_out_error": held_error,
+        }
+        number, every = len(self.history) + 1, self.validation.every
+        if number % every == 0 or number == self.settings.epochs:
+            row |= self.validation.measure(self.module)
+            previous = [rank(older) for older in self.history if older["measured"]]
+            if not previous or rank(row) < min(previous):
+                self.best = copy.deepcopy(self.module.state_dict())
+            row["measured"] = True
+        else:
+            row["measured"] = False
+        self.history.append(row)
 
     def save(self, path: str | Path) -> None:
         """Write the state after a whole epoch."""
@@ -231,24 +271,23 @@ class _Run:
 
     def _fingerprint(self) -> str:
         """Describe all on which a continued run must agree."""
-        controls = self.data.controls
         return json.dumps(
             {
                 "settings": asdict(self.settings),
-                "rows": len(self.data),
-                "controls": [float(controls.sum()), float(np.abs(controls).sum())],
+                "validation": self.validation.describe(),
+                "rows": self.part.describe(),
+                "held_out": self.held.describe(),
                 "goals": self.module.goals,
                 "max_control": self.module.max_control,
             }
         )
 
-    def _batch(self, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
-        """Read images in [0, 1], goals and controls in [-1, 1] onto the device."""
-        frames = torch.from_numpy(self.data.read_frames(rows)).to(self.device)
-        image = frames.permute(0, 3, 1, 2).float().div_(255)
-        goal = torch.from_numpy(self.data.goals[rows]).to(self.device)
-        control = torch.from_numpy(self.data.controls[rows]).to(self.device)
-        return image, goal, control / self.module.max_control
+    def _batch(self, data: FrameDataset, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
+        """Read frames (uint8), goals and controls in [-1, 1] onto the device."""
+        frames = torch.from_numpy(data.read_frames(rows)).to(self.device)
+        goal = torch.from_numpy(data.goals[rows]).to(self.device)
+        control = torch.from_numpy(data.controls[rows]).to(self.device)
+        return frames, goal, control / self.module.max_control
 
     def _error(
         self, image: torch.Tensor, goal: torch.Tensor, control: torch.Tensor

@@ -1,0 +1,201 @@
+"""Where driving frames come from: environments of a place, conditions drawn anew."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack import files
+from mi_nerfattack.deploy.daylight import DAYLIGHT
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.registry import (
+    ENVIRONMENTS,
+    Conditions,
+    Place,
+    make_environment,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.io import load_grid
+from mi_nerfattack.policy.placement import Ground, scene_ground
+from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.vehicle.route import Route
+
+
+@dataclass(frozen=True)
+class Weather:
+    """Conditions that are drawn anew for every shard of frames.
+
+    Args:
+        skies: times of day, equally likely.
+        exposures_ev: of the camera, in powers of two, equally likely; few, because an
+            environment is loaded for each.
+        spp: samples per pixel of path-traced images.
+    """
+
+    skies: tuple[str, ...] = ("day",)
+    exposures_ev: tuple[float, ...] = (0.0,)
+    spp: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.skies or not self.exposures_ev:
+            raise InputError("Weather: no skies or no exposures; at least one of each")
+        for sky in self.skies:
+            Conditions(sky, 0.0, self.spp)
+
+    def draw(self, rng: np.random.Generator) -> Conditions:
+        """Draw conditions."""
+        sky = self.skies[int(rng.integers(len(self.skies)))]
+        exposure = self.exposures_ev[int(rng.integers(len(self.exposures_ev)))]
+        return Conditions(sky, exposure, self.spp)
+
+
+#: All times of day, and exposures from half to twice the light.
+ANY_WEATHER = Weather(tuple(DAYLIGHT), (-1.0, -0.5, 0.0, 0.5, 1.0))
+
+
+class AbstractSite(ABC):
+    """Source of environments, objects and ground; picklable, to be sent to workers.
+
+    Attributes:
+        name: of the environments, and of the folder of their frames.
+    """
+
+    name: str
+
+    @property
+    @abstractmethod
+    def camera(self) -> Camera:
+        """Intrinsics of the frames."""
+
+    @property
+    @abstractmethod
+    def car(self) -> Any:
+        """What drives: its `control_unit`, `max_control` and `wheelbase`."""
+
+    @abstractmethod
+    def draw(self, rng: np.random.Generator) -> Any:
+        """Draw conditions: comparable, and JSON by `dataclasses.asdict`."""
+
+    @abstractmethod
+    def typical(self) -> Any:
+        """Return the conditions of validation."""
+
+    @abstractmethod
+    def open(self, conditions: Any) -> AbstractEnvironment:
+        """Make the environment under conditions."""
+
+    @abstractmethod
+    def load_objects(self) -> list[GridField]:
+        """Load the fields that stand beside the road; may be empty."""
+
+    @abstractmethod
+    def load_ground(self) -> Ground:
+        """Load the height of the ground where objects can stand."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return all that decides about the frames, as JSON: files by checksum."""
+
+
+@dataclass(frozen=True)
+class PlaceSite(AbstractSite):
+    """A registered environment of a place.
+
+    Args:
+        name: key of `deploy.registry.ENVIRONMENTS`.
+        place: files, camera, car.
+        weather: conditions of the shards.
+    """
+
+    name: str
+    place: Place
+    weather: Weather = field(default_factory=Weather)
+
+    def __post_init__(self) -> None:
+        if self.name not in ENVIRONMENTS:
+            raise InputError(
+                f"environment: {self.name!r}; one of {', '.join(ENVIRONMENTS)}"
+            )
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the place's camera."""
+        return self.place.camera
+
+    @property
+    def car(self) -> Any:
+        """The place's car."""
+        return self.place.car
+
+    def draw(self, rng: np.random.Generator) -> Conditions:
+        """Draw from the weather."""
+        return self.weather.draw(rng)
+
+    def typical(self) -> Conditions:
+        """Return the first sky without exposure."""
+        return Conditions(self.weather.skies[0], 0.0, self.weather.spp)
+
+    def open(self, conditions: Conditions) -> AbstractEnvironment:
+        """Make the environment by its name."""
+        return make_environment(self.name, self.place, conditions)
+
+    def load_objects(self) -> list[GridField]:
+        """Load the place's objects."""
+        return [load_grid(path) for path in self.place.objects]
+
+    def load_ground(self) -> Ground:
+        """Load the place's scene."""
+        return scene_ground(load_scene(self.place.scene))
+
+    def describe(self) -> dict[str, Any]:
+        """Return checksums of the files, and the numbers."""
+        place = self.place
+        paths = [place.scene, *_beside(place.scene), *place.objects]
+        if place.field is not None:
+            paths.append(place.field)
+        # the folder tells files of equal names apart
+        sums = {f"{p.resolve().parent.name}/{p.name}": _checksum(p) for p in paths}
+        return {
+            "environment": self.name,
+            "files": sums,
+            "camera": asdict(place.camera),
+            "mount": asdict(place.mount),
+            "car": asdict(place.car),
+            "period": place.period,
+            "weather": asdict(self.weather),
+        }
+
+
+def load_routes(path: str | Path) -> list[Route]:
+    """Read all routes of a file."""
+    table = files.read_json(path)
+    if not isinstance(table, dict) or not table:
+        raise InputError(f"{path}: needs an object with one key per route")
+    return [Route.from_file(path, name) for name in table]
+
+
+def _beside(scene: Path) -> list[Path]:
+    """Return the meshes and textures that a scene's folder holds."""
+    folders = [scene.parent / name for name in ("meshes", "textures")]
+    return [
+        p for f in folders if f.is_dir() for p in sorted(f.iterdir()) if p.is_file()
+    ]
+
+
+def _checksum(path: Path) -> str:
+    total = hashlib.sha256()
+    total.update(files.read_bytes(path, files.MAX_TENSOR_BYTES))
+    return total.hexdigest()
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as it comes back from a JSON file."""
+    return json.loads(json.dumps(value))
