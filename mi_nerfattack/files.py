@@ -11,14 +11,13 @@ from __future__ import annotations
 import errno
 import io
 import json
-import math
 import os
 import re
 import secrets
 import stat
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.strict_json import parse_json
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -81,23 +81,7 @@ def read_text(path: str | Path) -> str:
 
 def read_json(path: str | Path) -> Any:
     """Read strict JSON: no NaN or infinity, no key twice in one object."""
-    text = read_text(path)
-    try:
-        return json.loads(
-            text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant
-        )
-    except json.JSONDecodeError as err:
-        raise InputError(
-            f"{path}: line {err.lineno}, column {err.colno}: {err.msg}; "
-            "the file must be valid JSON"
-        ) from err
-    except _ConstantError as err:
-        raise InputError(
-            f"{path}: {_place_of_constant(text)}: {err} is not a JSON number; write a "
-            "finite number"
-        ) from err
-    except (ValueError, RecursionError) as err:
-        raise InputError(f"{path}: {err}; the file must be valid JSON") from err
+    return parse_json(path, read_text(path))
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -110,7 +94,12 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """Read a PNG, JPEG or WebP image.
+    """Read a PNG, JPEG or WebP image; see `decode_image`."""
+    return decode_image(path, read_bytes(path, MAX_IMAGE_BYTES))
+
+
+def decode_image(path: str | Path, raw: bytes) -> np.ndarray:
+    """Decode the content of a PNG, JPEG or WebP file; `path` is for messages.
 
     The pixels come as they are stored: an EXIF orientation is not applied, since
     calibrated poses refer to the stored grid. Grey and palette images become RGB.
@@ -118,7 +107,7 @@ def read_image(path: str | Path) -> np.ndarray:
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
     """
-    image = _open_image(path, ("PNG", "JPEG", "WEBP"))
+    image = _open_image(path, raw, ("PNG", "JPEG", "WEBP"))
     if image.mode not in ("1", "L", "P", "RGB", "LA", "PA", "RGBA"):
         raise InputError(
             f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
@@ -133,7 +122,7 @@ def read_image16(path: str | Path) -> np.ndarray:
     Returns:
         values as they are stored, uint16, (height, width).
     """
-    image = _open_image(path, ("PNG",))
+    image = _open_image(path, read_bytes(path, MAX_IMAGE_BYTES), ("PNG",))
     if image.mode not in ("I;16", "I;16B", "I"):
         raise InputError(f"{path}: pixel type {image.mode}; must be grey, 16 bits")
     return np.array(image).astype(np.uint16)
@@ -283,10 +272,9 @@ def _reported(path: str | Path) -> Iterator[None]:
         raise InputError(f"{str(path)!r}: {err}; check the path") from err
 
 
-def _open_image(path: str | Path, formats: tuple[str, ...]) -> Image.Image:
+def _open_image(path: str | Path, raw: bytes, formats: tuple[str, ...]) -> Image.Image:
     """Decode an image of at most `MAX_IMAGE_PIXELS` pixels."""
     names = " or ".join(formats)
-    raw = read_bytes(path, MAX_IMAGE_BYTES)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -362,39 +350,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"key {twice!r} twice in one object")
-    return result
-
-
-class _ConstantError(ValueError):
-    """NaN or infinity in JSON."""
-
-
-def _refuse_constant(name: str) -> None:
-    raise _ConstantError(name)
-
-
-def _place_of_constant(text: str) -> str:
-    """Return where NaN or infinity is, as `frames[1].transform_matrix[0][3]`."""
-
-    def find(value: Any, place: str) -> str:
-        if isinstance(value, float) and not math.isfinite(value):
-            return place
-        items: Iterable[tuple[str, Any]] = ()
-        if isinstance(value, dict):
-            items = ((f"{place}.{key}", item) for key, item in value.items())
-        elif isinstance(value, list):
-            items = ((f"{place}[{i}]", item) for i, item in enumerate(value))
-        return next(filter(None, (find(item, at) for at, item in items)), "")
-
-    try:
-        return find(json.loads(text), "").lstrip(".") or "a value"
-    except (ValueError, RecursionError):
-        return "a value"  # what follows is damaged too
