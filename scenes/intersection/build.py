@@ -10,14 +10,17 @@ import argparse
 import json
 from pathlib import Path
 
+import numpy as np
+
 from .city import BUILDINGS, build_city
 from .facades import paint_atlas
 from .furniture import furnish
 from .ground import grass, pavement, roads
 from .layout import routes
+from .mesh import MeshBuilder
 from .paint import grass_image, pavement_image, road_images, write_png
 
-_SHAPE = """    <shape type="ply" id="{name}">
+SHAPE = """    <shape type="ply" id="{name}">
         <string name="filename" value="meshes/{name}.ply"/>
         <bsdf type="twosided">
             <bsdf type="diffuse">
@@ -69,8 +72,6 @@ _SCENE = """<!-- T-intersection: metres, z up, linear image needs no exposure. -
 
 def build(folder: Path, seed: int) -> list[Path]:
     """Write the scene below folder and return the files written."""
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    (folder / "textures").mkdir(exist_ok=True)
     meshes = roads() | {
         "pavement": pavement(),
         "grass": grass(),
@@ -81,14 +82,9 @@ def build(folder: Path, seed: int) -> list[Path]:
         "grass": grass_image(seed),
         "city": paint_atlas([b.facade for b in BUILDINGS], seed),
     }
-    files = []
-    for name, mesh in meshes.items():
-        files.append(folder / "meshes" / f"{name}.ply")
-        mesh.write_ply(files[-1])
-        files.append(folder / "textures" / f"{name}.png")
-        write_png(files[-1], images[name])
+    files = write_parts(folder, meshes, images)
     shapes = "".join(
-        _SHAPE.format(
+        SHAPE.format(
             name=name, wrap="repeat" if name in ("pavement", "grass") else "clamp"
         )
         for name in meshes
@@ -97,10 +93,35 @@ def build(folder: Path, seed: int) -> list[Path]:
         "scene.xml": _SCENE.format(shapes=shapes),
         "routes.json": json.dumps(routes(), indent=1) + "\n",
     }
-    for name, text in texts.items():
-        files.append(folder / name)
-        files[-1].write_text(text, encoding="utf-8")
+    return files + write_texts(folder, texts)
+
+
+def write_parts(
+    folder: Path, meshes: dict[str, MeshBuilder], images: dict[str, np.ndarray]
+) -> list[Path]:
+    """Write meshes/NAME.ply and textures/NAME.png, and return the files written.
+
+    Args:
+        folder: made if needed.
+        meshes: by name.
+        images: (h, w, 3) by the same names, sRGB in [0, 1].
+    """
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    (folder / "textures").mkdir(exist_ok=True)
+    files = []
+    for name, mesh in meshes.items():
+        files.append(folder / "meshes" / f"{name}.ply")
+        mesh.write_ply(files[-1])
+        files.append(folder / "textures" / f"{name}.png")
+        write_png(files[-1], images[name])
     return files
+
+
+def write_texts(folder: Path, texts: dict[str, str]) -> list[Path]:
+    """Write texts below a folder by file name, and return the files written."""
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return [folder / name for name in texts]
 
 
 def main() -> None:

@@ -114,12 +114,17 @@ BUILDINGS = [
 
 
 class City:
-    """Builds the one mesh that shares the texture atlas."""
+    """Builds the one mesh that shares the texture atlas.
 
-    def __init__(self, seed: int) -> None:
+    Args:
+        seed: of the trees' shapes.
+        n_facades: in the atlas, above its row of plain colours.
+    """
+
+    def __init__(self, seed: int, n_facades: int = len(BUILDINGS)) -> None:
         self.mesh = MeshBuilder()
         self._rng = np.random.default_rng(seed)
-        self._n = len(BUILDINGS)
+        self._n = n_facades
 
     def box(self, centre, size, colour: str, angle: float = 0.0) -> None:
         """Append a plain box that stands at centre (3,) of its foot, metres."""
