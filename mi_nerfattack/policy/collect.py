@@ -54,7 +54,7 @@ class CollectSettings:
 
     frames: int = 9000
     seed: int = 0
-    shard: int = 256
+    shard: int = 64
     group: int = 8
     groups_a_texture: int = 2
     object_share: float = 0.75
