@@ -279,7 +279,7 @@ def test_an_interrupt_inside_a_recorded_loop_is_one(monkeypatch, capsys):
 def test_pasting_follows_depth_and_opacity():
     import mitsuba as mi
 
-    from mi_nerfattack.deploy import paste
+    from mi_nerfattack.deploy import paste_layer
     from mi_nerfattack.render.march import March
 
     rgb = np.zeros((1, 4, 3), np.float32)
@@ -290,7 +290,7 @@ def test_pasting_follows_depth_and_opacity():
         mi.Float(opacity),
         mi.Float(2.0 * opacity),
     )
-    pasted = paste(rgb, depth, layer)[0, :, 0]
+    pasted = paste_layer(rgb, depth, layer)[0, :, 0]
     assert np.allclose(pasted, [0.5, 0.0, 0.0, 0.5])
 
 

@@ -1,5 +1,13 @@
 """Deployment environments: worlds that an attack was never optimised against."""
 
-from mi_nerfattack.deploy.mitsuba import PathTracedSensor, paste
+from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.mitsuba import PathTracedSensor
+from mi_nerfattack.deploy.paste import paste_layer, paste_objects
 
-__all__ = ["PathTracedSensor", "paste"]
+__all__ = [
+    "AbstractEnvironment",
+    "CameraFrame",
+    "PathTracedSensor",
+    "paste_layer",
+    "paste_objects",
+]

@@ -55,10 +55,11 @@ class FieldView(AbstractView):
     def render(self, camera_to_world: np.ndarray, seed: int) -> CameraFrame:
         """Render one frame; see :meth:`AbstractView.render`."""
         del seed
-        rays = self._rays.at(camera_to_world)
         shape = (self.camera.height, self.camera.width)
-        kept = None if self._ahead is None else self._ahead.march(rays)
-        linear, depth = self._picture.develop(rays, kept)
+        with dr.suspend_grad():
+            rays = self._rays.at(camera_to_world)
+            kept = None if self._ahead is None else self._ahead.march(rays)
+            linear, depth = self._picture.develop(rays, kept)
         image = linear_to_uint8(linear.numpy().T.reshape(*shape, 3))
         pose = np.array(camera_to_world, np.float64)
         return CameraFrame(image, depth.numpy().reshape(shape).copy(), pose)

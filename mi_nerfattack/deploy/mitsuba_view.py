@@ -15,14 +15,22 @@ from mi_nerfattack.deploy.paste import Paster
 from mi_nerfattack.deploy.view import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import PosedField
+
+
+#: Samples of a pixel that are added up in one order whatever the threads do.
+_PART = 16
 
 
 class MitsubaView(AbstractView):
     """Camera at any pose in a scene that its own integrator renders.
 
-    Two views of one scene give equal frames for equal poses and seeds. After the
-    first frame no kernel is compiled.
+    Two views of one scene give equal frames, to the last bit, for equal poses and
+    seeds. Mitsuba's film does not promise that: where a pixel's samples are shared
+    between threads, their sum has an order that varies. So images are rendered in
+    parts of 16, 8, 4, 2 or 1 samples per pixel, and the parts are added up in order.
+    After the first frame no kernel is compiled.
 
     Args:
         scene: `mi.Scene`, metric, z up.
@@ -45,10 +53,37 @@ class MitsubaView(AbstractView):
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> CameraFrame:
         """Render one frame; see :meth:`AbstractView.render`."""
-        view = self.renderer.render(camera_to_world, self.spp, seed)
-        image = linear_to_uint8(view.rgb * np.float32(2.0**self.exposure_ev))
+        rgb, depth = self.linear(camera_to_world, seed)
+        image = linear_to_uint8(rgb)
         pose = np.array(camera_to_world, np.float64)
-        return self._paster.paste(CameraFrame(image, view.depth.copy(), pose))
+        return self._paster.paste(CameraFrame(image, depth, pose))
+
+    def linear(
+        self, camera_to_world: np.ndarray, seed: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Render one frame without its objects.
+
+        Returns:
+            (height, width, 3) linear, exposed, and depth (height, width), metres along
+            the ray; float32.
+        """
+        parts = _parts(self.spp)
+        seeds = [seed]
+        if len(parts) > 1:
+            sequence = np.random.SeedSequence(seed)
+            seeds = [int(value) for value in sequence.generate_state(len(parts))]
+        views = [
+            self.renderer.render(camera_to_world, *part)
+            for part in zip(parts, seeds, strict=True)
+        ]
+        weights = np.array(parts, np.float32) / np.float32(self.spp)
+        rgb = sum(w * view.rgb for w, view in zip(weights, views, strict=True))
+        gain = np.float32(2.0**self.exposure_ev)
+        return np.asarray(gain * rgb), views[0].depth.copy()
+
+    def march(self, camera_to_world: np.ndarray) -> March:
+        """March the objects along the rays of one image; there must be an object."""
+        return self._paster.march(camera_to_world)
 
     def show(self, objects: Sequence[PosedField]) -> None:
         """Paste other fields."""
@@ -56,3 +91,13 @@ class MitsubaView(AbstractView):
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+def _parts(spp: int) -> list[int]:
+    """Split a number of samples into powers of two, the largest first."""
+    parts = [_PART] * (spp // _PART)
+    size = _PART // 2
+    while size:
+        parts += [size] * ((spp % _PART) // size % 2)
+        size //= 2
+    return parts

@@ -50,7 +50,8 @@ class Paster:
 
     def march(self, camera_to_world: np.ndarray) -> March:
         """March all objects along the rays of one image; there must be an object."""
-        return self._frozen(self._rays.at(camera_to_world))
+        with dr.suspend_grad():
+            return self._frozen(self._rays.at(camera_to_world))
 
     def paste(self, frame: CameraFrame) -> CameraFrame:
         """Return the frame with the objects in it.
