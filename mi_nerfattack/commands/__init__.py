@@ -15,6 +15,7 @@ from mi_nerfattack.commands.bench import Bench
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
+from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.poses import Poses
@@ -40,6 +41,7 @@ COMMANDS: dict[str, type[Command]] = {
     "asset": Asset,
     "export": Export,
     "train": Train,
+    "evaluate": Evaluate,
     "attack": Attack,
     "bench": Bench,
 }

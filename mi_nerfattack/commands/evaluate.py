@@ -1,0 +1,214 @@
+"""``mi-nerfattack evaluate``: the closed-loop error of a policy, its card."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from mi_nerfattack.commands.evaluate_options import (
+    PlaceOptions,
+    PolicyOptions,
+    parse_conditions,
+)
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.commands.bars import StageBars
+    from mi_nerfattack.policy.evaluate import EvaluateSettings
+    from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
+    from mi_nerfattack.policy.evaluate_work import EvaluateWork, Evaluation
+    from mi_nerfattack.policy.workers import AbstractWorkers
+    from mi_nerfattack.vehicle.route import Route
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Drive a policy in the closed loop, per environment and route, and print its card.
+
+    Every drive starts at random near the route's start: once alone, once past objects
+    with random textures. The expert drives from the same starts. Finished drives are
+    kept: the same command continues after Ctrl-C, and more runs add to them.
+    """
+
+    policy: tyro.conf.Positional[str | None] = None
+    """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
+    file with a section [policy] as a scenario has; the bundled one by default."""
+    environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
+    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla."""
+    routes: tuple[str, ...] = ()
+    """Routes by name; all by default."""
+    runs: int = 20
+    """Drives of each environment, route and case."""
+    objects: int = 1
+    """Objects beside the road at a time; 0 leaves the drives with objects out."""
+    seed: int = 0
+    """Of starts, places, textures and images."""
+    horizon: int = 1000
+    """Most control periods of a drive; it ends 2 m before its route does."""
+    conditions: tuple[str, ...] = ("day",)
+    """Times of day (day, morning, noon, evening, overcast), each with an exposure in
+    powers of two on request: noon, noon:+1, evening:-0.5. Not for the surrogate."""
+    spp: int = 4
+    """Samples per pixel of path-traced images."""
+    where: tyro.conf.OmitArgPrefixes[PlaceOptions] = PlaceOptions()
+    """Where."""
+    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    """How the policy is called."""
+    workers: int | None = None
+    """Processes that drive; one a core by default. 1 drives in this process."""
+    drives: Path = Path("runs/evaluate")
+    """Folder of finished drives; those of other evaluations can be in it, too."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File for the card (.json)."""
+    page: Path | None = None
+    """Folder for the policy's page: NAME.md, NAME.card.json and NAME.png."""
+    json: bool = False
+    """Print the card as JSON, and nothing else."""
+
+    def run(self) -> int:
+        """Drive, summarise, print and write."""
+        from rich.console import Console
+
+        from mi_nerfattack import files, variant
+        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.policy.evaluate_work import run_evaluation
+        from mi_nerfattack.report.table import card_table
+
+        if self.output is not None:
+            files.check_writable(self.output)
+        if self.page is not None:
+            files.make_folder(self.page)
+        variant.ensure()
+        work, workers = self._work(), self._workers()
+        start = time.monotonic()
+        with StageBars() as bars:
+            bars.say(f"drives are kept in {work.folder}")
+            found = run_evaluation(work, workers, _Progress(bars).show)
+        if self.output is not None:
+            files.write_json(self.output, found.card)
+        if self.page is not None:
+            self._write_page(self.page, work, found, time.monotonic() - start)
+        if self.json:
+            print(json.dumps(found.card, allow_nan=False))
+        else:
+            Console().print(card_table(found.card))
+        return 0
+
+    def _write_page(
+        self, folder: Path, work: EvaluateWork, found: Evaluation, wall_s: float
+    ) -> None:
+        from mi_nerfattack.report.policy_page import write_policy_page
+
+        about = {**work.describe(), "command": self._command(), "wall_s": wall_s}
+        path = write_policy_page(
+            folder, about, found.card, found.seconds, found.drives, work.routes
+        )
+        print(f"{path}: written", file=sys.stderr)
+
+    def _work(self) -> EvaluateWork:
+        """Check everything that can be checked before the first drive."""
+        from mi_nerfattack.policy.evaluate_identity import identify
+        from mi_nerfattack.policy.evaluate_work import EvaluateWork, check_policy
+        from mi_nerfattack.policy.load import load_policy
+
+        section, base = self.options.section(self.policy)
+        place = self.where.build()
+        routes, under = self._routes(place.routes), self._environments()
+        settings = self._settings(place.car.width)
+        check_policy(load_policy(section, base), place, routes)
+        identities = identify(section, base, place, under, routes, settings)
+        return EvaluateWork(
+            section, base, place, under, routes, settings, self.drives, identities
+        )
+
+    def _settings(self, car_width_m: float) -> EvaluateSettings:
+        from mi_nerfattack.policy.evaluate import EvaluateSettings
+
+        return EvaluateSettings(
+            self.runs,
+            self.objects,
+            self.seed,
+            horizon=self.horizon,
+            car_width_m=car_width_m,
+        )
+
+    def _routes(self, path: Path) -> tuple[Route, ...]:
+        from mi_nerfattack.policy.sites import load_routes
+        from mi_nerfattack.vehicle.route import Route
+
+        if not self.routes:
+            return tuple(load_routes(path))
+        _check_different("--routes", self.routes)
+        return tuple(Route.from_file(path, name) for name in self.routes)
+
+    def _environments(self) -> tuple[EnvironmentUnder, ...]:
+        from mi_nerfattack.deploy.registry import ENVIRONMENTS
+
+        _check_different("--environments", self.environments)
+        known = [name for name in ENVIRONMENTS if name != "replay"]
+        for name in self.environments:
+            if name not in known:
+                raise InputError(
+                    f"--environments: {name!r}; one of {', '.join(known)} (a recording "
+                    "does not answer to a policy)"
+                )
+        return parse_conditions(self.environments, self.conditions, self.spp)
+
+    def _workers(self) -> AbstractWorkers:
+        from mi_nerfattack.policy.workers import (
+            InThisProcess,
+            Processes,
+            available_cores,
+        )
+
+        count = available_cores() if self.workers is None else self.workers
+        return InThisProcess() if count == 1 else Processes(count)
+
+    def _command(self) -> str:
+        """Write the command anew from what differs from the defaults."""
+        return " ".join(["mi-nerfattack evaluate", *words(self)])
+
+
+class _Progress:
+    """Shows steps, and how long it still takes."""
+
+    def __init__(self, bars: StageBars) -> None:
+        self._bars, self._first = bars, (0, 0.0)
+
+    def show(self, done: int, total: int) -> None:
+        """Show control periods done and wanted."""
+        now = time.monotonic()
+        if self._first == (0, 0.0):
+            self._first = done - 1, now
+        before, start = self._first
+        left = (now - start) / (done - before) * (total - done)
+        state = f"step {done}/{total}, {left / 60:.1f} min left"
+        self._bars.show("driving", done, total, state)
+
+
+def words(options: Any) -> list[str]:
+    """Return the arguments that differ from the defaults, for a shell."""
+    found = []
+    for item in fields(options):
+        value = getattr(options, item.name)
+        if is_dataclass(value):
+            found += words(value)
+        elif value != item.default and item.name == "policy":
+            found.insert(0, shlex.quote(str(value)))
+        elif value != item.default:
+            found.append("--" + item.name.replace("_", "-"))
+            values = value if isinstance(value, tuple) else (value,)
+            found += [shlex.quote(str(v)) for v in values if v is not True]
+    return found
+
+
+def _check_different(option: str, names: tuple[str, ...]) -> None:
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"{option}: {' '.join(names)!r}; at least one, each once")

@@ -1,0 +1,148 @@
+"""Options of ``evaluate``: where a policy drives, and how it is called."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.deploy.registry import Place
+    from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
+    from mi_nerfattack.sections import PolicySection
+
+#: The policy that is evaluated where none is given.
+BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
+
+
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Where a policy drives."""
+
+    place: str = "intersection"
+    """Bundled place: intersection, or room (a small car that takes steering angles)."""
+    scene: Path | None = None
+    """Mitsuba XML of a scene of your own; needs --routes-file."""
+    field: Path | None = None
+    """Field file of the scene, for the surrogate."""
+    routes_file: Path | None = None
+    """Routes, JSON."""
+    object: tuple[Path, ...] = ()
+    """Grid fields that stand beside the road with random textures; the bundled place's
+    by default."""
+
+    def build(self) -> Place:
+        """Return the place; camera and car are those of the bundled one."""
+        from mi_nerfattack.deploy.registry import bundled_place
+
+        place = bundled_place(self.place)
+        if self.scene is not None:
+            if self.routes_file is None:
+                raise InputError(f"--scene: {self.scene}; it needs its --routes-file")
+            place = replace(place, scene=self.scene, field=None, objects=())
+        return replace(
+            place,
+            field=self.field or place.field,
+            routes=self.routes_file or place.routes,
+            objects=self.object or place.objects,
+        )
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """How a policy is called; a TOML file can say more, as a scenario does."""
+
+    kind: str | None = None
+    """Kind, where the suffix does not tell it: drjit, callable, ..."""
+    weights_file: str | None = None
+    """Weights of a module: .safetensors or a state dict."""
+    goal: str | None = None
+    """How the goal is passed: integer, one_hot or none."""
+    goals: int | None = None
+    """Number of goals."""
+    control_scale: float = 1.0
+    """Factor to the car's unit, rad/s or rad, positive to the left."""
+    column: int | None = None
+    """Column of the control, where the network gives several numbers."""
+
+    def section(self, policy: str | None) -> tuple[PolicySection, Path]:
+        """Return what a scenario's section [policy] would say, and its folder.
+
+        Raises:
+            InputError: an option does not fit, or the TOML file is not usable.
+        """
+        if policy is not None and policy.lower().endswith(".toml"):
+            if self != PolicyOptions():
+                raise InputError(
+                    f"{policy}: says itself how the policy is called; leave out "
+                    "--kind, --weights-file, --goal, --goals, --control-scale, --column"
+                )
+            return _read_section(Path(policy)), Path(policy).parent
+        chosen = policy or BUNDLED_POLICY
+        values = {
+            "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
+            "kind": self.kind,
+            "weights_file": self.weights_file,
+            "goal": self.goal,
+            "goals": self.goals,
+            "control_scale": self.control_scale,
+            "output": self.column,
+        }
+        return _checked(chosen, values), Path()
+
+
+def parse_conditions(
+    names: tuple[str, ...], conditions: tuple[str, ...], spp: int
+) -> tuple[EnvironmentUnder, ...]:
+    """Return the environments under all conditions; the surrogate under none.
+
+    Args:
+        names: of the environments.
+        conditions: each ``SKY`` or ``SKY:EV``.
+        spp: samples per pixel.
+    """
+    from mi_nerfattack.deploy.registry import Conditions
+    from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
+
+    parsed = []
+    for text in conditions:
+        sky, _, exposure = text.partition(":")
+        try:
+            parsed.append(Conditions(sky, float(exposure or 0), spp))
+        except ValueError as err:
+            raise InputError(f"--conditions: {text!r}: {err}") from err
+    if not parsed or len(set(parsed)) < len(parsed):
+        raise InputError(f"--conditions: {conditions}; at least one, each once")
+    found = []
+    for name in names:
+        several = [Conditions(spp=spp)] if name == "surrogate" else parsed
+        found += [EnvironmentUnder(name, item) for item in several]
+    return tuple(found)
+
+
+def _read_section(path: Path) -> PolicySection:
+    from mi_nerfattack import files
+
+    values = files.read_toml(path).get("policy")
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: has no section [policy]")
+    return _checked(str(path), values)
+
+
+def _checked(name: str, values: dict[str, object]) -> PolicySection:
+    from pydantic import ValidationError
+
+    from mi_nerfattack.sections import PolicySection
+
+    try:
+        return PolicySection.model_validate_json(json.dumps(values, default=str))
+    except ValidationError as err:
+        first = err.errors()[0]
+        location = [str(part) for part in first["loc"]]
+        if first["type"] == "keys":
+            location.append(str(first.get("ctx", {})["key"]))
+        key = ".".join(["policy", *location])
+        raise InputError(f"{name}: {key}: {first['msg']}") from err

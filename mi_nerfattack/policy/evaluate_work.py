@@ -1,0 +1,330 @@
+"""An evaluation by several processes; finished drives are files and never repeated."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack import files
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.registry import Place, make_environment
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.io import load_grid
+from mi_nerfattack.policy.adapter import AbstractPolicy
+from mi_nerfattack.policy.evaluate import (
+    CLEAN,
+    EvaluateSettings,
+    ExpertPolicy,
+    evaluate_run,
+)
+from mi_nerfattack.policy.evaluate_identity import (
+    EnvironmentUnder,
+    policy_content,
+    short_digest,
+)
+from mi_nerfattack.policy.load import load_policy
+from mi_nerfattack.policy.placement import scene_ground
+from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.report.metrics import Drive, card_figures, departure_limit
+from mi_nerfattack.resumable import read_kept, write_kept
+from mi_nerfattack.sections import PolicySection
+from mi_nerfattack.vehicle.expert import expert_for
+from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.versions import versions
+
+#: Case of the drives of the expert, which is no case of the card.
+EXPERT = "expert"
+_ARRAYS = ("states", "controls", "cross_track_m", "time_s")
+_REMEDY = "choose another folder for the drives, or remove this one"
+#: The expert sees no image: the smallest are rendered for it.
+_EXPERT_CAMERA_PX = (8, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One drive: a case of the card, or "expert"."""
+
+    environment: EnvironmentUnder
+    route: Route
+    case: str
+    run: int
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluateWork(AbstractWork):
+    """All drives of an evaluation.
+
+    Args:
+        policy: that drives, as a scenario describes it.
+        base: folder that its relative paths start from.
+        place: where.
+        environments: with different labels.
+        routes: with different names.
+        settings: see there.
+        folder: of the drives.
+        identities: of the drives of each environment and route, see `identify`.
+    """
+
+    policy: PolicySection
+    base: Path
+    place: Place
+    environments: tuple[EnvironmentUnder, ...]
+    routes: tuple[Route, ...]
+    settings: EvaluateSettings
+    folder: Path
+    identities: Mapping[tuple[str, str], Mapping[str, str]]
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Every drive; those of one environment and of one sort together."""
+        cases = self.settings.cases if self.place.objects else (CLEAN,)
+        return [
+            Job(environment, route, case, run)
+            for environment in self.environments
+            for sort in ((EXPERT,), cases)
+            for route in self.routes
+            for case in sort
+            for run in range(self.settings.runs)
+        ]
+
+    def open(self) -> Opened:
+        """Load policy, objects and ground."""
+        return Opened(self)
+
+    def do(self, opened: Opened, index: int, report: OnUnits) -> None:
+        """Drive once and write the drive; a unit is a control period."""
+        job, start = self.jobs[index], time.monotonic()
+        result = opened.drive(job, lambda step: report(1))
+        seconds = time.monotonic() - start
+        about = {"wall_s": f"{seconds:.3f}", "seed": f"{result.seed}"}
+        path = self.path(job)
+        files.make_folder(path.parent)
+        tensors = {name: getattr(result, name) for name in _ARRAYS}
+        write_kept(path, tensors, self._identity(job), about)
+
+    def close(self, opened: Opened) -> None:
+        """Close the environment."""
+        opened.close()
+
+    def path(self, job: Job) -> Path:
+        """Return the file of a drive."""
+        label, route = job.environment.label, job.route.name
+        folder = self.folder / f"{label}-{short_digest(self.identities[label, route])}"
+        parts = (quote(route, safe=""), job.case, f"run_{job.run:04d}.safetensors")
+        return folder.joinpath(*parts)
+
+    def steps(self, job: Job) -> int:
+        """Return the number of control periods of a drive."""
+        return self.settings.steps(job.route, self.place.period)
+
+    def read(self, job: Job) -> tuple[Drive, float] | None:
+        """Read a drive and its seconds; None where it was not finished.
+
+        Raises:
+            InputError: the file is damaged, or of another evaluation.
+        """
+        path = self.path(job)
+        if not path.is_file():
+            return None
+        kept = read_kept(path, self._identity(job), _REMEDY)
+        found = Drive(
+            environment=job.environment.name,
+            route=job.route.name,
+            case=CLEAN if job.case == EXPERT else job.case,
+            run=job.run,
+            seed=int(kept.about["seed"]),
+            **{name: kept.tensors[name] for name in _ARRAYS},
+        )
+        return found, float(kept.about["wall_s"])
+
+    def describe(self) -> dict[str, Any]:
+        """Return policy, place, routes, environments and settings, as JSON."""
+        place = self.place
+        paths = [place.scene, place.routes, *place.objects]
+        return {
+            "policy": self.policy.file or self.policy.url,
+            "policy_section": policy_content(self.policy, self.base),
+            "place": [f"{path.resolve().parent.name}/{path.name}" for path in paths],
+            "routes": [route.name for route in self.routes],
+            "environments": {
+                under.label: {"sky": c.sky, "exposure_ev": c.exposure_ev, "spp": c.spp}
+                for under in self.environments
+                for c in (under.conditions,)
+            },
+            "settings": asdict(self.settings),
+            "versions": versions(),
+        }
+
+    def _identity(self, job: Job) -> dict[str, str]:
+        shared = self.identities[job.environment.label, job.route.name]
+        return {**shared, "case": job.case, "run": f"{job.run}"}
+
+
+class Opened:
+    """What a process needs for its drives; one environment at a time."""
+
+    def __init__(self, work: EvaluateWork) -> None:
+        self._work = work
+        self._policy = load_policy(work.policy, work.base)
+        paths = work.place.objects
+        count = max(len(paths), work.settings.objects) if paths else 0
+        # each is a field of its own, with a texture of its own
+        self._objects = [load_grid(p) for p in itertools.islice(_endless(paths), count)]
+        self._ground = scene_ground(load_scene(work.place.scene))
+        self._key: tuple[str, bool] | None = None
+        self._environment: AbstractEnvironment | None = None
+
+    def drive(self, job: Job, on_step: Callable[[int], None]) -> Drive:
+        """Drive once."""
+        environment = self._open(job)
+        driver, case = self._policy, job.case
+        if case == EXPERT:
+            driver, case = self._expert(environment, job.route), CLEAN
+        return evaluate_run(
+            environment,
+            driver,
+            job.route,
+            case,
+            job.run,
+            self._objects,
+            self._ground,
+            self._work.settings,
+            on_step,
+        )
+
+    def close(self) -> None:
+        """Close the environment, where there is one."""
+        if self._environment is not None:
+            self._environment.close()
+        self._key = self._environment = None
+
+    def _open(self, job: Job) -> AbstractEnvironment:
+        blind, under = job.case == EXPERT, job.environment
+        if self._environment is None or self._key != (under.label, blind):
+            self.close()
+            place, conditions = self._work.place, under.conditions
+            if blind:
+                camera = place.camera.resized(*_EXPERT_CAMERA_PX)
+                place = replace(place, camera=camera)
+                conditions = replace(conditions, spp=1)
+            self._environment = make_environment(under.name, place, conditions)
+            self._key = under.label, blind
+        return self._environment
+
+    def _expert(self, environment: AbstractEnvironment, route: Route) -> ExpertPolicy:
+        expert = expert_for(
+            environment.control_unit,
+            route,
+            environment.period,
+            environment.max_control,
+            self._work.place.car.wheelbase,
+        )
+        return ExpertPolicy(environment, expert)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A finished evaluation.
+
+    Args:
+        card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}; the figures of the case "clean"
+            have those of the expert as `expert`.
+        drives: by environment, route and case ("expert" among them).
+        seconds: of a drive on one worker, mean, by environment and case.
+    """
+
+    card: dict[str, Any]
+    drives: Mapping[tuple[str, str, str], Sequence[Drive]]
+    seconds: Mapping[tuple[str, str], float]
+
+
+def run_evaluation(
+    work: EvaluateWork,
+    workers: AbstractWorkers,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Evaluation:
+    """Do the drives that are not there yet, and summarise all.
+
+    Args:
+        work: all drives.
+        workers: who does them.
+        progress: called with control periods done and wanted.
+
+    Raises:
+        InputError: an environment cannot be made, the policy does not take its
+            images, or the folder holds drives of another evaluation.
+    """
+    jobs = work.jobs
+    steps = [work.steps(job) for job in jobs]
+    found = [work.read(job) for job in jobs]
+    left = [index for index, item in enumerate(found) if item is None]
+    done, total = sum(steps) - sum(steps[index] for index in left), sum(steps)
+
+    def count(units: int) -> None:
+        nonlocal done
+        done += units
+        progress(done, total)
+
+    workers.run(work, left, count)
+    drives: dict[tuple[str, str, str], list[Drive]] = {}
+    seconds: dict[tuple[str, str], list[float]] = {}
+    for job in jobs:
+        item = work.read(job)
+        if item is None:
+            raise InputError(f"{work.path(job)}: does not exist; it was removed")
+        label = job.environment.label
+        drives.setdefault((label, job.route.name, job.case), []).append(item[0])
+        seconds.setdefault((label, job.case), []).append(item[1])
+    means = {key: sum(values) / len(values) for key, values in seconds.items()}
+    width = work.settings.car_width_m
+    limits = {r.name: departure_limit(r.lane_width_m, width) for r in work.routes}
+    return Evaluation(make_card(drives, limits), drives, means)
+
+
+def make_card(
+    drives: Mapping[tuple[str, str, str], Sequence[Drive]],
+    limits: Mapping[str, float],
+) -> dict[str, Any]:
+    """Summarise drives, and set the expert's figures beside the policy's.
+
+    Args:
+        drives: by environment, route and case.
+        limits: departure limit of each route, metres.
+    """
+    card: dict[str, Any] = {}
+    for (label, route, case), group in drives.items():
+        if case == EXPERT:
+            continue
+        figures = card_figures(group, limits[route])
+        expert = drives.get((label, route, EXPERT))
+        if case == CLEAN and expert is not None:
+            seen = card_figures(expert, limits[route])
+            names = ("n", "cross_track_mean_m", "cross_track_max_m", "departures")
+            figures["expert"] = {name: seen[name] for name in names}
+        card.setdefault(label, {}).setdefault(route, {})[case] = figures
+    return card
+
+
+def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) -> None:
+    """Show a policy a black image for every goal.
+
+    Raises:
+        InputError: the camera's image or a goal does not fit.
+    """
+    shape = (1, place.camera.height, place.camera.width, 3)
+    image = mi.TensorXf(np.zeros(shape, np.float32))
+    for route in routes:
+        policy.step(image, route.goal, policy.initial_memory(1))
+
+
+def _endless(paths: Sequence[Path]) -> itertools.cycle[Path]:
+    return itertools.cycle(paths)
