@@ -18,7 +18,6 @@ from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import PosedField
 
-
 #: Samples of a pixel that are added up in one order whatever the threads do.
 _PART = 16
 
