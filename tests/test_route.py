@@ -183,6 +183,10 @@ def write_routes(folder, **changes):
 def test_route_file(tmp_path):
     route = Route.from_file(write_routes(tmp_path), "right")
     assert (route.goal, route.lane_width_m, route.length) == (1, 3.5, 1.0)
+    assert not route.closed
+    loop = {"points_m": [[0, 0], [1, 0], [0, 1]], "closed": True}
+    (route,) = Route.all_from_file(write_routes(tmp_path, **loop))
+    assert route.closed and route.length == pytest.approx(2 + 2**0.5)
     with pytest.raises(InputError, match="no route 'left'; it has 'right'"):
         Route.from_file(tmp_path / "routes.json", "left")
     with pytest.raises(InputError, match="absent"):
@@ -200,6 +204,8 @@ def test_route_file(tmp_path):
         ({"speed_ms": "5"}, "speed_ms"),
         ({"goal": 1.5}, "goal"),
         ({"goal": -1}, "goal"),
+        ({"closed": 1}, "closed 1; true or false"),
+        ({"closed": True}, "at least three"),
     ],
 )
 def test_route_file_errors(tmp_path, changes, message):
