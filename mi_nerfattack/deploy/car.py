@@ -61,7 +61,7 @@ SMALL_CAR = Car(
     track=0.24,
     wheel_radius=0.054,
     mass=4.0,
-    max_steer=0.34,
+    max_steer=0.4,
     control_unit="rad",
-    max_control=0.34,
+    max_control=0.4,
 )

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.deploy.built_in import BuiltInObject, built_in_shapes
-from mi_nerfattack.deploy.car import CAR, Car
+from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.deploy.daylight import DAYLIGHT, set_daylight
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.field_view import FieldView
 from mi_nerfattack.deploy.kinematic import KinematicVehicle
 from mi_nerfattack.deploy.mitsuba_view import MitsubaView
 from mi_nerfattack.deploy.simulated import SimulatedEnvironment
+from mi_nerfattack.deploy.vehicle import AbstractVehicle
+from mi_nerfattack.deploy.view import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
@@ -39,7 +42,7 @@ class Place:
         period: seconds between two images.
         car: what drives.
         recording: of `replay`: a folder, a video or a log.
-        server: of `carla`: "HOST:PORT".
+        server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
     """
 
     scene: Path
@@ -109,10 +112,7 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
             "environment 'surrogate': the place has no field; make one with "
             "'mi-nerfattack fit' and give it"
         )
-    if conditions.built_in:
-        raise InputError(
-            "environment 'surrogate': built-in objects need geometry; show fields"
-        )
+    _refuse_built_in("surrogate", conditions)
     view = FieldView(PosedField(load_field(place.field)), place.camera)
     return _pair("surrogate", kinematic_vehicle(place.car, place.period), view, place)
 
@@ -122,14 +122,103 @@ def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
     return _pair("mitsuba", vehicle, mitsuba_view(place, conditions), place)
 
 
-def _pair(name: str, vehicle: Any, view: Any, place: Place) -> SimulatedEnvironment:
+def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
+    with _installed("mujoco", "pip install mujoco"):
+        from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+    vehicle = MujocoVehicle(place.car, period=place.period)
+    return _pair("mujoco", vehicle, mitsuba_view(place, conditions), place)
+
+
+def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
+    with _installed("mujoco_gl", "pip install mujoco"):
+        from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+        from mi_nerfattack.deploy.mujoco_view import MujocoView
+    scene = load_scene(place.scene)
+    set_daylight(scene, conditions.sky)
+    view = MujocoView(scene, place.camera, conditions.built_in, conditions.exposure_ev)
+    vehicle = MujocoVehicle(place.car, period=place.period)
+    return _pair("mujoco_gl", vehicle, view, place)
+
+
+def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
+    with _installed("carla", "pip install 'mi-nerfattack[carla]'"):
+        import carla  # noqa: F401  # pyright: ignore[reportMissingImports]
+
+        from mi_nerfattack.deploy.carla_drivers import KinematicDriver
+        from mi_nerfattack.deploy.carla_environment import CarlaEnvironment
+        from mi_nerfattack.deploy.carla_session import CarlaServer
+    _refuse_built_in("carla", conditions)
+    server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
+    driver = KinematicDriver(kinematic_vehicle(place.car, place.period))
+    exposure = {"exposure_compensation": str(conditions.exposure_ev)}
+    return CarlaEnvironment(
+        server,
+        place.camera,
+        place.mount,
+        driver,
+        place.period,
+        attributes=exposure if conditions.exposure_ev else None,
+    )
+
+
+def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
+    from mi_nerfattack.deploy.replay import ReplayEnvironment, open_recording
+
+    if place.recording is None:
+        raise InputError(
+            "environment 'replay': the place has no recording; give it a folder, a "
+            "video or an MCAP log"
+        )
+    _refuse_built_in("replay", conditions)
+    recording = open_recording(place.recording, place.camera, place.mount, place.period)
+    car = place.car
+    return ReplayEnvironment(
+        recording, place.mount, place.period, car.max_control, car.control_unit
+    )
+
+
+def _refuse_built_in(name: str, conditions: Conditions) -> None:
+    if conditions.built_in:
+        raise InputError(
+            f"environment {name!r}: takes no built-in objects; show fields, which it "
+            "pastes or composes"
+        )
+
+
+@contextmanager
+def _installed(name: str, remedy: str) -> Iterator[None]:
+    """Turn a failed import into an `InputError` with a remedy."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"environment {name!r}: the package {error.name} is not installed; {remedy}"
+        ) from error
+
+
+def _pair(
+    name: str, vehicle: AbstractVehicle, view: AbstractView, place: Place
+) -> SimulatedEnvironment:
     return SimulatedEnvironment(name, vehicle, view, place.mount, place.period)
 
+
+#: CARLA's weather for our times of day; its sun is not ours.
+_CARLA_WEATHER = {
+    "day": "ClearNoon",
+    "morning": "ClearSunset",
+    "noon": "ClearNoon",
+    "evening": "ClearSunset",
+    "overcast": "CloudyNoon",
+}
 
 #: What makes an environment of a place under conditions, by name.
 ENVIRONMENTS: Mapping[str, Callable[[Place, Conditions], AbstractEnvironment]] = {
     "surrogate": _surrogate,
     "mitsuba": _mitsuba,
+    "mujoco": _mujoco,
+    "mujoco_gl": _mujoco_gl,
+    "replay": _replay,
+    "carla": _carla,
 }
 
 
@@ -157,17 +246,28 @@ def bundled_place(name: str = "intersection") -> Place:
     """Return a bundled scene with its routes, objects and car.
 
     Args:
-        name: "intersection".
+        name: "intersection", with the full-size car; or "room", with the small car on
+            its square track, which has no field.
     """
     from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
 
-    if name != "intersection":
-        raise InputError(f"place: {name!r}; one of intersection")
+    if name not in _CARS:
+        raise InputError(f"place: {name!r}; one of {', '.join(_CARS)}")
+    car, mount = _CARS[name]
+    field = "intersection/field.safetensors"
     return Place(
-        scene=bundled("intersection/scene.xml"),
-        field=bundled("intersection/field.safetensors"),
-        routes=bundled("intersection/routes.json"),
+        scene=bundled(f"{name}/scene.xml"),
+        field=bundled(field) if name == "intersection" else None,
+        routes=bundled(f"{name}/routes.json"),
         objects=(bundled("hydrant/field.safetensors"),),
         camera=from_fov(200, 66, 90.0),
-        mount=CameraMount(),
+        mount=mount,
+        car=car,
     )
+
+
+#: Cars of the bundled places, and where their cameras are.
+_CARS = {
+    "intersection": (CAR, CameraMount()),
+    "room": (SMALL_CAR, CameraMount(height_m=0.2, forward_m=0.3, pitch_deg=10.0)),
+}

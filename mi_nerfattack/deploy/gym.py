@@ -1,0 +1,219 @@
+"""Deployment environments as `gymnasium` environments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.registry import (
+    ENVIRONMENTS,
+    Conditions,
+    Place,
+    bundled_place,
+    make_environment,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.route import Route
+
+#: Depth that observations have where there is nothing, and the largest, metres.
+FAR_M = 1000.0
+
+_WORLD_M = 1e6  # coordinates are below this
+
+
+class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
+    """Follow a route in a deployment environment.
+
+    Observation, a `Dict`: `image` (height, width, 3) uint8 sRGB; `depth` (height,
+    width) float32, metres along the ray, cut at 1000 m, which also stands for
+    nothing; `camera_to_world` (4, 4) float64, OpenCV axes, metres; `goal` (), the
+    route's goal.
+
+    Action: `Box` (1,) float32 from -1 to 1, the share of `environment.max_control`, in
+    `environment.control_unit`; positive steers to the left.
+
+    Reward: minus the absolute cross-track error in metres after the step. An episode
+    terminates where the vehicle leaves the lane, which is when its side passes the
+    lane's border; it is truncated at the end of the route, after `max_steps` steps, or
+    where the environment has nothing more to observe.
+
+    `info` holds `cross_track_m`, `arc_length_m`, `state` and, in a reset, `route`.
+    Options of `reset`: `route`, the name of one of the routes; `pose`, (3,) x, y and
+    heading. Without the first, the seed draws a route; without the second, the
+    episode begins at the route's start.
+
+    Args:
+        environment: what is driven; it is closed with this one.
+        routes: at least one.
+        width: of the vehicle, metres.
+        max_steps: of an episode.
+        margin_m: arc length before the route's end at which an episode is truncated.
+        render_mode: "rgb_array" or None.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        environment: AbstractEnvironment,
+        routes: Sequence[Route],
+        width: float = 1.8,
+        max_steps: int = 1000,
+        margin_m: float = 2.0,
+        render_mode: str | None = None,
+    ) -> None:
+        if not routes:
+            raise InputError("routes: none; at least one route to follow")
+        if max_steps < 1:
+            raise InputError(f"max_steps: {max_steps}; at least 1")
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode: {render_mode!r}; 'rgb_array' or None")
+        self.environment, self.routes = environment, {r.name: r for r in routes}
+        self.width, self.max_steps, self.margin_m = width, max_steps, margin_m
+        self.render_mode = render_mode
+        self.metadata = {
+            **self.metadata,
+            "render_fps": max(1, round(1 / environment.period)),
+        }
+        self.observation_space = _observations(environment, routes)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._route = routes[0]
+        self._frame: CameraFrame | None = None
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; see the class for the options."""
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = set(options) - {"route", "pose"}
+        if unknown:
+            raise InputError(f"options: {', '.join(sorted(unknown))}; 'route', 'pose'")
+        drawn = int(self.np_random.integers(len(self.routes)))
+        name = options.get("route", list(self.routes)[drawn])
+        if name not in self.routes:
+            known = ", ".join(map(repr, self.routes))
+            raise InputError(f"options.route: {name!r}; one of {known}")
+        self._route = self.routes[name]
+        image_seed = int(self.np_random.integers(2**31))
+        frame = self.environment.reset(self._route, options.get("pose"), image_seed)
+        self._frame, self._steps = frame, 0
+        return self._observe(frame), {**self._info(), "route": name}
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Hold a control for one period.
+
+        Raises:
+            InputError: the action is not one finite number.
+        """
+        share = np.asarray(action, np.float64)
+        if share.size != 1:
+            raise InputError(f"action: shape {share.shape}; one control, shape (1,)")
+        control = float(share.reshape(())) * self.environment.max_control
+        frame = self.environment.step(control)
+        self._frame, self._steps = frame, self._steps + 1
+        info = self._info()
+        error = abs(info["cross_track_m"])
+        departed = error > (self._route.lane_width_m - self.width) / 2
+        over = self._steps >= self.max_steps or self.environment.is_over
+        if not self._route.closed:
+            over |= info["arc_length_m"] >= self._route.length - self.margin_m
+        return self._observe(frame), -error, departed, over, info
+
+    def render(self) -> np.ndarray | None:
+        """Return the last image (height, width, 3), sRGB, or None."""
+        if self.render_mode is None or self._frame is None:
+            return None
+        return self._frame.image.copy()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.environment.close()
+
+    def _info(self) -> dict[str, Any]:
+        state = self.environment.state
+        arc, error, _ = self._route.project_numpy(state[:3])
+        return {
+            "cross_track_m": float(error[0]),
+            "arc_length_m": float(arc[0]),
+            "state": state,
+        }
+
+    def _observe(self, frame: CameraFrame) -> dict[str, Any]:
+        return {
+            "image": frame.image,
+            "depth": np.minimum(frame.depth, np.float32(FAR_M)).astype(np.float32),
+            "camera_to_world": np.asarray(frame.camera_to_world, np.float64),
+            "goal": np.int64(self._route.goal),
+        }
+
+
+def _observations(
+    environment: AbstractEnvironment, routes: Sequence[Route]
+) -> gymnasium.spaces.Dict:
+    size = (environment.camera.height, environment.camera.width)
+    box, goals = gymnasium.spaces.Box, max(route.goal for route in routes) + 1
+    return gymnasium.spaces.Dict(
+        {
+            "image": box(0, 255, (*size, 3), np.uint8),
+            "depth": box(0.0, FAR_M, size, np.float32),
+            "camera_to_world": box(-_WORLD_M, _WORLD_M, (4, 4), np.float64),
+            "goal": gymnasium.spaces.Discrete(goals),
+        }
+    )
+
+
+def make_gym(
+    name: str,
+    place: Place | str = "intersection",
+    conditions: Conditions | None = None,
+    routes: Sequence[str] = (),
+    size_px: tuple[int, int] | None = None,
+    render_mode: str | None = None,
+    **more: Any,
+) -> DrivingEnv:
+    """Make a `DrivingEnv` of a registered environment; `gymnasium.make` calls it.
+
+    Args:
+        name: key of `ENVIRONMENTS`.
+        place: or the name of a bundled one.
+        conditions: of light and camera.
+        routes: names in the place's file; all of them by default.
+        size_px: width and height of the images; the place's camera decides by default.
+        render_mode: "rgb_array" or None.
+        **more: to `DrivingEnv`.
+    """
+    from mi_nerfattack import variant
+
+    variant.ensure()
+    place = bundled_place(place) if isinstance(place, str) else place
+    if size_px is not None:
+        place = replace(place, camera=place.camera.resized(*size_px))
+    if routes:
+        found = [Route.from_file(place.routes, route) for route in routes]
+    else:
+        found = Route.all_from_file(place.routes)
+    environment = make_environment(name, place, conditions)
+    more.setdefault("width", place.car.width)
+    return DrivingEnv(environment, found, render_mode=render_mode, **more)
+
+
+def register() -> None:
+    """Register "mi_nerfattack/NAME-v0" for every environment; repeating is harmless."""
+    for name in ENVIRONMENTS:
+        key = f"mi_nerfattack/{name}-v0"
+        if key not in gymnasium.registry:
+            gymnasium.register(
+                key, "mi_nerfattack.deploy.gym:make_gym", kwargs={"name": name}
+            )
+
+
+register()
