@@ -1,19 +1,23 @@
-"""Routes, a sensor and a scene for tests of collection and validation."""
+"""Routes, an environment and a scene for tests of collection and validation."""
 
 from __future__ import annotations
 
 import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
-import drjit as dr
+import time
+from dataclasses import dataclass, field
+
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.deploy.car import CAR, Car
+from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.policy.adapter import AbstractPolicy
 from mi_nerfattack.policy.collect import CollectSettings
+from mi_nerfattack.policy.sites import AbstractSite
+from mi_nerfattack.render.camera import Camera, from_fov
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.vehicle.route import Route
 
 KERB_M = 0.12
@@ -44,34 +48,116 @@ def small_grid() -> GridField:
     )
 
 
-class StateSensor:
-    """Paints the state into flat images, and remembers states and objects."""
+@dataclass(frozen=True)
+class Grey:
+    """Conditions of the fake site: a level that is added to all images."""
 
-    def __init__(self) -> None:
-        self.objects: list[PosedField] = []
+    level: int = 0
+
+
+class PaintedEnvironment(AbstractEnvironment):
+    """Paints the state into flat images, and remembers states and objects.
+
+    Channels of every pixel: x, y (0.2 m a level) and heading (0.02 rad a level).
+    """
+
+    name = "painted"
+    control_unit = "rad/s"
+    max_control = 1.5
+    period = 0.1
+
+    def __init__(self, camera: Camera, conditions: Grey) -> None:
+        self.camera, self.conditions = camera, conditions
         self.states: list[np.ndarray] = []
         self.seen: list[list[PosedField]] = []
+        self.seeds: list[int] = []
+        self.starts: list[int] = []
+        self.objects: list[PosedField] = []
+        self._speed, self._state = 0.0, np.zeros(3)
 
-    def observe(self, state, step) -> Observation:
-        states = np.array(state).T
-        self.states.append(states)
+    @property
+    def state(self) -> np.ndarray:
+        return self._state
+
+    def reset(self, route, pose=None, seed=0):
+        self._speed, self._state = route.speed_ms, np.array(pose, np.float64)
+        self.starts.append(len(self.states))
+        self.seeds.append(seed)
+        return self._observe()
+
+    def step(self, control):
+        """Drive an arc."""
+        turn = control * self.period
+        chord = self._speed * self.period * np.sinc(turn / 2 / np.pi)
+        x, y, theta = self._state
+        middle = theta + turn / 2
+        self._state = np.array(
+            [x + chord * np.cos(middle), y + chord * np.sin(middle), theta + turn]
+        )
+        return self._observe()
+
+    def show(self, objects):
+        self.objects = list(objects)
+
+    def close(self):
+        pass
+
+    def _observe(self):
+        self.states.append(self._state)
         self.seen.append(list(self.objects))
-        shade = np.clip(0.5 + states / 100, 0, 1)[:, None, None, :]
-        image = np.broadcast_to(shade, (len(states), 66, 200, 3))
-        return Observation(mi.TensorXf(np.ascontiguousarray(image, np.float32)))
+        shape = self.camera.height, self.camera.width
+        image = np.broadcast_to(painted(self._state, self.conditions), (*shape, 3))
+        return CameraFrame(image.copy(), np.full(shape, np.inf, "f4"), np.eye(4))
 
 
-class Constant(AbstractPolicy):
-    """Returns one control whatever it sees."""
+def painted(state: np.ndarray, conditions: Grey = Grey()) -> np.ndarray:  # noqa: B008
+    """Colour (3,) uint8 of the images of a state."""
+    levels = 128 + conditions.level + state[:3] / [0.2, 0.2, 0.02]
+    return np.clip(np.round(levels), 0, 255).astype(np.uint8)
 
-    def __init__(self, value: float) -> None:
-        self.value = value
 
-    def control(self, image, goal):
-        return dr.opaque(mi.Float, self.value, image.shape[0])
+@dataclass(frozen=True)
+class PaintedSite(AbstractSite):
+    """Site of painted environments; `opened` remembers those of this process."""
 
-    def vjp(self, image, goal, cotangent):
-        raise AssertionError("collection needs no derivative")
+    name: str = "painted"
+    objects: bool = True
+    size_px: tuple[int, int] = (8, 4)
+    opened: list[PaintedEnvironment] = field(default_factory=list, compare=False)
+    delay_s: float = 0.0
+
+    @property
+    def camera(self) -> Camera:
+        return from_fov(*self.size_px, 90.0)
+
+    @property
+    def car(self) -> Car:
+        return CAR
+
+    @property
+    def period(self) -> float:
+        return PaintedEnvironment.period
+
+    def draw(self, rng):
+        return Grey(int(rng.integers(3)))
+
+    def typical(self):
+        return Grey()
+
+    def open(self, conditions):
+        time.sleep(self.delay_s)
+        self.opened.append(PaintedEnvironment(self.camera, conditions))
+        self.opened[-1].name = self.name
+        return self.opened[-1]
+
+    def load_objects(self):
+        return [small_grid()] if self.objects else []
+
+    def load_ground(self):
+        return flat_ground
+
+    def describe(self):
+        return {"environment": self.name, "size": self.size_px}
 
 
 def kerb_scene():
@@ -96,5 +182,5 @@ def kerb_scene():
 
 
 def small(**changes) -> CollectSettings:
-    base = {"frames": 24, "group": 4, "groups_a_shard": 3, "seed": 5}
+    base = {"frames": 24, "group": 4, "shard": 12, "seed": 5}
     return CollectSettings(**(base | changes))

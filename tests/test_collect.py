@@ -5,128 +5,241 @@ from __future__ import annotations
 import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
+import json
+from pathlib import Path
+
 import drjit as dr
 import numpy as np
 import pytest
+import torch
 from roadside import (
-    Constant,
-    StateSensor,
+    Grey,
+    PaintedSite,
     bent,
-    flat_ground,
-    kerb_scene,
+    painted,
     small,
-    small_grid,
     straight,
 )
 
-from mi_nerfattack.deploy.mitsuba import PathTracedSensor
+from mi_nerfattack.deploy.registry import Place
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.policy.collect import (
-    CollectSettings,
-    World,
-    collect,
-    collect_visited,
-    to_uint8,
-)
+from mi_nerfattack.policy.collect import CollectSettings, collect, find_shards
 from mi_nerfattack.policy.dataset import FrameDataset
-from mi_nerfattack.policy.placement import Roadside, Scatter, scene_ground
-from mi_nerfattack.render.camera import from_fov
-from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
-from mi_nerfattack.rollout.loop import to_state
-from mi_nerfattack.vehicle.expert import LaneFollower
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.placement import Scatter
+from mi_nerfattack.policy.sites import PlaceSite, Weather, load_routes
+from mi_nerfattack.policy.sources import (
+    ExpertDrives,
+    Mixture,
+    PolicyDrives,
+    Scattered,
+)
+from mi_nerfattack.policy.workers import InThisProcess
+from mi_nerfattack.render.camera import CameraMount, from_fov
+from mi_nerfattack.scenes import bundled
+from mi_nerfattack.vehicle.expert import expert_for
 
 pytestmark = pytest.mark.usefixtures("variant")
 
+HERE = InThisProcess()
+
+
+def follower(route):
+    return expert_for("rad/s", route, 0.1)
+
+
+FILES = ("frames.npy", "goals.npy", "controls.npy", "shard.json")
+
 
 @pytest.fixture
-def grid(variant) -> GridField:
-    return small_grid()
+def site() -> PaintedSite:
+    return PaintedSite()
 
 
-def test_frames_carry_the_experts_control_and_goal(grid, tmp_path):
-    sensor = StateSensor()
-    world = World("surrogate", sensor, (grid,), flat_ground)
+def states_of(site: PaintedSite) -> np.ndarray:
+    return np.concatenate([np.stack(item.states) for item in site.opened])
+
+
+def conditions_of(shards: list[Path]) -> list[int]:
+    return [json.loads((s / "shard.json").read_text())["conditions"] for s in shards]
+
+
+def test_frames_carry_the_experts_control_and_goal(site, tmp_path):
     routes = [straight(), bent()]
-    shards = collect(world, routes, small(frames=120), tmp_path)
+    shards = collect(site, routes, Scattered(), small(frames=120), tmp_path, HERE)
     data = FrameDataset.from_folders(shards)
     assert len(data) == 120
-    states = np.concatenate(sensor.states)
+    # the last group of a shard may be cut: only what was labelled is written
+    states = states_of(site)
+    assert len(states) == 120
     assert set(data.goals) == {0, 1}
     for route in routes:
         mine = data.goals == route.goal
-        expected = LaneFollower(route).control(states[mine])
+        expected = follower(route).control(states[mine])
         np.testing.assert_allclose(data.controls[mine], expected, rtol=1e-6)
         arc = route.project_numpy(states[mine])[0]
         assert arc.min() > -3
         assert arc.max() < route.length + 3
-    shade = np.round(255 * np.clip(0.5 + states / 100, 0, 1))
     frames = data.read_frames(np.arange(120))
-    np.testing.assert_array_equal(frames[:, 30, 100], shade.astype(np.uint8))
+    levels = [about["level"] for about in conditions_of(shards) for _ in range(12)]
+    expected = [painted(s, Grey(k)) for s, k in zip(states, levels, strict=True)]
+    np.testing.assert_array_equal(frames[:, 2, 3], expected)
 
 
-def test_objects_come_and_go_ahead_of_the_vehicles(grid, tmp_path):
-    sensor = StateSensor()
-    world = World("surrogate", sensor, (grid,), flat_ground)
-    own = grid.texture.numpy()
-    collect(world, [straight()], small(frames=480), tmp_path)
-    present = [bool(objects) for objects in sensor.seen]
-    assert 0.55 < np.mean(present) < 0.95
-    for objects, states in zip(sensor.seen, sensor.states, strict=True):
+def test_the_last_shard_has_the_rest(site, tmp_path):
+    settings = small(frames=17)
+    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    sizes = [len(FrameDataset.from_folders([shard])) for shard in shards]
+    assert sizes == [12, 5]
+
+
+def test_conditions_change_from_shard_to_shard(site, tmp_path):
+    settings = small(frames=120)
+    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    levels = [about["level"] for about in conditions_of(shards)]
+    assert set(levels) == {0, 1, 2}
+    # loaded only where they differ
+    changes = 1 + sum(a != b for a, b in zip(levels, levels[1:], strict=False))
+    assert len(site.opened) == changes
+
+
+def test_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
+    collect(site, [straight()], Scattered(), small(frames=480), tmp_path, HERE)
+    seen = [objects for item in site.opened for objects in item.seen]
+    assert 0.55 < np.mean([bool(objects) for objects in seen]) < 0.95
+    for objects, state in zip(seen, states_of(site), strict=True):
         for posed in objects:
-            ahead = posed.pose.translation[0] - states[:, 0]
-            assert 0 < ahead.min()
-            assert ahead.max() < 24
-    np.testing.assert_array_equal(grid.texture.numpy(), own)
-    assert sensor.objects == []
+            assert 0 < posed.pose.translation[0] - state[0] < 24
 
 
-def test_no_objects_when_none_are_wanted(grid, tmp_path):
-    sensor = StateSensor()
-    world = World("surrogate", sensor, (grid,), flat_ground)
-    collect(world, [straight()], small(object_share=0.0), tmp_path / "a")
-    collect(World("surrogate", sensor, (), flat_ground), [bent()], small(), tmp_path)
-    assert not any(sensor.seen)
+def test_no_objects_when_none_are_wanted(site, tmp_path):
+    settings = small(object_share=0.0)
+    collect(site, [straight()], Scattered(), settings, tmp_path / "a", HERE)
+    bare = PaintedSite(objects=False)
+    collect(bare, [bent()], Scattered(), small(), tmp_path / "b", HERE)
+    assert not any(any(item.seen) for item in (*site.opened, *bare.opened))
 
 
-def test_interrupted_collection_continues_with_the_same_frames(grid, tmp_path):
-    world = World("surrogate", StateSensor(), (grid,), flat_ground)
-    whole = collect(world, [straight(), bent()], small(frames=36), tmp_path / "whole")
+def test_interrupted_collection_continues_with_the_same_frames(site, tmp_path):
+    routes, settings = [straight(), bent()], small(frames=36)
+    whole = collect(site, routes, Scattered(), settings, tmp_path / "whole", HERE)
+    part = tmp_path / "part"
 
-    def stop(done, total):
+    def stop(done, total, left_s):
         if done == 20:
             raise KeyboardInterrupt
 
-    for broken in (stop, lambda done, total: None):
-        try:
-            part = collect(
-                world,
-                [straight(), bent()],
-                small(frames=36),
-                tmp_path / "part",
-                progress=broken,
-            )
-        except KeyboardInterrupt:
-            first = tmp_path / "part" / "surrogate" / "shard_0000"
-            assert (first / "shard.json").is_file()
-            written = (first / "frames.npy").stat().st_mtime_ns
+    with pytest.raises(KeyboardInterrupt):
+        collect(site, routes, Scattered(), settings, part, HERE, stop)
+    first = part / "painted" / "shard_0000"
+    assert (first / "shard.json").is_file()
+    written = (first / "frames.npy").stat().st_mtime_ns
+    seen = []
+    again = collect(
+        site,
+        routes,
+        Scattered(),
+        settings,
+        part,
+        HERE,
+        lambda done, total, left_s: seen.append((done, total)),
+    )
     assert (first / "frames.npy").stat().st_mtime_ns == written
-    for one, other in zip(whole, part, strict=True):
-        for name in ("frames", "goals", "controls"):
-            path = f"{name}.npy"
-            assert (one / path).read_bytes() == (other / path).read_bytes()
+    assert seen == [(done, 36) for done in range(12, 37)]
+    for one, other in zip(whole, again, strict=True):
+        for name in FILES:
+            assert (one / name).read_bytes() == (other / name).read_bytes()
 
 
-def test_folder_of_other_settings_is_refused(tmp_path):
-    world = World("surrogate", StateSensor(), (), flat_ground)
-    collect(world, [straight()], small(), tmp_path, origin="a")
-    with pytest.raises(InputError, match="manifest.json.*origin"):
-        collect(world, [straight()], small(), tmp_path, origin="b")
-    with pytest.raises(InputError, match="differ in settings"):
-        collect(world, [straight()], small(seed=6), tmp_path, origin="a")
-    with pytest.raises(InputError, match="differ in routes"):
-        collect(world, [bent()], small(), tmp_path, origin="a")
+def test_expert_drives_recover(site, tmp_path):
+    """From 1 m beside the lane the expert comes back within 16 periods (8 m)."""
+    scatter = Scatter(lateral_sd_m=0.8, heading_sd=0.01, close_share=0.0)
+    settings = small(frames=64, shard=64, scatter=scatter, object_share=0.0)
+    collect(site, [straight()], ExpertDrives(16), settings, tmp_path, HERE)
+    (environment,) = site.opened
+    drives = np.split(np.stack(environment.states), environment.starts[1:])
+    error = np.abs([(drive[0, 1], drive[15, 1]) for drive in drives if len(drive) > 15])
+    assert error[:, 0].max() > 0.5
+    assert error[:, 1].max() < 0.3 * error[:, 0].max()
+
+
+@pytest.fixture
+def weights(tmp_path) -> Path:
+    """A policy that always gives 0.2 rad/s."""
+    module = PilotNet(2)
+    torch.nn.init.zeros_(module.head[-1].weight)
+    torch.nn.init.constant_(module.head[-1].bias, np.arctanh(0.2 / 1.5))
+    module.save(tmp_path / "constant.safetensors")
+    return tmp_path / "constant.safetensors"
+
+
+def test_visited_states_are_those_of_the_policy(weights, tmp_path):
+    """At a constant rate of 0.2 rad/s the vehicle drives arcs."""
+    site = PaintedSite(size_px=(200, 66))
+    settings = small(frames=12, scatter=Scatter(close_share=1.0))
+    drives = PolicyDrives(weights, horizon=3)
+    shards = collect(site, [straight()], drives, settings, tmp_path, HERE)
+    data = FrameDataset.from_folders(shards)
+    assert len(data) == 12
+    (environment,) = site.opened
+    for start in environment.starts:
+        first, second = environment.states[start : start + 2]
+        assert second[2] - first[2] == pytest.approx(0.02, abs=1e-6)
+    expected = follower(straight()).control(np.stack(environment.states))
+    np.testing.assert_allclose(data.controls, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_expert_drives_its_share_of_the_periods(weights, tmp_path):
+    site = PaintedSite(size_px=(200, 66), objects=False)
+    settings = small(frames=200, shard=200)
+    drives = PolicyDrives(weights, horizon=8, expert_share=0.5)
+    collect(site, [straight()], drives, settings, tmp_path, HERE)
+    (environment,) = site.opened
+    states = np.stack(environment.states)
+    turn = np.diff(states[:, 2])
+    same = np.setdiff1d(np.arange(len(turn)), np.array(environment.starts) - 1)
+    assert 0.35 < np.isclose(turn[same], 0.02, atol=1e-6).mean() < 0.65
+
+
+def test_drives_end_where_the_vehicle_has_strayed(weights, tmp_path):
+    """0.6 lane widths off, frames teach nothing any more."""
+    site = PaintedSite(size_px=(200, 66), objects=False)
+    drives = PolicyDrives(weights, horizon=60)
+    shards = collect(site, [straight()], drives, small(), tmp_path, HERE)
+    frames = FrameDataset.from_folders(shards).read_frames(np.arange(24))
+    lateral = 0.2 * (frames[:, 0, 0, 1] - 128.0)
+    assert np.abs(lateral).max() < 0.6 * 3.5 + 0.5  # grey levels of 0.2 m, up to 2
+    assert max(np.diff(site.opened[0].starts)) < 60
+
+
+def test_a_mixture_takes_from_all_its_sources(site, tmp_path):
+    mixture = Mixture((Scattered(), ExpertDrives(3)), (0.5, 0.5))
+    settings = small(frames=240, shard=240)
+    collect(site, [straight()], mixture, settings, tmp_path, HERE)
+    lengths = np.diff(site.opened[0].starts)
+    assert {1, 3} <= set(lengths) <= {1, 2, 3}  # 2: past the route's end
+    with pytest.raises(InputError, match="one positive share a source"):
+        Mixture((Scattered(),), (0.5, 0.5))
+
+
+def test_folder_of_other_settings_is_refused(site, weights, tmp_path):
+    routes = [straight()]
+
+    def again(site=site, routes=routes, source=Scattered(), **changes):  # noqa: B008
+        collect(site, routes, source, small(**changes), tmp_path, HERE)
+
+    again()
+    with pytest.raises(InputError, match=r"manifest.json.*differ in settings"):
+        again(seed=6)
+    with pytest.raises(InputError, match="differ in expert, routes"):
+        again(routes=[bent()])
+    with pytest.raises(InputError, match="differ in site"):
+        again(site=PaintedSite(size_px=(4, 4)))
+    with pytest.raises(InputError, match="differ in source"):
+        again(source=PolicyDrives(weights))
+    (tmp_path / "painted" / "manifest.json").unlink()
+    with pytest.raises(InputError, match=r"frames without manifest.json"):
+        again()
 
 
 @pytest.mark.parametrize("change", [{"frames": 0}, {"object_share": 1.5}])
@@ -135,87 +248,60 @@ def test_settings_out_of_range_are_refused(change):
         CollectSettings(**change)
 
 
-def compiled() -> int:
-    history = dr.kernel_history((dr.KernelType.JIT,))
-    return sum(not entry["cache_hit"] for entry in history)
+def test_folders_without_frames_are_named(tmp_path):
+    with pytest.raises(InputError, match="no frames in it"):
+        find_shards(tmp_path)
 
 
-def worlds_of(grid: GridField) -> list[World]:
-    camera = from_fov(200, 66, 90.0)
-    scene = kerb_scene()
-    layout = GridLayout(levels=1, base_resolution=3, max_resolution=3)
-    ground = GridField(layout, np.array([-60, -60, -1]), np.array([60, 60, 0.0]))
-    ground.step_m = 0.5
-    surrogate = FieldSensor(PosedField(ground), [], camera)
-    path_traced = PathTracedSensor(scene, [], camera, spp=1)
-    return [
-        World("surrogate", surrogate, (grid,), scene_ground(scene)),
-        World("deployment", path_traced, (grid,), scene_ground(scene)),
-    ]
+def test_a_full_disk_is_told(site, tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.write", full)
+    with pytest.raises(InputError, match="no space left on the disk"):
+        collect(site, [straight()], Scattered(), small(), tmp_path, HERE)
 
 
-@pytest.mark.parametrize("index", [0, 1], ids=["surrogate", "deployment"])
-def test_nothing_is_compiled_after_the_first_groups(grid, tmp_path, index):
-    world = worlds_of(grid)[index]
-    world.sensor.observe(to_state(np.zeros((4, 3))), 0)
+def bundled_site(name: str, **changes) -> PlaceSite:
+    place = Place(
+        bundled("intersection/scene.xml"),
+        bundled("intersection/field.safetensors"),
+        bundled("intersection/routes.json"),
+        (bundled("hydrant/field.safetensors"),),
+        from_fov(24, 8, 90.0),
+        CameraMount(),
+    )
+    return PlaceSite(name, place, Weather(spp=1, **changes))
+
+
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_nothing_is_compiled_after_the_first_shard(name, tmp_path):
+    site = bundled_site(name)
+    routes = load_routes(site.place.routes)
+    settings = small(frames=24, shard=24)
+    collect(site, routes, Scattered(), settings, tmp_path / "warm", HERE)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        collect(world, [straight()], small(frames=36), tmp_path / "warm")
         dr.kernel_history_clear()
-        collect(world, [bent()], small(frames=36, seed=8), tmp_path / "again")
-        assert compiled() == 0
+        collect(site, routes, Scattered(), settings, tmp_path / "again", HERE)
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    assert not [entry for entry in history if not entry["cache_hit"]]
 
 
-def test_objects_stand_in_both_worlds_at_the_same_pixels(grid):
-    """A green object before white, grey or black covers the same part of both."""
-    green = np.tile(np.float32([-2, 2, -2]), (grid.n_vertices, 1))
-    grid.set_parameter("texture", green)
-    grid.set_parameter("density", np.full(grid.n_vertices, 1.0, np.float32))
-    masks = []
-    for world in worlds_of(grid):
-        rng = np.random.default_rng(4)
-        pose = Roadside().place(grid, straight(), (8.0, 9.0), world.ground, rng)
-        state = to_state(np.zeros((1, 3)))
-        without = np.array(world.sensor.observe(state, 0).image)
-        world.sensor.objects = [PosedField(grid, pose)]
-        with_object = np.array(world.sensor.observe(state, 0).image)
-        masks.append(np.abs(with_object - without).max(-1)[0] > 0.05)
-    assert masks[0].sum() > 50
-    assert (masks[0] & masks[1]).sum() > 0.9 * (masks[0] | masks[1]).sum()
+def test_shards_of_a_place_have_their_light(tmp_path):
+    site = bundled_site("mitsuba", skies=("noon",), exposures_ev=(-2.0, 2.0))
+    routes = load_routes(site.place.routes)
+    settings = small(frames=24, shard=4, object_share=0.0)
+    shards = collect(site, routes, Scattered(), settings, tmp_path, HERE)
+    means: dict[float, list[float]] = {}
+    for shard, about in zip(shards, conditions_of(shards), strict=True):
+        frames = FrameDataset.from_folders([shard]).read_frames(np.arange(4))
+        means.setdefault(about["exposure_ev"], []).append(frames.mean())
+    assert set(means) == {-2.0, 2.0}
+    assert max(means[-2.0]) < min(means[2.0]) - 30
 
 
-def test_visited_states_are_those_of_the_policy(tmp_path):
-    """At a constant rate of 0.2 rad/s the vehicle drives arcs."""
-    sensor = StateSensor()
-    world = World("surrogate", sensor, (), flat_ground)
-    settings = small(scatter=Scatter(close_share=1.0))
-    shards = collect_visited(
-        world, [straight()], Constant(0.2), settings, tmp_path, horizon=3
-    )
-    data = FrameDataset.from_folders(shards)
-    assert len(data) == 24
-    for start in range(0, len(sensor.states), 3):
-        first, _, third = sensor.states[start : start + 3]
-        np.testing.assert_allclose(third[:, 2] - first[:, 2], 0.2 * 2 * 0.1, atol=1e-6)
-    drive = np.concatenate(sensor.states[:3])
-    expected = LaneFollower(straight()).control(drive)
-    np.testing.assert_allclose(data.controls[:12], expected, rtol=1e-5, atol=1e-6)
-
-
-def test_visited_states_far_from_the_route_are_dropped(tmp_path):
-    sensor = StateSensor()
-    world = World("surrogate", sensor, (), flat_ground)
-    shards = collect_visited(
-        world, [straight()], Constant(1.4), small(), tmp_path, horizon=40
-    )
-    data = FrameDataset.from_folders(shards)
-    assert len(data) == 24
-    # at 1.4 rad/s (radius 3.6 m) a vehicle comes 7 m off the route
-    states = np.concatenate(sensor.states)
-    assert np.abs(states[:, 1]).max() > 4
-    frames = data.read_frames(np.arange(24))[:, 0, 0, 1] / 255
-    assert np.abs((frames - 0.5) * 100).max() < 2 + 100 / 255
-
-
-def test_images_are_rounded_to_the_nearest_level():
-    values = np.array([0.0, 0.4 / 255, 0.6 / 255, 1.0, 1.2])
-    np.testing.assert_array_equal(to_uint8(values), [0, 0, 1, 255, 255])
+def test_unknown_environments_and_skies_are_refused():
+    with pytest.raises(InputError, match=r"environment: 'moon'; one of surrogate"):
+        bundled_site("moon")
+    with pytest.raises(InputError, match="sky: 'dusk'"):
+        Weather(("dusk",))

@@ -18,11 +18,15 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.dataset import write_shard
 from mi_nerfattack.policy.placement import Roadside, Scatter
-from mi_nerfattack.policy.sites import AbstractSite, as_json
+from mi_nerfattack.policy.sites import (
+    AbstractSite,
+    as_json,
+    expert_of,
+    probe_expert,
+)
 from mi_nerfattack.policy.sources import AbstractSource, Labelled, Scenery
 from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
 
 #: Called with frames done, frames wanted, and the remaining time in seconds.
@@ -122,6 +126,7 @@ def collect(
         "site": site.describe(),
         "source": source.describe(),
         "routes": _digest(routes),
+        "expert": {route.name: probe_expert(site, route) for route in routes},
     }
     _claim(root, about)
     paths = [root / f"shard_{index:04d}" for index in range(settings.shards)]
@@ -172,17 +177,7 @@ class _Shards(AbstractWork):
         self, stage: _Stage, environment: AbstractEnvironment, rng: np.random.Generator
     ) -> Iterator[tuple[int, Labelled]]:
         """Yield goals and labelled frames without end."""
-        car, period = self.site.car, environment.period
-        experts = {
-            route.name: expert_for(
-                environment.control_unit,
-                route,
-                period,
-                environment.max_control,
-                car.wheelbase,
-            )
-            for route in self.routes
-        }
+        experts = {route.name: expert_of(self.site, route) for route in self.routes}
         states = _draw_states(self.routes, self.settings, rng)
         for number, (route, arc, poses) in enumerate(states):
             stage.dress(environment, route, arc, number, rng)

@@ -26,7 +26,11 @@ from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.placement import Ground, scene_ground
 from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.vehicle.expert import AbstractExpert, expert_for
 from mi_nerfattack.vehicle.route import Route
+
+#: The environment whose light does not change.
+SURROGATE = "surrogate"
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,11 @@ class AbstractSite(ABC):
     @abstractmethod
     def car(self) -> Any:
         """What drives: its `control_unit`, `max_control` and `wheelbase`."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """Seconds between two images."""
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> Any:
@@ -135,8 +144,15 @@ class PlaceSite(AbstractSite):
         """The place's car."""
         return self.place.car
 
+    @property
+    def period(self) -> float:
+        """The place's period."""
+        return self.place.period
+
     def draw(self, rng: np.random.Generator) -> Conditions:
-        """Draw from the weather."""
+        """Draw from the weather; the light of the surrogate is in its field."""
+        if self.name == SURROGATE:
+            return self.typical()
         return self.weather.draw(rng)
 
     def typical(self) -> Conditions:
@@ -172,6 +188,24 @@ class PlaceSite(AbstractSite):
             "period": place.period,
             "weather": asdict(self.weather),
         }
+
+
+def expert_of(site: AbstractSite, route: Route) -> AbstractExpert:
+    """Make the expert that labels a site's frames on a route."""
+    car = site.car
+    return expert_for(
+        car.control_unit, route, site.period, car.max_control, car.wheelbase
+    )
+
+
+def probe_expert(site: AbstractSite, route: Route) -> list[float]:
+    """Return an expert's controls beside a route's middle, which tell experts apart."""
+    expert, controls = expert_of(site, route), []
+    for lateral, heading in ((0.1, 0.0), (-0.2, 0.05), (0.0, -0.1)):
+        expert.reset()
+        state = route.pose_at(route.length / 2, lateral, heading)
+        controls.append(round(float(expert.control(state)[0]), 4))
+    return controls
 
 
 def load_routes(path: str | Path) -> list[Route]:

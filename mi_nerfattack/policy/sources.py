@@ -120,12 +120,12 @@ class ExpertDrives(AbstractSource):
     def frames(self, prepared: None, scenery: Scenery) -> Iterator[Labelled]:
         """Drive."""
         image = scenery.reset(scenery.poses[0])
-        for _ in range(self.horizon):
-            control = scenery.label()
-            yield image, control
+        yield image, (control := scenery.label())
+        for _ in range(self.horizon - 1):
             image = scenery.environment.step(control).image
             if scenery.strayed:
                 return
+            yield image, (control := scenery.label())
 
 
 @dataclass(frozen=True)
@@ -166,14 +166,14 @@ class PolicyDrives(AbstractSource):
     def frames(self, prepared: PilotNet, scenery: Scenery) -> Iterator[Labelled]:
         """Drive until the horizon, or until the vehicle has strayed."""
         image = scenery.reset(scenery.poses[0])
-        for _ in range(self.horizon):
-            control = scenery.label()
-            yield image, control
+        yield image, (control := scenery.label())
+        for _ in range(self.horizon - 1):
             if scenery.rng.uniform() >= self.expert_share:
                 control = steer(prepared, image, scenery.route.goal)
             image = scenery.environment.step(control).image
             if scenery.strayed:
                 return
+            yield image, (control := scenery.label())
 
 
 @dataclass(frozen=True)
