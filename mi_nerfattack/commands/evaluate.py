@@ -106,10 +106,16 @@ class Evaluate:
     ) -> None:
         from mi_nerfattack.report.policy_page import write_policy_page
 
-        about = {**work.describe(), "command": self._command(), "wall_s": wall_s}
-        path = write_policy_page(
-            folder, about, found.card, found.seconds, found.drives, work.routes
-        )
+        about = {
+            **work.describe(),
+            "command": self._command(),
+            "wall_s": wall_s,
+            "seconds_a_drive": {
+                f"{environment}, {case}": seconds
+                for (environment, case), seconds in found.seconds.items()
+            },
+        }
+        path = write_policy_page(folder, about, work.record(), found.card, found.drives)
         print(f"{path}: written", file=sys.stderr)
 
     def _work(self) -> EvaluateWork:

@@ -99,11 +99,11 @@ def _route_content(route: Route) -> list[Any]:
 
 
 def policy_content(policy: PolicySection, base: Path) -> dict[str, Any]:
-    """Return a policy's section as JSON, its files replaced by their checksums."""
-    values = policy.model_dump(mode="json")
+    """Return what a policy's section says as JSON, files by their checksums."""
+    values = policy.model_dump(mode="json", exclude_defaults=True)
     for key in ("file", "weights_file"):
-        if values[key] is not None:
-            values[key] = reference_digest(values[key], base)
+        if key in values:
+            values[f"{key}_sha256"] = reference_digest(values.pop(key), base)
     return values
 
 

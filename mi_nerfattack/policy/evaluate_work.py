@@ -36,6 +36,7 @@ from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.report.metrics import Drive, card_figures, departure_limit
 from mi_nerfattack.resumable import read_kept, write_kept
+from mi_nerfattack.scenario import resolve
 from mi_nerfattack.sections import PolicySection
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
@@ -155,7 +156,7 @@ class EvaluateWork(AbstractWork):
             "policy_section": policy_content(self.policy, self.base),
             "place": [f"{path.resolve().parent.name}/{path.name}" for path in paths],
             "routes": [route.name for route in self.routes],
-            "environments": {
+            "environments_under": {
                 under.label: {"sky": c.sky, "exposure_ev": c.exposure_ev, "spp": c.spp}
                 for under in self.environments
                 for c in (under.conditions,)
@@ -163,6 +164,16 @@ class EvaluateWork(AbstractWork):
             "settings": asdict(self.settings),
             "versions": versions(),
         }
+
+    def record(self) -> dict[str, Any] | None:
+        """Read the JSON that training writes beside a policy; None without one."""
+        if self.policy.file is None or ".py:" in self.policy.file:
+            return None
+        path = resolve(self.policy.file, self.base).with_suffix(".json")
+        if not path.is_file():
+            return None
+        found = files.read_json(path)
+        return found if isinstance(found, dict) else None
 
     def _identity(self, job: Job) -> dict[str, str]:
         shared = self.identities[job.environment.label, job.route.name]

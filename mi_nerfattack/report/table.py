@@ -112,31 +112,29 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
         pad_edge=False,
         padding=(0, 1),
     )
-    for name in ("environment", "route"):
-        table.add_column(name, overflow="fold", max_width=16)
+    table.add_column("environment", overflow="fold", min_width=11, max_width=18)
+    table.add_column("route", overflow="fold", min_width=8, max_width=14)
     table.add_column("case", no_wrap=True)
-    for name in ("runs", "mean\n(m)", "95 %", "max\n(m)", "left\nlane", "expert\n(m)"):
+    for name in ("runs", "mean\n(m)", "max\n(m)", "left\nlane", "expert\n(m)"):
         table.add_column(name, justify="right", no_wrap=True)
     for environment, routes in card.items():
         labels = [environment]
         for route, cases in routes.items():
             labels.append(route)
             for case, figures in cases.items():
-                table.add_row(*labels, case, *card_cells(figures))
+                table.add_row(*labels, case, *_card_cells(figures))
                 labels = ["", ""]
             labels = [""]
         table.add_section()
     return table
 
 
-def card_cells(figures: Mapping[str, Any]) -> list[str]:
-    """Return runs, mean, its interval, largest, drives that left, the expert's mean."""
-    interval = figures.get("cross_track_mean_ci95_m")
+def _card_cells(figures: Mapping[str, Any]) -> list[str]:
+    """Return runs, mean, largest, drives that left the lane, the expert's mean."""
     expert = figures.get("expert")
     return [
         str(figures["n"]),
         f"{figures['cross_track_mean_m']:.3f}",
-        "" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}",
         f"{figures['cross_track_max_m']:.3f}",
         str(figures["departures"]),
         "" if expert is None else f"{expert['cross_track_mean_m']:.3f}",
