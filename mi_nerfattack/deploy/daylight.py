@@ -41,10 +41,10 @@ class Daylight:
 #: Times of day by name; "day" leaves the scene as its file has it.
 DAYLIGHT: Mapping[str, Daylight | None] = {
     "day": None,
-    "morning": Daylight(22.0, 100.0, sky=1.2),
+    "morning": Daylight(28.0, 100.0, sun=1.3, sky=1.9),
     "noon": Daylight(68.0, 180.0),
-    "evening": Daylight(14.0, 262.0, sun=1.4, sky=1.5, turbidity=6.0),
-    "overcast": Daylight(50.0, 180.0, sun=0.0, sky=2.2, turbidity=10.0),
+    "evening": Daylight(18.0, 262.0, sun=1.7, sky=2.3, turbidity=6.0),
+    "overcast": Daylight(50.0, 180.0, sun=0.0, sky=1.5, turbidity=10.0),
 }
 
 
