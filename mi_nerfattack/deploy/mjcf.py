@@ -1,0 +1,69 @@
+"""MJCF of a place: its map, its light and a car."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mi_nerfattack.deploy import mjcf_car
+from mi_nerfattack.deploy.built_in import BuiltInObject
+from mi_nerfattack.deploy.car import Car
+from mi_nerfattack.deploy.mjcf_car import Handling
+from mi_nerfattack.deploy.mjcf_light import (
+    SHADOW_RADIUS,
+    add_lighting,
+    read_lighting,
+)
+from mi_nerfattack.deploy.mjcf_map import add_meshes, built_in_mesh, read_meshes
+
+NEAR_M = 0.05
+_SHADOW_PX = 2048
+_FAR = 4.0  # radii of the map: the sky stands at 0.7 of it
+
+
+def map_spec(
+    scene: Any, built_in: Sequence[BuiltInObject] = (), exposure_ev: float = 0.0
+) -> mujoco.MjSpec:
+    """Describe a Mitsuba scene for MuJoCo: meshes, textures, light, level ground.
+
+    Args:
+        scene: `mi.Scene`, metric, z up; meshes and rectangles of opaque materials.
+        built_in: more objects.
+        exposure_ev: its light is multiplied by two to this power.
+
+    Returns:
+        what compiles to a model without joints; the ground that cars drive on is the
+        plane z = 0, whatever is drawn.
+
+    Raises:
+        InputError: something in the scene cannot be drawn.
+    """
+    meshes = read_meshes(scene)
+    meshes += [built_in_mesh(index, item) for index, item in enumerate(built_in)]
+    lighting = read_lighting(scene).scaled(2.0**exposure_ev)
+    spec = mujoco.MjSpec()
+    mjcf_car.add_ground(spec)
+    add_meshes(spec, meshes, lighting.white)
+    add_lighting(spec, lighting)
+    _set_visual(spec, np.concatenate([mesh.vertices for mesh in meshes]))
+    return spec
+
+
+def world_spec(scene: Any, car: Car, handling: Handling | None = None) -> mujoco.MjSpec:
+    """Describe map and car in one model, as for MuJoCo's own viewer."""
+    spec = map_spec(scene)
+    mjcf_car.add_car(spec, car, handling or Handling())
+    return spec
+
+
+def _set_visual(spec: mujoco.MjSpec, vertices: np.ndarray) -> None:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    radius = max(0.5 * float(np.linalg.norm(high - low)), 1.0)
+    spec.stat.center, spec.stat.extent = (low + high) / 2, radius
+    view = spec.visual
+    view.map.znear, view.map.zfar = NEAR_M / radius, _FAR
+    view.map.shadowclip = SHADOW_RADIUS / radius
+    view.quality.shadowsize, view.quality.offsamples = _SHADOW_PX, 0
