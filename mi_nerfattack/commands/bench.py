@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
+from mi_nerfattack.commands.bench_experts import BenchExperts
+
 
 @dataclass(frozen=True)
 class BenchRender:
@@ -244,6 +246,7 @@ _Chosen = tyro.conf.OmitArgPrefixes[
             Annotated[BenchFit, tyro.conf.subcommand("fit")],
             Annotated[BenchAttack, tyro.conf.subcommand("attack")],
             Annotated[BenchComposite, tyro.conf.subcommand("composite")],
+            Annotated[BenchExperts, tyro.conf.subcommand("experts")],
         ]
     ]
 ]
