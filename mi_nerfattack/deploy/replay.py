@@ -99,8 +99,8 @@ class ReplayEnvironment(AbstractEnvironment):
     @property
     def is_over(self) -> bool:
         """Whether the next step would lie beyond the last frame."""
-        times = self.recording.track.times
-        return self._time(len(self.controls) + 1) > times[-1] + 0.5 * self.period
+        end = float(self.recording.track.times[-1]) + 0.5 * self.period
+        return self._time(len(self.controls) + 1) > end
 
     def show(self, objects: Sequence[Any]) -> None:
         """Paste fields by depth."""
