@@ -53,12 +53,14 @@ class Lighting:
         sun: (3,), irradiance of a surface that faces the sun; zero without one.
         sky: (3,), irradiance of level ground by all the rest.
         faces: (6, n, n, 3), radiance of the sky on the faces of MuJoCo's cube map.
+        has_shadows: whether the sun casts shadows.
     """
 
     sun_direction: np.ndarray
     sun: np.ndarray
     sky: np.ndarray
     faces: np.ndarray
+    has_shadows: bool = True
 
     def scaled(self, factor: float) -> Lighting:
         """Return the light multiplied by a factor."""
@@ -67,6 +69,7 @@ class Lighting:
             factor * self.sun,
             factor * self.sky,
             np.float32(factor) * self.faces,
+            self.has_shadows,
         )
 
     @property
@@ -76,10 +79,12 @@ class Lighting:
 
 
 def read_lighting(scene: Any) -> Lighting:
-    """Measure the environment and directional emitters of a Mitsuba scene.
+    """Measure the light of a Mitsuba scene.
 
-    Area emitters are drawn, but light nothing; with them alone the scene is evenly lit
-    as if it were white all around.
+    Outdoors, with an environment or directional emitter, other emitters are drawn but
+    light nothing. Without one, the mean light in the scene's lower half is measured:
+    what falls on vertical surfaces becomes ambient light, and what level ones get
+    besides comes from straight above, without shadows.
 
     Args:
         scene: `mi.Scene`.
@@ -92,7 +97,9 @@ def read_lighting(scene: Any) -> Lighting:
             direction = found[2]
         sun, sky = sun + found[0], sky + found[1]
     if not emitters:
-        sky = np.full(3, math.pi)
+        above, beside = _indoor_irradiance(scene)
+        sun, sky = np.maximum(above - beside, 0), beside
+        return Lighting(direction, sun, sky, _sky_faces([]), False)
     return Lighting(direction, sun, sky, _sky_faces(emitters))
 
 
@@ -114,7 +121,7 @@ def add_lighting(spec: mujoco.MjSpec, lighting: Lighting) -> None:
             ambient=[0] * 3,
             diffuse=np.clip((level - ambient) / height, 0, 1),
             specular=[0] * 3,
-            castshadow=True,
+            castshadow=lighting.has_shadows,
         )
     texels = linear_to_uint8(lighting.faces)
     size = texels.shape[1]
@@ -156,6 +163,32 @@ def _irradiance(emitter: Any, scene: Any) -> tuple[np.ndarray, ...]:
         np.where(near[:, None], 0, level).mean(axis=0),
         middle if near.any() else np.array([0.0, 0.0, 1.0]),
     )
+
+
+def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean irradiance (3,) of level and of vertical surfaces.
+
+    The scene's integrator tells it at random points between a twentieth and a half of
+    the scene's height.
+    """
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, _SAMPLES)
+    box = scene.bbox()
+    place = mi.Point3f(sampler.next_2d().x, sampler.next_2d().x, sampler.next_2d().x)
+    place = mi.Point3f(place.x, place.y, 0.05 + 0.45 * place.z)
+    origin = mi.Point3f(box.min) + mi.Vector3f(box.extents()) * mi.Vector3f(place)
+    upward = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    angle = 2 * math.pi * sampler.next_2d().x
+    sin, cos = dr.sincos(angle)
+    sideways = mi.Vector3f(
+        upward.z * cos - upward.x * sin, upward.z * sin + upward.x * cos, upward.y
+    )
+    result = []
+    for direction in (upward, sideways):
+        ray = mi.RayDifferential3f(mi.Ray3f(origin, direction))
+        radiance, *_ = scene.integrator().sample(scene, sampler, ray)
+        result.append(math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64))
+    return result[0], result[1]
 
 
 def _sky_faces(emitters: list[Any]) -> np.ndarray:

@@ -57,8 +57,9 @@ def make_context(width: int, height: int) -> Any:
         context.make_current()
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
         detail = " ".join(str(error).split()) or type(error).__name__
+        setting = f"{VARIABLE}={name or 'default'}"
         raise InputError(
-            f"OpenGL: {VARIABLE}={name or 'default'} does not work ({detail}); {_REMEDY}"
+            f"OpenGL: {setting} does not work ({detail}); {_REMEDY}"
         ) from error
     return context
 
