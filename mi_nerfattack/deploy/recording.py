@@ -93,7 +93,7 @@ def no_depth(camera: Camera) -> np.ndarray:
 
 
 def checked_image(where: str, image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return an image as (height, width, 3).
+    """Return a copy of an image as (height, width, 3).
 
     Args:
         where: file and frame, for messages.
@@ -111,7 +111,7 @@ def checked_image(where: str, image: np.ndarray, camera: Camera) -> np.ndarray:
         )
     if image.shape[2] == 4 and image[..., 3].min() < 255:
         raise InputError(f"{where}: transparent pixels; frames must be opaque")
-    return np.ascontiguousarray(image[..., :3])
+    return np.array(image[..., :3], order="C")
 
 
 def nearest_pose(

@@ -120,7 +120,7 @@ class ReplayEnvironment(AbstractEnvironment):
         frame = CameraFrame(
             self.recording.image(self._index),
             self.recording.depth(self._index),
-            track.camera_to_world[self._index],
+            track.camera_to_world[self._index].copy(),
         )
         return self._paster.paste(frame)
 

@@ -55,7 +55,11 @@ class FolderRecording(AbstractRecording):
 
     def depth(self, index: int) -> np.ndarray:
         """Return the depth of one frame."""
-        return no_depth(self.camera) if self._depth is None else self._depth[index]
+        return (
+            self._depth[index].copy()
+            if self._depth is not None
+            else no_depth(self.camera)
+        )
 
 
 def required_camera(source: Path, own: Camera | None, given: Camera | None) -> Camera:
