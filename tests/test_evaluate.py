@@ -1,0 +1,458 @@
+"""Evaluation of policies in an environment of known geometry, its card and page."""
+
+from __future__ import annotations
+
+import mi_nerfattack  # noqa: F401  before drjit
+
+# isort: split
+import json
+import math
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from roadside import Grey, PaintedEnvironment, bent, flat_ground, small_grid, straight
+
+from mi_nerfattack import cli, files
+from mi_nerfattack.deploy.registry import make_environment
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy import evaluate_work
+from mi_nerfattack.policy.adapter import AbstractPolicy
+from mi_nerfattack.policy.evaluate import (
+    CLEAN,
+    RANDOM_OBJECTS,
+    EvaluateSettings,
+    ExpertPolicy,
+    card,
+    drive,
+    evaluate,
+    evaluate_run,
+    random_start,
+)
+from mi_nerfattack.render.camera import from_fov
+from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
+from mi_nerfattack.report.table import card_table
+from mi_nerfattack.vehicle.expert import expert_for
+from mi_nerfattack.vehicle.route import Route
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ROUTES = {
+    "straight": {
+        "goal": 0,
+        "points_m": [[0, 0], [20, 0], [40, 0]],
+        "lane_width_m": 3.5,
+        "speed_ms": 5.0,
+    }
+}
+SCENE = """<scene version="3.0.0">
+<integrator type="direct"/>
+<shape type="rectangle"><transform name="to_world">
+<scale x="90" y="90"/></transform></shape>
+<emitter type="constant"/>
+</scene>"""
+STILL = "def drive(image, goal, step):\n    return [0.0] * len(image)\n"
+
+
+class Counting(AbstractPolicy):
+    """Gives one control, and remembers images, goals and memories."""
+
+    def __init__(self, value: float = 0.0) -> None:
+        self.value = value
+        self.seen: list[tuple[np.ndarray, int, int]] = []
+
+    def initial_memory(self, count):
+        assert count == 1
+        return (0,)
+
+    def step(self, image, goal, memory):
+        self.seen.append((image.numpy().copy(), goal, memory[0]))
+        return dr.opaque(mi.Float, self.value, 1), (memory[0] + 1,)
+
+    def control(self, image, goal):
+        raise AssertionError("a policy is asked for steps")
+
+    def vjp(self, image, goal, cotangent):
+        raise AssertionError("an evaluation needs no derivative")
+
+
+def surrogate(name: str = "surrogate") -> PaintedEnvironment:
+    environment = PaintedEnvironment(from_fov(8, 4, 90.0), Grey())
+    environment.name = name
+    return environment
+
+
+def test_a_straight_drive_beside_the_centre_has_a_known_error():
+    """At 0.3 m and an angle, control 0: the error is 0.3 + v t sin(psi)."""
+    environment, policy = surrogate(), Counting()
+    pose = np.array([1.0, 0.3, 0.05])
+    found = drive(environment, policy, straight(), pose, 7, 20)
+    expected = 0.3 + 5.0 * found.time_s * math.sin(0.05)
+    np.testing.assert_allclose(found.cross_track_m, expected, atol=1e-9)
+    np.testing.assert_allclose(found.time_s, 0.1 * np.arange(1, 21))
+    np.testing.assert_allclose(found.states[0], pose)
+    assert environment.seeds == [7]
+    # the memory grows step by step, the goal is the route's
+    assert [(goal, memory) for _, goal, memory in policy.seen] == [
+        (0, step) for step in range(20)
+    ]
+
+
+def test_the_policy_sees_srgb_in_the_unit_interval():
+    environment, policy = surrogate(), Counting()
+    drive(environment, policy, straight(), np.array([1.0, 0.3, 0.0]), 0, 1)
+    image = policy.seen[0][0]
+    assert image.shape == (1, 4, 8, 3) and image.dtype == np.float32
+    # levels 128 + 1 / 0.2, 128 + 0.3 / 0.2 and 128
+    np.testing.assert_allclose(image[0, 2, 3], np.array([133, 130, 128]) / 255, 1e-6)
+
+
+def test_a_constant_turn_is_integrated_with_the_period():
+    """A heading rate of w for T seconds turns the car by w T."""
+    found = drive(surrogate(), Counting(0.5), straight(), np.zeros(3), 0, 10)
+    assert found.states[-1, 2] == pytest.approx(0.5)
+    np.testing.assert_allclose(found.controls, 0.5)
+
+
+def test_starts_are_cut_and_depend_on_seed_route_and_run_alone():
+    settings = EvaluateSettings()
+    rng = np.random.default_rng(0)
+    poses = np.array([random_start(straight(), settings, rng) for _ in range(400)])
+    assert 0.2 < poses[:, 1].std() < 0.3
+    assert np.abs(poses[:, 1]).max() <= 0.75
+    assert np.rad2deg(poses[:, 2].std()) == pytest.approx(3.0, rel=0.2)
+    assert np.abs(np.rad2deg(poses[:, 2])).max() <= 9.0
+    np.testing.assert_array_equal(poses[:, 0], 0)
+    few, many = EvaluateSettings(runs=2, horizon=2), EvaluateSettings(horizon=2)
+    arguments = (Counting(), straight(), CLEAN, 1, [], flat_ground)
+    one = evaluate_run(surrogate(), *arguments, few)
+    other = evaluate_run(surrogate("mujoco"), *arguments, many)
+    np.testing.assert_array_equal(one.states, other.states)
+    assert one.seed == other.seed
+
+
+def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
+    grid = small_grid()
+    seen = []
+    for name in ("surrogate", "mitsuba"):
+        environment = surrogate(name)
+        settings = EvaluateSettings(horizon=3)
+        runs = [
+            evaluate_run(
+                environment,
+                Counting(),
+                straight(),
+                case,
+                run,
+                [grid],
+                flat_ground,
+                settings,
+            )
+            for case in settings.cases
+            for run in range(2)
+        ]
+        assert [item.case for item in runs] == [CLEAN] * 2 + [RANDOM_OBJECTS] * 2
+        shown = environment.seen
+        assert not any(shown[:8]) and all(len(item) == 1 for item in shown[8:])
+        assert environment.objects == []
+        seen.append([shown[8][0].pose.translation, shown[12][0].pose.translation])
+        # clean and with objects from the same start
+        np.testing.assert_array_equal(runs[0].states[0], runs[2].states[0])
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0][0], seen[0][1])
+    np.testing.assert_array_equal(grid.texture.numpy(), 0)
+
+
+def test_the_card_counts_drives_that_left_the_lane():
+    """Limit (3.5 - 1.8) / 2 = 0.85 m: 0.8 m stays, 0.9 m left."""
+    drives = [
+        drive(surrogate(), Counting(), straight(), np.array([0, y, 0]), 3, 4, run=run)
+        for run, y in enumerate([0.0, 0.8, -0.9])
+    ]
+    figures = card(drives, [straight()], 1.8)["surrogate"]["straight"]["clean"]
+    assert figures["n"] == 3
+    assert figures["departures"] == 1
+    assert figures["cross_track_mean_m"] == pytest.approx(1.7 / 3)
+    assert figures["cross_track_max_m"] == pytest.approx(0.9)
+    assert [run["departed"] for run in figures["per_run"]] == [False, False, True]
+    last = figures["per_run"][2]
+    assert last["departed_time_s"] == pytest.approx(0.1)
+    assert last["start"] == [0, -0.9, 0]
+    # Wilson's interval of 1 in 3, by its formula
+    z, share = 1.959963984540054, 1 / 3
+    middle = (share + z**2 / 6) / (1 + z**2 / 3)
+    half = z / (1 + z**2 / 3) * math.sqrt(share * (1 - share) / 3 + z**2 / 36)
+    assert figures["departure_rate_ci95"] == pytest.approx(
+        [middle - half, middle + half]
+    )
+    json.dumps(figures, allow_nan=False)
+
+
+def test_evaluate_drives_everything_and_counts_steps():
+    settings = EvaluateSettings(runs=2, horizon=4)
+    calls: list[tuple[int, int]] = []
+    environments = [surrogate("surrogate"), surrogate("mitsuba")]
+    found = evaluate(
+        Counting(),
+        environments,
+        [straight(), bent()],
+        [small_grid()],
+        flat_ground,
+        settings,
+        lambda done, total: calls.append((done, total)),
+    )
+    assert list(found) == ["surrogate", "mitsuba"]
+    for routes in found.values():
+        assert list(routes) == ["straight", "left"]
+        for cases in routes.values():
+            assert list(cases) == [CLEAN, RANDOM_OBJECTS]
+            assert all(figures["n"] == 2 for figures in cases.values())
+    assert calls == [(step, 64) for step in range(1, 65)]
+    assert card_table(found).row_count == 8
+
+
+def test_the_expert_drives_by_the_state():
+    environment, route = surrogate(), straight()
+    expert = ExpertPolicy(environment, expert_for("rad/s", route, 0.1))
+    found = drive(environment, expert, route, np.array([0, 0.5, 0.1]), 0, 60)
+    assert found.distance_m[0] > 0.5
+    assert found.distance_m[-20:].max() < 0.01
+    with pytest.raises(InputError, match="no derivative"):
+        expert.vjp(None, 0, None)
+
+
+def test_drives_end_before_an_open_route_and_with_a_closed_one():
+    square = np.array([[0, 0], [10, 0], [10, 10], [0, 10]], float)
+    loop = Route("loop", 0, square, closed=True)
+    assert EvaluateSettings().steps(straight()) == 76  # (40 - 2) m at 0.5 m a step
+    assert EvaluateSettings().steps(loop) == 80
+    assert EvaluateSettings(horizon=9).steps(loop) == 9
+
+
+@pytest.mark.parametrize("change", [{"runs": 0}, {"objects": -1}, {"horizon": 0}])
+def test_settings_out_of_range_are_named(change):
+    (name,) = change
+    with pytest.raises(InputError, match=rf"EvaluateSettings\.{name}"):
+        EvaluateSettings(**change)
+
+
+# The command
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch) -> list[str]:
+    """Files of a place and a policy, and the painted environment under every name."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "still.py").write_text(STILL)
+    files.write_json(tmp_path / "routes.json", ROUTES)
+    made: list[PaintedEnvironment] = []
+
+    def make(name, where, conditions=None):
+        made.append(PaintedEnvironment(where.camera, Grey()))
+        made[-1].name = name
+        return made[-1]
+
+    monkeypatch.setattr(evaluate_work, "make_environment", make)
+    monkeypatch.chdir(tmp_path)
+    options = ["--scene", "scene.xml", "--routes-file", "routes.json"]
+    options += ["--workers", "1", "--kind", "callable", "--runs", "2"]
+    return ["evaluate", "still.py:drive", "--environments", "mitsuba", *options]
+
+
+def test_the_command_prints_a_card_as_json(place, capsys):
+    assert cli.main([*place, "--json", "-o", "card.json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == files.read_json("card.json")
+    assert list(printed) == ["mitsuba"]
+    assert list(printed["mitsuba"]) == ["straight"]
+    # without objects there is no case with objects
+    assert list(printed["mitsuba"]["straight"]) == ["clean"]
+    figures = printed["mitsuba"]["straight"]["clean"]
+    assert figures["n"] == len(figures["per_run"]) == 2
+    assert figures["expert"]["cross_track_mean_m"] < figures["cross_track_mean_m"]
+
+
+def test_finished_drives_are_kept_and_more_runs_add_to_them(place, capsys, monkeypatch):
+    assert cli.main([*place, "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)
+    kept = sorted(Path("runs/evaluate").rglob("*.safetensors"))
+    assert len(kept) == 4  # two of the policy, two of the expert
+    times = [path.stat().st_mtime_ns for path in kept]
+    kept[0].unlink()
+    assert cli.main([*place, "--json", "--runs", "3"]) == 0
+    second = json.loads(capsys.readouterr().out)
+    old, new = (card["mitsuba"]["straight"]["clean"] for card in (first, second))
+    assert new["per_run"][:2] == old["per_run"]
+    assert [path.stat().st_mtime_ns for path in kept[1:]] == times[1:]
+    monkeypatch.setattr(evaluate_work, "make_environment", None)  # nothing is driven
+    assert cli.main([*place, "--json", "--runs", "3"]) == 0
+    assert json.loads(capsys.readouterr().out) == second
+
+
+def test_an_interrupted_evaluation_continues(place, capsys, monkeypatch):
+    whole = PaintedEnvironment.step
+    steps = 0
+
+    def step(self, control):
+        nonlocal steps
+        steps += 1
+        if steps == 100:
+            raise KeyboardInterrupt
+        return whole(self, control)
+
+    monkeypatch.setattr(PaintedEnvironment, "step", step)
+    assert cli.main([*place, "--json", "--drives", "kept"]) == 130
+    kept = len(list(Path("kept").rglob("*.safetensors")))
+    assert kept == 1  # 76 steps each
+    assert cli.main([*place, "--json", "--drives", "kept"]) == 0
+    assert steps == 100 + 3 * 76
+    capsys.readouterr()
+
+
+def test_conditions_are_rows_of_their_own(place, capsys):
+    place += ["--horizon", "3", "--conditions", "day", "evening", "noon:+1"]
+    assert cli.main([*place, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert list(printed) == ["mitsuba", "mitsuba@evening", "mitsuba@noon+1EV"]
+
+
+def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
+    # a lane hardly wider than the car: every start is out of it
+    narrow = {"straight": {**ROUTES["straight"], "lane_width_m": 1.81}}
+    files.write_json("routes.json", narrow)
+    assert cli.main([*place, "--page", "out", "--seed", "4"]) == 0
+    assert "left" in capsys.readouterr().out  # the table; failures are figures
+    text = Path("out/still-drive.md").read_text()
+    assert "2 of 2 drives left the lane" in text
+    assert "Drives that left the lane: 2 of 2." in text
+    assert "| mitsuba | straight | clean | 2 |" in text
+    assert "There is no record of the training" in text
+    assert "mi-nerfattack evaluate still.py:drive --environments mitsuba" in text
+    assert "--seed 4" in text and "file_sha256" in text
+    assert "Times of day driven in: day" in text
+    assert files.read_image("out/still-drive.png").std() > 5
+    document = files.read_json("out/still-drive.card.json")
+    assert document["environments"]["mitsuba"]["straight"]["clean"]["departures"] == 2
+    assert document["training"] is None
+
+
+def test_a_training_s_record_is_shown_as_far_as_it_goes():
+    former = {
+        "schema": 1,
+        "settings": {"runs": 2},
+        "training": [[{"held_out_loss": 1}]],
+    }
+    facts = training_facts(former)
+    assert facts["settings"] is None  # those are of the validation
+    assert facts["rounds"] == [
+        {"epochs": 1, "held_out_loss": 1, "closed_loop_error_m": None}
+    ]
+    facts = training_facts(
+        {"schema": 2, "settings": {"frames": {"mitsuba": 9}, "seed": 3}, "training": []}
+    )
+    assert facts["data"] == {"mitsuba": 9} and facts["seed"] == 3
+    assert facts["checksums"] is None
+
+
+def test_pages_are_named_after_the_policy():
+    assert policy_name("bundled:policy/pilotnet.safetensors") == "pilotnet"
+    assert policy_name("folder/mine.py:Net") == "mine-Net"
+    assert policy_name("http://127.0.0.1:8000") == "policy"
+
+
+def test_a_summary_counts_all_drives():
+    figures = {"n": 5, "departures": 1, "cross_track_mean_m": 0.25}
+    text = summary({"mitsuba": {"left": {"clean": figures, "random_objects": figures}}})
+    assert text.startswith("2 of 10 drives left the lane")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--runs", "0"], "EvaluateSettings.runs: 0"),
+        (["--workers", "0"], "workers: 0"),
+        (["--environments", "moon"], "--environments: 'moon'; one of"),
+        (["--environments", "replay"], "--environments: 'replay'"),
+        (["--environments", "mitsuba", "mitsuba"], "each once"),
+        (["--routes", "loop"], "no route 'loop'; it has 'straight'"),
+        (["--conditions", "night"], "--conditions: 'night'"),
+        (["--conditions", "day:bright"], "--conditions: 'day:bright'"),
+        (["--spp", "0"], "spp: 0"),
+        (["--goal", "integer"], "still.py:drive: policy.goals"),
+        (["--routes-file", "nothing.json"], "nothing.json: does not exist"),
+        (["--scene", "nothing.xml"], "nothing.xml: does not exist"),
+        (["--object", "nothing.safetensors"], "nothing.safetensors: does not exist"),
+        (["--output", "no/folder/card.json"], "no/folder/card.json"),
+        (["--place", "moon"], "place: 'moon'"),
+    ],
+)
+def test_bad_options_are_one_message(place, capsys, change, message):
+    assert cli.main([*place, *change]) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and "Traceback" not in errors
+    assert not list(Path().rglob("*.safetensors"))
+
+
+def test_an_environment_that_is_not_installed_is_one_message(
+    place, capsys, monkeypatch
+):
+    monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.delitem(
+        sys.modules, "mi_nerfattack.deploy.mujoco_vehicle", raising=False
+    )
+    assert cli.main([*place, "--environments", "mujoco"]) == 2
+    errors = capsys.readouterr().err
+    assert "pip install" in errors and "mujoco" in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("nothing.safetensors", "nothing.safetensors: does not exist"),
+        ("nothing.toml", "nothing.toml: does not exist"),
+        ("empty.toml", "empty.toml: has no section [policy]"),
+        ("key.toml", "key.toml: policy.colour"),
+        ("small.py:Small", "small.py:Small"),
+        ("nan.py:Bad", "it must be finite"),
+        ("noise.bin", "its suffix tells no kind"),
+        ("noise.safetensors", "noise.safetensors"),
+    ],
+)
+def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message):
+    Path("empty.toml").write_text("[scene]\n")
+    Path("key.toml").write_text('[policy]\nfile = "still.py:drive"\ncolour = "red"\n')
+    Path("small.py").write_text(  # for images of 66 x 100 pixels
+        "from torch import nn\n\n\ndef Small():\n"
+        "    return nn.Sequential(nn.Flatten(), nn.Linear(3 * 66 * 100, 1))\n"
+    )
+    Path("nan.py").write_text(
+        "from torch import nn\n\n\nclass Bad(nn.Module):\n"
+        "    def forward(self, image):\n"
+        "        return image.mean((1, 2, 3)) * float('nan')\n"
+    )
+    Path("noise.bin").write_bytes(b"noise")
+    Path("noise.safetensors").write_bytes(b"noise")
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = policy
+    assert cli.main(place) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and "Traceback" not in errors
+    assert not Path("runs").exists()
+
+
+def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
+    Path("mine.toml").write_text(
+        '[policy]\nkind = "callable"\nfile = "still.py:drive"\n'
+        "[policy.preprocess]\nresize_px = [10, 5]\n"
+    )
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = "mine.toml"
+    assert cli.main([*place, "--json", "--horizon", "2"]) == 0
+    assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
+    assert cli.main([*place, "--goals", "3"]) == 2
+    assert "mine.toml: says itself" in capsys.readouterr().err
