@@ -5,12 +5,15 @@ PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 # The build that the results were measured with; it needs no GPU.
 TORCH := torch==2.13.0
 
+# Processes that the tests are spread over; each takes up to 2 GB of memory.
+WORKERS ?= 2
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint check-python clean
 
 help:
 	@echo "make demo   run the whole chain on the bundled scene, about 10 minutes"
-	@echo "make test   run the tests, less than 20 minutes"
+	@echo "make test   run the tests, about 10 minutes on 2 cores"
 	@echo "make lint   check format, lint and types"
 	@echo "make clean  remove the virtual environment and what was built"
 
@@ -18,7 +21,7 @@ demo: $(VENV)/.installed
 	$(VENV)/bin/mi-nerfattack demo
 
 test: $(VENV)/.installed-test
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal --durations 25
 
 lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff format --check .

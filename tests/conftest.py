@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import mi_nerfattack  # noqa: F401  before drjit: it chooses the LLVM
+import os
+
+# Idle threads of PyTorch would spin on cores that another worker needs; before torch.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import mi_nerfattack  # noqa: E402, F401  before drjit: it chooses the LLVM
 
 # isort: split
-import os
 import random
 import signal
 import sys
