@@ -176,7 +176,7 @@ def weights(tmp_path) -> Path:
 def test_visited_states_are_those_of_the_policy(weights, tmp_path):
     """At a constant rate of 0.2 rad/s the vehicle drives arcs."""
     site = PaintedSite(size_px=(200, 66))
-    settings = small(frames=12, scatter=Scatter(close_share=1.0))
+    settings = small(frames=12, scatter=Scatter(close_share=1.0), margin_m=-8.0)
     drives = PolicyDrives(weights, horizon=3)
     shards = collect(site, [straight()], drives, settings, tmp_path, HERE)
     data = FrameDataset.from_folders(shards)

@@ -133,6 +133,11 @@ class PlaceSite(AbstractSite):
             raise InputError(
                 f"environment: {self.name!r}; one of {', '.join(ENVIRONMENTS)}"
             )
+        if self.name == SURROGATE and self.place.field is None:
+            raise InputError(
+                f"frames of {SURROGATE!r}: the place has no field; make one with "
+                "'mi-nerfattack fit' and give it, or want no such frames"
+            )
 
     @property
     def camera(self) -> Camera:
