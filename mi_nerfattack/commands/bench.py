@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
+from mi_nerfattack.commands.bench_circle import BenchCircle
 from mi_nerfattack.commands.bench_experts import BenchExperts
 
 
@@ -247,6 +248,7 @@ _Chosen = tyro.conf.OmitArgPrefixes[
             Annotated[BenchAttack, tyro.conf.subcommand("attack")],
             Annotated[BenchComposite, tyro.conf.subcommand("composite")],
             Annotated[BenchExperts, tyro.conf.subcommand("experts")],
+            Annotated[BenchCircle, tyro.conf.subcommand("circle")],
         ]
     ]
 ]

@@ -183,7 +183,7 @@ def _read_shape(shape: Any) -> DrawnMesh:
     return DrawnMesh(name, vertices, faces, normals, uv, albedo, two_sided)
 
 
-def _mesh_arrays(shape: Any) -> tuple[np.ndarray, ...]:
+def _mesh_arrays(shape: Any) -> tuple[Any, ...]:
     parameters = mi.traverse(shape)
 
     def rows(key: str, width: int) -> np.ndarray:
