@@ -144,7 +144,6 @@ class KinematicDriver(AbstractCarlaDriver):
     ) -> None:
         """Switch the actor's physics off."""
         self._session, self._actor, self._axles = session, actor, axles
-        self._map = session.world.get_map()
         self.vehicle.reset(pose, speed)
         actor.set_simulate_physics(False)
         self._place()
@@ -165,7 +164,7 @@ class KinematicDriver(AbstractCarlaDriver):
     def _place(self) -> None:
         body = self.vehicle.body_to_world
         actor_to_world = self._axles.actor_to_world(body)
-        actor_to_world[2, 3] = road_height(self._session, self._map, actor_to_world)
+        actor_to_world[2, 3] = road_height(self._session, actor_to_world)
         pose = body_to_carla(actor_to_world)
         self._actor.set_transform(self._session.transform(pose))
 
@@ -272,12 +271,17 @@ class PhysicalDriver(AbstractCarlaDriver):
         return float(np.clip(pedal, -1, 1))
 
 
-def road_height(
-    session: CarlaSession, town_map: Any, actor_to_world: np.ndarray
-) -> float:
-    """Return z of the lane nearest to an actor's pose (4, 4), metres."""
+def road_height(session: CarlaSession, actor_to_world: np.ndarray) -> float:
+    """Return z of the lane nearest to an actor's pose (4, 4), metres.
+
+    Raises:
+        InputError: the town has no lane.
+    """
     where = session.transform(body_to_carla(actor_to_world)).location
-    return float(town_map.get_waypoint(where).transform.location.z)
+    waypoint = session.town_map.get_waypoint(where)
+    if waypoint is None:
+        raise InputError(f"{session.town_map.name}: no lane to drive on; take a town")
+    return float(waypoint.transform.location.z)
 
 
 def measured_body(transform: Any, axles: Axles) -> np.ndarray:

@@ -89,7 +89,7 @@ class CarlaEnvironment(AbstractEnvironment):
     @property
     def town_map(self) -> Any:
         """The town's `carla.Map`, for `route_from_town`."""
-        return self.session.world.get_map()
+        return self.session.town_map
 
     def reset(
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
@@ -149,7 +149,7 @@ class CarlaEnvironment(AbstractEnvironment):
         session = self.session
         body = planar_body(start)
         place = body if self._axles is None else self._axles.actor_to_world(body)
-        place[2, 3] = road_height(session, self.town_map, place) + _DROP_M
+        place[2, 3] = road_height(session, place) + _DROP_M
         role = {"role_name": "hero"}
         self._actor = session.spawn(self._vehicle, body_to_carla(place), role)
         if self._axles is not None:
@@ -158,7 +158,7 @@ class CarlaEnvironment(AbstractEnvironment):
         measured = body_from_carla(read_pose(self._actor.get_transform()))
         axles = read_axles(self._actor, measured)
         place = axles.actor_to_world(body)
-        place[2, 3] = road_height(session, self.town_map, place) + _DROP_M
+        place[2, 3] = road_height(session, place) + _DROP_M
         self._actor.set_transform(session.transform(body_to_carla(place)))
         return axles
 

@@ -97,6 +97,10 @@ class CarlaSession:
         period: seconds of simulation between two ticks, at most 0.16.
         api: the module `carla`.
 
+    Attributes:
+        world: `carla.World`.
+        town_map: `carla.Map` of it.
+
     Raises:
         InputError: no answer within the time limit, a server of another version, an
             unknown town or weather, or a period that the physics cannot take.
@@ -113,6 +117,7 @@ class CarlaSession:
         self._client = self._connect()
         self.world = self._load_town()
         with self._answered("read its settings"):
+            self.town_map = self.world.get_map()
             before, weather = self.world.get_settings(), self.world.get_weather()
             settings = self.world.get_settings()
         self._undo = _Undo(self.world, before, weather)
