@@ -20,8 +20,8 @@ from .furniture import furniture
 from .layout import HEIGHT, LENGTH, WIDTH, routes
 from .paint import WALL_SCALE, WALLS, floor_image, wall_length, wall_rows, walls_image
 
-_PANEL = (3.6, 2.8)  # of the light in the ceiling, metres
-_RADIANCE = 4.5
+_PANEL = (1.6, 1.2)  # of the light in the ceiling, metres
+_RADIANCE = 23.0
 
 _SCENE = """<!-- Room with a square track: metres, z up; images need no exposure. -->
 <scene version="3.0.0">
