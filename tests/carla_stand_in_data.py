@@ -99,6 +99,9 @@ class Map:
     def __init__(self, name: str) -> None:
         self.name = name
 
+    def get_spawn_points(self) -> list[Transform]:
+        return [Transform(Location(5.0, 0.0, ROAD_HEIGHT))]
+
     def get_waypoint(self, location: Location) -> Waypoint:
         if location.y > 5:
             return Waypoint(3, _ARC + max(location.y - 10, 0.0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from carla_stand_in import Server
 from gymnasium.utils.env_checker import check_env
-from recorded_drives import CAMERA, MOUNT, write_folder
+from recorded_drives import CAMERA, MOUNT, log_messages, write_folder, write_log
 
 from mi_nerfattack.deploy.gym import DrivingEnv
 from mi_nerfattack.deploy.registry import Conditions, Place, make_environment
@@ -95,3 +95,30 @@ def test_gymnasium_accepts_a_recording(tmp_path):
 def test_a_place_without_a_recording():
     with pytest.raises(InputError, match="the place has no recording; give it a"):
         make_environment("replay", PLACE)
+
+
+DOCS = Path(__file__).parents[1] / "docs" / "environments.md"
+
+
+def documented(heading: str) -> str:
+    """The first Python block under a heading of the documentation."""
+    section = DOCS.read_text("utf-8").split(f"\n## {heading}\n")[1]
+    return section.split("```python\n")[1].split("```")[0]
+
+
+def test_the_documented_drive_in_carla(server):
+    names: dict = {}
+    exec(documented("CARLA"), names)
+    assert names["frame"].image.shape == (66, 200, 3)
+    assert server.town == "Town03" and server.is_as_before
+
+
+def test_the_documented_replay(tmp_path, monkeypatch):
+    topics = log_messages(tmp_path)
+    del topics["/camera/calibration"]
+    write_log(tmp_path / "drive.mcap", topics)
+    monkeypatch.chdir(tmp_path)
+    code = documented("Replay").replace("366, 188, 75.0", "16, 8, 90.0")
+    names: dict = {}
+    exec(code, names)
+    assert names["environment"].reset(ROUTE).image.shape == (8, 16, 3)
