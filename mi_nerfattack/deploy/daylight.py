@@ -56,7 +56,8 @@ def set_daylight(scene: Any, name: str) -> None:
         name: key of `DAYLIGHT`.
 
     Raises:
-        InputError: unknown name, or no `sunsky` emitter in the scene.
+        InputError: unknown name, no `sunsky` emitter in the scene, or one whose sun
+            follows from place and time instead of a direction.
     """
     if name not in DAYLIGHT:
         raise InputError(f"sky: {name!r}; one of {', '.join(DAYLIGHT)}")
@@ -72,6 +73,11 @@ def set_daylight(scene: Any, name: str) -> None:
         )
     for key in suns:
         emitter = key.removesuffix(".sun_direction")
+        if parameters.flags(key) & mi.ParamFlags.ReadOnly.value:
+            raise InputError(
+                f"sky: {name!r}: the sun of {emitter!r} follows from place and time; "
+                "give it a sun_direction in the scene's file, or use 'day'"
+            )
         parameters[key] = mi.Vector3f(*daylight.sun_direction)
         parameters[f"{emitter}.sun_scale"] *= daylight.sun
         parameters[f"{emitter}.sky_scale"] *= daylight.sky
