@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 from small_fields import vertices
 
 from mi_nerfattack.capture.atlas import lay_out
@@ -19,6 +20,7 @@ from mi_nerfattack.deploy.built_in import (
     make_built_in,
 )
 from mi_nerfattack.deploy.mitsuba_view import MitsubaView
+from mi_nerfattack.deploy.opengl import make_context
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.fields.io import load_grid
@@ -335,3 +337,50 @@ def test_hydrant_covers_the_pixels_that_it_is_pasted_over():
     assert np.median(np.abs(pasted.depth[both] - built.depth[both])) < 0.025
     # where it stands in the sun, red stays red
     assert built.image[both].mean(0).argmax() == 0
+
+
+@pytest.fixture
+def opengl() -> None:
+    """Skip where MuJoCo's renderer has no OpenGL."""
+    try:
+        make_context(8, 8).free()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("side", [-1, 1])
+def test_mujoco_draws_it_as_mitsuba_does(side, box_file):
+    """Three sides at a time: the outline, and each side's own colour on it."""
+    from mi_nerfattack.deploy.mujoco_view import MujocoView
+
+    item = make_built_in(box_field(), TestLight.POSE, box_file)
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sky": {"type": "constant"},
+        "ground": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -9]),
+        },
+    }
+    built = mi.load_dict({**scene, **built_in_shapes([item])}, parallel=False)
+    middle = np.array([1.0, 2.0, 1.2])
+    eye = look_at(middle + side * np.array([4.0, 5.0, 6.0]), middle)
+    camera = from_fov(80, 60, 40.0)
+    truth = MitsubaView(built, camera, 16).render(eye, 0)
+    view = MujocoView(mi.load_dict(scene, parallel=False), camera, [item])
+    drawn = view.render(eye, 0)
+    view.close()
+    near = [frame.depth < 12 for frame in (truth, drawn)]
+    assert near[0].sum() > 600
+    assert (near[0] & near[1]).sum() / (near[0] | near[1]).sum() > 0.95
+    both = ndimage.binary_erosion(near[0] & near[1])
+    assert np.median(np.abs(truth.depth[both] - drawn.depth[both])) < 0.01
+    hues = [
+        frame.image[both]
+        / np.linalg.norm(frame.image[both].astype(float), axis=1)[:, None]
+        for frame in (truth, drawn)
+    ]
+    # less than 8 degrees between the colours, but at the sides' edges
+    assert np.mean((hues[0] * hues[1]).sum(1) > np.cos(np.radians(8))) > 0.9

@@ -158,10 +158,11 @@ def _inset(mesh: DrawnMesh) -> np.ndarray:
 
 def _read_shape(shape: Any) -> DrawnMesh:
     name, bsdf = shape.id(), shape.bsdf()
-    if shape.is_mesh():
-        vertices, faces, normals, uv = _mesh_arrays(shape)
-    elif shape.class_name() == "Rectangle":
+    # a rectangle calls itself a mesh, but has no arrays
+    if shape.class_name() == "Rectangle":
         vertices, faces, normals, uv = _rectangle_arrays(shape)
+    elif shape.is_mesh():
+        vertices, faces, normals, uv = _mesh_arrays(shape)
     else:
         raise InputError(
             f"shape {name!r}: MuJoCo cannot draw a {shape.class_name()}; take a mesh "
