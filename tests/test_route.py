@@ -200,6 +200,7 @@ def test_route_file(tmp_path):
         ({"points_m": [[0, 0], [1]]}, "pairs"),
         ({"points_m": [[0, 0], [1, 1], [1, 1]]}, "points 1 and 2"),
         ({"points_m": [[0, 0], [1, None]]}, "finite"),
+        ({"points_m": [[0, 0], [1, 1e10]]}, "point 1 .* at most 1e.09 m"),
         ({"lane_width_m": -1}, "lane_width_m -1"),
         ({"speed_ms": "5"}, "speed_ms"),
         ({"goal": 1.5}, "goal"),

@@ -20,6 +20,9 @@ from mi_nerfattack.errors import InputError
 #: segment instead, because the direction to the vertex is then a rounding error.
 VERTEX_RADIUS = 1e-3
 
+#: Largest coordinate of a route's point, metres.
+LARGEST_M = 1e9
+
 
 @dataclass(frozen=True)
 class Operations:
@@ -171,7 +174,8 @@ def checked_points(owner: str, points: Any, closed: bool = False) -> np.ndarray:
 
     Raises:
         InputError: not numbers of that shape, fewer than two points (three of a
-            closed one), a value that is not finite, or two equal consecutive points.
+            closed one), a value that is not finite or too large, or two equal
+            consecutive points.
     """
     try:
         array = np.array(points, dtype=np.float64)
@@ -183,9 +187,13 @@ def checked_points(owner: str, points: Any, closed: bool = False) -> np.ndarray:
         raise InputError(
             f"{owner}: points{kind} of shape {array.shape}; at least {word} pairs x, y"
         )
-    if not np.isfinite(array).all():
-        row = int(np.argmin(np.isfinite(array).all(axis=1)))
-        raise InputError(f"{owner}: point {row} is {array[row].tolist()}; finite only")
+    usable = (np.abs(array) <= LARGEST_M).all(axis=1)  # false for NaN
+    if not usable.all():
+        row = int(np.argmin(usable))
+        raise InputError(
+            f"{owner}: point {row} is {array[row].tolist()}; finite, and at most "
+            f"{LARGEST_M:g} m"
+        )
     repeated = np.flatnonzero((edges_of(array, closed) == 0).all(axis=1))
     if len(repeated):
         row = int(repeated[0])
