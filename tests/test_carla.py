@@ -13,7 +13,6 @@ import pytest
 from carla_stand_in import Server
 from small_fields import homogeneous
 
-from mi_nerfattack.deploy.carla_cameras import CarlaCameras
 from mi_nerfattack.deploy.carla_drivers import Axles, KinematicDriver, PhysicalDriver
 from mi_nerfattack.deploy.carla_environment import CarlaEnvironment
 from mi_nerfattack.deploy.carla_session import CarlaServer, CarlaSession, load_client
@@ -359,9 +358,42 @@ def test_images_of_another_size_are_refused():
     server = Server()
     environment = make(server)
     environment.reset(STRAIGHT)
-    cameras = environment._cameras
-    assert isinstance(cameras, CarlaCameras)
-    cameras.camera = from_fov(9, 6, 90.0)
+    environment._cameras.camera = from_fov(9, 6, 90.0)
     with pytest.raises(InputError, match="192 bytes; 9 x 6 pixels"):
         environment.step(0.0)
+    assert server.is_as_before
+
+
+def test_the_steering_value_by_hand():
+    driver, server = PhysicalDriver(), Server()
+    environment = make(server, driver)
+    environment.reset(STRAIGHT)
+    # atan(2.9 m * 0.5 rad/s / 5 m/s) = 16.172 degrees; at 18 km/h the 70 degrees of
+    # the front wheels shrink to 0.91 of them; to the left is negative
+    assert driver.steer(0.5, 5.0) == pytest.approx(-16.172 / (70 * 0.91), abs=1e-4)
+    assert driver.steer(-50.0, 0.0) == 1.0
+    environment.close()
+
+
+@pytest.mark.parametrize(
+    ("count", "scale", "message"),
+    [(2, 1.0, r"its wheels are \[\] m ahead"), (4, 50.0, r"wheels are \[-72.5, ")],
+)
+def test_a_vehicle_that_is_no_car(monkeypatch, count, scale, message):
+    whole = stand_in.Vehicle.get_physics_control
+
+    def other(self):
+        control = whole(self)
+        del control.wheels[count:]
+        here = self.get_transform().location
+        for wheel in control.wheels:
+            place = wheel.position
+            place.x = 100 * here.x + scale * (place.x - 100 * here.x)
+        return control
+
+    monkeypatch.setattr(stand_in.Vehicle, "get_physics_control", other)
+    server = Server()
+    environment = make(server)
+    with pytest.raises(InputError, match=message):
+        environment.reset(STRAIGHT)
     assert server.is_as_before
