@@ -1,155 +1,243 @@
-"""Closed-loop validation, and the way from frames to a policy."""
+"""The way from frames to a policy."""
 
 from __future__ import annotations
 
 import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
-from roadside import (
-    Constant,
-    StateSensor,
-    bent,
-    flat_ground,
-    small,
-    small_grid,
-    straight,
-)
+import torch
+from roadside import PaintedSite, bent, small, straight
 
 from mi_nerfattack import cli, files
 from mi_nerfattack.commands.bars import StageBars
+from mi_nerfattack.commands.train import Train
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.policy.adapter import TorchPolicy
-from mi_nerfattack.policy.collect import World
-from mi_nerfattack.policy.evaluate import (
-    EvaluateSettings,
-    card_table,
-    drive_routes,
-    policy_card,
-)
+from mi_nerfattack.policy.dataset import FrameDataset
+from mi_nerfattack.policy.evaluate import EvaluateSettings
+from mi_nerfattack.policy.export_program import export_program
+from mi_nerfattack.policy.exported import load_exported
 from mi_nerfattack.policy.imitate import ImitationSettings, imitate
-from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.train import TrainSettings
-from mi_nerfattack.policy.worlds import WorldFiles, load_deployment, load_surrogate
-from mi_nerfattack.scenes import bundled
+from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
+from mi_nerfattack.policy.presets import PRESETS, find_preset
+from mi_nerfattack.policy.train import TrainSettings, fit_policy
+from mi_nerfattack.policy.validation import (
+    DEPARTURES,
+    ERROR,
+    AbstractValidation,
+    rank,
+)
+from mi_nerfattack.policy.workers import InThisProcess
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-
-@pytest.fixture
-def grid(variant) -> GridField:
-    return small_grid()
-
-
-def test_errors_of_a_straight_drive_are_the_initial_ones():
-    """With control 0 the error is e0 + v t sin(psi0)."""
-    settings = EvaluateSettings(runs=5, horizon=20)
-    world = World("surrogate", StateSensor(), (), flat_ground)
-    drives = drive_routes(Constant(0.0), [world], [straight()], settings)
-    assert [drive.run for drive in drives] == list(range(5))
-    for drive in drives:
-        _, lateral, heading = drive.states[0]
-        expected = lateral + 5.0 * drive.time_s * np.sin(heading)
-        np.testing.assert_allclose(drive.cross_track_m, expected, atol=1e-6)
-    laterals = [drive.states[0, 1] for drive in drives]
-    assert 0.02 < np.std(laterals) < 0.3
-    card = policy_card(drives, [straight()])
-    figures = card["routes"]["straight"]["surrogate"]["unperturbed"]
-    assert figures["n"] == 5
-    errors = [np.abs(drive.cross_track_m) for drive in drives]
-    assert figures["cross_track_mean_m"] == pytest.approx(np.mean(errors))
-    assert card_table(card).row_count == 1
+SITE = PaintedSite("mitsuba", size_px=(200, 66))
+HERE = InThisProcess()
+DRIVE = EvaluateSettings(runs=1, objects=0, horizon=3)
+SETTINGS = ImitationSettings(
+    frames={"mitsuba": 64},
+    dagger_frames={"mitsuba": 32},
+    dagger_rounds=1,
+    dagger_epochs=1,
+    collecting=small(shard=32),
+    training=TrainSettings(epochs=1, batch=32),
+    validation=DRIVE,
+    final=DRIVE,
+)
+ROUTES = [straight(), bent()]
 
 
-def test_validation_ends_before_the_route_does():
-    settings = EvaluateSettings(margin_m=2.0)
-    assert settings.steps(straight()) == 76  # (40 - 2) m at 0.5 m a step
-    assert EvaluateSettings(horizon=9).steps(straight()) == 9
-
-
-def test_random_objects_are_the_same_in_both_worlds(grid):
-    seen, textures = [], []
-    for name in ("surrogate", "deployment"):
-        sensor = StateSensor()
-        world = World(name, sensor, (grid,), flat_ground)
-        settings = EvaluateSettings(runs=2, objects=2)
-        drives = drive_routes(Constant(0.0), [world], [straight()], settings)
-        cases = [(drive.case, drive.run) for drive in drives]
-        assert cases[:2] == [("unperturbed", 0), ("unperturbed", 1)]
-        assert cases[2:] == [("random", run) for run in range(4)]
-        assert not any(sensor.seen[:76])
-        assert all(sensor.seen[76:])
-        seen.append([objects[0].pose.translation for objects in sensor.seen[76::76]])
-        textures.append(grid.texture.numpy())
-    np.testing.assert_array_equal(seen[0], seen[1])
-    assert not np.array_equal(seen[0][0], seen[0][1])
-    np.testing.assert_array_equal(textures[0], 0)  # its own are back
-
-
-def test_imitation_runs_from_frames_to_card_and_resumes(grid, tmp_path):
-    world = World("surrogate", StateSensor(), (grid,), flat_ground)
-    settings = ImitationSettings(
-        frames={"surrogate": 64},
-        dagger_frames=32,
-        dagger_rounds=1,
-        dagger_epochs=1,
-        collecting=small(groups_a_shard=8),
-        training=TrainSettings(epochs=1, batch=32),
-        validation=EvaluateSettings(runs=2, objects=0, horizon=3),
-    )
-    routes = [straight(), bent()]
+def test_imitation_runs_from_frames_to_card_and_resumes(tmp_path):
     stages: list[str] = []
 
     def note(stage, done, total, state):
-        assert 0 < done <= total
+        assert 0 <= done <= total
         if stage not in stages:
             stages.append(stage)
 
-    first = imitate([(world, "x")], routes, settings, tmp_path, note)
+    first = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, note)
     assert stages == [
-        "frames, surrogate",
+        "round_0, mitsuba",
         "training 0",
-        "round 1, surrogate",
+        "validation",
+        "round_1, mitsuba",
         "training 1",
-        "closed loop",
+        "card",
     ]
     assert [len(rows) for rows in first.history] == [1, 1]
-    assert set(first.card["routes"]) == {"straight", "left"}
+    assert set(first.card) == {"mitsuba"}
+    assert set(first.card["mitsuba"]) == {"straight", "left"}
+    ranks = [rank(rows[-1]) for rows in first.history]
+    assert first.best_round == ranks.index(min(ranks))
     files.write_json(tmp_path / "card.json", first.card)
     stages.clear()
-    again = imitate([(world, "x")], routes, settings, tmp_path, note)
+    again = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, note)
     assert "training 0" not in stages
+    assert again.history == first.history
     for one, other in zip(
         first.module.parameters(), again.module.parameters(), strict=True
     ):
         np.testing.assert_array_equal(one.numpy(force=True), other.numpy(force=True))
+    longer = dataclasses.replace(SETTINGS, dagger_rounds=2)
+    more = imitate([SITE], ROUTES, longer, tmp_path, HERE)
+    assert more.history[:2] == first.history and len(more.history) == 3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["surrogate", "deployment"])
-def test_bundled_policy_keeps_its_lane(variant, name):
-    """30 steps of each route: an error below what the attack may start from."""
-    paths = WorldFiles(
-        bundled("intersection/scene.xml"),
-        bundled("intersection/field.safetensors"),
-        (bundled("hydrant/field.safetensors"),),
-        bundled("intersection/routes.json"),
+def test_a_collection_of_its_own_is_held_out(tmp_path):
+    settings = dataclasses.replace(
+        SETTINGS, dagger_rounds=0, validation_frames={"mitsuba": 40}
     )
-    world, _ = (
-        load_surrogate(paths) if name == "surrogate" else load_deployment(paths, 4, 0)
-    )
-    module = PilotNet.load(bundled("policy/pilotnet.safetensors"))
-    settings = EvaluateSettings(
-        runs=1, objects=1, horizon=30, seed=3, ahead_m=(6.0, 1.0)
-    )
-    routes = paths.load_routes()
-    drives = drive_routes(TorchPolicy(module), [world], routes, settings)
-    assert len(drives) == 6
-    for drive in drives:
-        assert drive.distance_m.mean() < (0.15 if name == "surrogate" else 0.2)
-        assert drive.distance_m.max() < 0.85
+    stages = []
+    imitate([SITE], ROUTES, settings, tmp_path, HERE, lambda *at: stages.append(at[0]))
+    assert "held_out, mitsuba" in stages
+    shards = [
+        tmp_path / name / "mitsuba" / "shard_0000" for name in ("round_0", "held_out")
+    ]
+    one, other = (FrameDataset.from_folders([shard]) for shard in shards)
+    assert not np.array_equal(one.controls, other.controls)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scripted(AbstractValidation):
+    """Measures what it is told, one epoch after the other."""
+
+    rows: list[tuple[int, float]]
+    every: int = 1
+    weights: list[torch.Tensor] = dataclasses.field(default_factory=list)
+
+    def measure(self, module) -> dict[str, Any]:
+        departures, error = self.rows[len(self.weights)]
+        self.weights.append(module.head[-1].weight.detach().clone())
+        return {ERROR: error, DEPARTURES: departures}
+
+    def describe(self):
+        return {}
+
+
+@pytest.fixture
+def data(rng) -> FrameDataset:
+    frames = rng.integers(0, 256, (24, *IMAGE_SHAPE, 3), dtype=np.uint8)
+    controls = rng.uniform(-1, 1, 24).astype(np.float32)
+    return FrameDataset((frames,), np.zeros(24, np.int64), controls)
+
+
+@pytest.mark.parametrize(
+    ("rows", "best"),
+    [
+        ([(0, 0.05), (0, 0.03), (0, 0.04)], 1),
+        ([(1, 0.01), (0, 0.30), (2, 0.01)], 1),  # no departures first
+        ([(0, 0.2), (0, 0.1), (0, 0.0)], 2),
+    ],
+)
+def test_best_epoch_is_that_of_the_closed_loop(data, rows, best):
+    validation = Scripted(rows)
+    module = PilotNet(1)
+    settings = TrainSettings(epochs=3, batch=12)
+    history = fit_policy(module, data, settings, validation=validation)
+    assert torch.equal(module.head[-1].weight, validation.weights[best])
+    assert [row[ERROR] for row in history] == [error for _, error in rows]
+
+
+def test_loss_decides_among_equals_and_unmeasured_epochs_do_not_count():
+    rows = [
+        {ERROR: 0.0301, DEPARTURES: 0, "held_out_loss": 0.2},
+        {ERROR: 0.0304, DEPARTURES: 0, "held_out_loss": 0.1},
+    ]
+    assert rank(rows[1]) < rank(rows[0])
+
+
+def test_validation_every_second_epoch_and_after_the_last(data):
+    validation = Scripted([(0, 0.1), (0, 0.2)], every=2)
+    settings = TrainSettings(epochs=3, batch=24)
+    history = fit_policy(PilotNet(1), data, settings, validation=validation)
+    assert [row["measured"] for row in history] == [False, True, True]
+
+
+def test_exported_program_gives_the_modules_controls(tmp_path):
+    torch.manual_seed(3)
+    module = PilotNet(3).eval()
+    export_program(module, tmp_path / "policy.pt2")
+    program = load_exported(tmp_path / "policy.pt2")
+    assert program.batch is None
+    for count in (1, 3):
+        image, goal = torch.rand(count, 3, *IMAGE_SHAPE), torch.arange(count) % 3
+        torch.testing.assert_close(program(image, goal), module(image, goal))
+
+
+def test_steering_policies_say_their_unit(tmp_path):
+    PilotNet(1, 0.34, "rad").save(tmp_path / "small.safetensors")
+    assert PilotNet.load(tmp_path / "small.safetensors").unit == "rad"
+    with pytest.raises(InputError, match="unit: 'deg'"):
+        PilotNet(1, 0.34, "deg")
+
+
+def test_presets_have_the_figures_of_the_paper():
+    assert find_preset("intersection").frames == {
+        "mitsuba": 120_000,
+        "surrogate": 60_000,
+    }
+    assert find_preset("intersection").validation_frames == {"surrogate": 12_000}
+    assert find_preset("room").frames == {"mitsuba": 9_584, "surrogate": 12_000}
+    laptop = find_preset("laptop")
+    total = sum(laptop.frames.values())
+    total += laptop.dagger_rounds * sum(laptop.dagger_frames.values())
+    assert 9_000 <= total <= 11_000
+    with pytest.raises(InputError, match="preset: 'desktop'; one of laptop"):
+        find_preset("desktop")
+    assert Train(output="o", data="d").preset in PRESETS  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": {"moon": 3}}, "frames: of moon"),
+        ({"frames": {"mitsuba": 0}}, "at least one frame"),
+        ({"frames": {"mitsuba": -1}}, "frames: -1 of 'mitsuba'"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        settings = dataclasses.replace(SETTINGS, **change)
+        imitate([SITE], ROUTES, settings, tmp_path, HERE)
+
+
+def test_goals_cameras_and_weights_must_fit(tmp_path):
+    with pytest.raises(InputError, match=r"goals \[1\]"):
+        imitate([SITE], [bent()], SETTINGS, tmp_path, HERE)
+    small_camera = PaintedSite(size_px=(100, 50))
+    with pytest.raises(InputError, match=r"100 x 50 px; PilotNet takes 200 x 66"):
+        imitate([small_camera], ROUTES, SETTINGS, tmp_path, HERE)
+    with pytest.raises(InputError, match=r"start: .*\(2, 1.5, 'rad/s'\) are needed"):
+        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=PilotNet(5))
+
+
+def run_train(tmp_path, *arguments: str) -> int:
+    base = ["train", "-o", str(tmp_path / "policy.safetensors")]
+    return cli.main([*base, "--data", str(tmp_path / "data"), *arguments])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--preset", "desktop"], "preset: 'desktop'; one of laptop"),
+        (["--frames", "moon", "3"], "environment: 'moon'; one of surrogate"),
+        (["--preset", "room"], "no field; make one with 'mi-nerfattack fit'"),
+        (["--skies", "dusk"], "sky: 'dusk'"),
+        (["--more", "{empty}"], "no frames in it"),
+        (["--workers", "0"], "workers: 0"),
+    ],
+)
+def test_train_says_what_is_wrong(tmp_path, capsys, arguments, message):
+    (tmp_path / "empty").mkdir()
+    filled = [item.format(empty=tmp_path / "empty") for item in arguments]
+    assert run_train(tmp_path, *filled) == 2
+    captured = capsys.readouterr().err
+    assert message in captured and captured.count("\n") == 1
+    assert not (tmp_path / "policy.safetensors").exists()
 
 
 def test_train_names_a_missing_scene(tmp_path, capsys):
@@ -157,19 +245,11 @@ def test_train_names_a_missing_scene(tmp_path, capsys):
     routes["points_m"] = [[0, 0], [40, 0]]
     files.write_json(tmp_path / "routes.json", {"straight": routes})
     missing = str(tmp_path / "nowhere.xml")
-    arguments = ["train", "-o", str(tmp_path / "policy.safetensors")]
-    arguments += ["--data", str(tmp_path / "data"), "--scene", missing]
-    arguments += ["--field", missing, "--object", missing]
+    arguments = ["--scene", missing, "--field", missing, "--object", missing]
     arguments += ["--routes", str(tmp_path / "routes.json")]
-    assert cli.main(arguments) == 2
+    assert run_train(tmp_path, *arguments) == 2
     assert f"{missing}: does not exist" in capsys.readouterr().err
     assert not (tmp_path / "policy.safetensors").exists()
-
-
-def test_worlds_without_goals_in_order_are_refused(tmp_path):
-    world = World("surrogate", StateSensor(), (), flat_ground)
-    with pytest.raises(InputError, match=r"goals \[1\]"):
-        imitate([(world, "")], [bent()], ImitationSettings({"surrogate": 8}), tmp_path)
 
 
 def test_bars_print_plain_lines_where_there_is_no_terminal(capsys):

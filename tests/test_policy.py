@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mi_nerfattack import files
+from mi_nerfattack.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.augment import Augmentation
@@ -257,16 +258,42 @@ def test_dataset_errors(tmp_path, rng):
 
 
 def test_augmentation_limits_and_identity():
-    image = torch.rand(8, 3, 12, 16)
+    levels = torch.randint(0, 256, (8, 12, 16, 3), dtype=torch.uint8)
     generator = torch.Generator().manual_seed(1)
-    same = Augmentation(1.0, 1.0, 1.0, 0.0, 0.0).apply(image, generator)
-    torch.testing.assert_close(same, image)
-    flat = torch.full((4000, 3, 2, 2), 0.5)
-    bright = Augmentation(1.4, 1.0, 1.0, 1.0, 0.0).apply(flat, generator)
-    assert 0.5 / 1.4 <= bright.min() < 0.36 and 0.69 < bright.max() <= 0.7
-    noisy = Augmentation(1.0, 1.0, 1.0, 0.0, 0.1).apply(flat, generator) - 0.5
+    same = Augmentation(0.0, 1.0, 1.0, 0.0, 0.0).apply(levels, generator)
+    expected = levels.permute(0, 3, 1, 2) / 255
+    torch.testing.assert_close(same, expected, atol=1e-6, rtol=0)
+    grey = torch.full((4000, 2, 2, 3), 128, dtype=torch.uint8)
+    noisy = Augmentation(0.0, 1.0, 1.0, 0.0, 0.1).apply(grey, generator) - 128 / 255
     # sd is uniform in [0, 0.1]: its mean square is 0.01 / 3.
     assert noisy.square().mean().item() == pytest.approx(0.01 / 3, rel=0.05)
+    assert noisy.mean().abs() < 0.002
+
+
+def test_exposure_and_gain_act_on_linear_light():
+    grey = torch.full((4000, 2, 2, 3), 128, dtype=torch.uint8)
+    generator = torch.Generator().manual_seed(2)
+    brighter = Augmentation(0.5, 1.0, 1.0, 1.0, 0.0).apply(grey, generator)
+    light = srgb_to_linear_numpy(brighter.numpy())
+    factor = light / srgb_to_linear_numpy(np.float32(128 / 255))
+    assert 2**-0.5 <= factor.min() < 0.72 and 1.39 < factor.max() <= 2**0.5 + 1e-5
+    # one factor for all pixels and channels of an image, uniform in powers of two
+    assert np.ptp(factor, axis=(1, 2, 3)).max() < 1e-4
+    assert np.log2(factor).mean() == pytest.approx(0, abs=0.02)
+    tinted = Augmentation(0.0, 1.1, 1.0, 0.0, 0.0).apply(grey, generator)
+    assert np.ptp(tinted.numpy(), axis=1).max() > 0.03
+
+
+def test_noise_of_images_differs_and_blur_keeps_the_mean():
+    generator = torch.Generator().manual_seed(3)
+    grey = torch.full((6, 8, 8, 3), 128, dtype=torch.uint8)
+    noisy = Augmentation(0.0, 1.0, 1.0, 0.0, 0.2).apply(grey, generator)
+    assert not any(torch.equal(noisy[0], other) for other in noisy[1:])
+    levels = torch.randint(60, 200, (1, 40, 40, 3), dtype=torch.uint8)
+    before = levels.permute(0, 3, 1, 2) / 255
+    blurred = Augmentation(0.0, 1.0, 1.0, 1.0, 0.0).apply(levels, generator)
+    assert blurred.var() < 0.9 * before.var()
+    assert blurred.mean().item() == pytest.approx(before.mean().item(), abs=0.01)
 
 
 def train(data, settings=SETTINGS, **arguments):

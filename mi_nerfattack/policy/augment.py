@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
-#: Independent normal numbers in a batch, as a multiple of those in an image; images
-#: take theirs from random places, because drawing is what takes longest.
-_NOISE_POOL = 6
+#: Normal numbers that are drawn for a batch; images take theirs from random places,
+#: because drawing is what takes longest.
+_NOISE_POOL = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ class Augmentation:
     ) -> torch.Tensor:
         n, size = len(image), image[0].numel()
         sd = self.noise * _uniform(generator, n)
-        pool = torch.randn(_NOISE_POOL * size, generator=generator, device=image.device)
-        last = (_NOISE_POOL - 1) * size
-        starts = (_uniform(generator, n) * last).long().tolist()
+        count = max(_NOISE_POOL, 2 * size)
+        pool = torch.randn(count, generator=generator, device=image.device)
+        starts = (_uniform(generator, n) * (count - size)).long().tolist()
         flat = image.permute(0, 2, 3, 1).reshape(n, size)
         for row, start, scale in zip(flat, starts, sd.tolist(), strict=True):
             row.add_(pool[start : start + size], alpha=scale)
