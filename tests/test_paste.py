@@ -5,13 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 import pytest
+from small_fields import homogeneous, sigmoid_to_linear
 
 from mi_nerfattack.deploy import CameraFrame, paste_objects
 from mi_nerfattack.deploy.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import from_fov, look_at
 from mi_nerfattack.render.posed import Pose, PosedField
-from small_fields import homogeneous, sigmoid_to_linear
 
 pytestmark = pytest.mark.usefixtures("variant")
 

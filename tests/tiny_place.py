@@ -6,18 +6,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+from small_fields import ONES, blob
 
 from mi_nerfattack.deploy.registry import Place
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.render.camera import CameraMount, from_fov
-from small_fields import ONES, blob
 
 SCENE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="3"/></integrator>
-  <emitter type="sunsky" id="sky">
-    <vector name="sun_direction" value="-0.4, -0.5, 0.75"/>
-  </emitter>
+  <emitter type="constant"/>
   <shape type="rectangle" id="ground">
     <transform name="to_world"><scale value="60"/></transform>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.3"/></bsdf>
