@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import mitsuba as mi
@@ -96,6 +97,7 @@ class TestAtlas:
         corners = rng.normal(0, 1, (40, 3, 3))
         corners[:10, 2] = corners[:10, 1] + rng.normal(0, 1e-3, (10, 3))  # slivers
         corners[10:20] *= 0.01
+        corners[20] = [[0, 0, 0], [1, 0, 0], [0.3, 1e-17, 0]]
         return corners
 
     def test_no_colour_bleeds_into_a_neighbour(self, rng):
@@ -313,6 +315,8 @@ class TestPose:
         np.testing.assert_allclose([low, high], expected, atol=1e-9)
         box = built_in_shapes([item])["built_in_000"].bbox()
         np.testing.assert_allclose([box.min, box.max], expected, atol=1e-6)
+        again = pickle.loads(pickle.dumps(item))  # as worker processes get it
+        np.testing.assert_array_equal(again.world_vertices, item.world_vertices)
         moved = replace(item, pose=Pose.identity())
         np.testing.assert_array_equal(moved.world_vertices, item.vertices)
 

@@ -155,7 +155,8 @@ def _nearest(flat: np.ndarray, points: np.ndarray) -> np.ndarray:
     twice = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     # the area beside each edge is the share of the corner opposite of it
     beside = edges[..., 0] * offset[..., 1] - edges[..., 1] * offset[..., 0]
-    weights = np.roll(beside / twice[:, None], 2, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # slivers: their edges count
+        weights = np.roll(beside / twice[:, None], 2, axis=1)
     along = (offset * edges).sum(2) / (edges**2).sum(2)
     along = np.clip(along, 0, 1)
     distance = np.linalg.norm(offset - along[..., None] * edges, axis=2)

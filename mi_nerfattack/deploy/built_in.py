@@ -117,16 +117,14 @@ def make_built_in(
         )
     texel = 0.5 * voxel_m(field) if texel_m is None else texel_m
     if mesh is None:
-        surface = field_surface(field)
-        corners, normals = surface.vertices[surface.faces], surface.normals
-        corner_normals, is_flat = normals[surface.faces], False
+        corners, normals = _field_triangles(field)
     else:
         placed = (placement or Placement()).mesh(mesh)
         check_same_box(field, placed)
         corners = _outward(field, _solid_corners(placed))
-        corner_normals, is_flat = _flat_normals(corners), True
+        normals = _flat_normals(corners)
     atlas = lay_out(corners, texel)
-    radiance = _texel_colours(field, atlas, corners, corner_normals)
+    radiance = _texel_colours(field, atlas, corners, normals)
     albedo = linear_to_uint8(np.pi / captured_irradiance * radiance)
     return BuiltInObject(
         corners.reshape(-1, 3),
@@ -134,8 +132,16 @@ def make_built_in(
         atlas.uv.reshape(-1, 2),
         atlas.image(albedo),
         pose,
-        None if is_flat else corner_normals.reshape(-1, 3),
+        normals.reshape(-1, 3) if mesh is None else None,
     )
+
+
+def _field_triangles(field: GridField) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and normals, (m, 3, 3) each, of a field's surface."""
+    surface = field_surface(field)
+    corners, normals = surface.vertices[surface.faces], surface.normals[surface.faces]
+    kept = _has_area(corners)
+    return corners[kept], normals[kept]
 
 
 def _solid_corners(mesh: TexturedMesh) -> np.ndarray:
@@ -146,13 +152,17 @@ def _solid_corners(mesh: TexturedMesh) -> np.ndarray:
             "leave out the mesh for the surface of the field"
         )
     corners = np.concatenate([part.vertices[part.faces] for part in mesh.parts])
-    return corners[np.linalg.norm(_cross(corners), axis=1) > 0]
+    return corners[_has_area(corners)]
 
 
 def _outward(field: GridField, corners: np.ndarray) -> np.ndarray:
     """Order corners (m, 3, 3) counter-clockwise from where the field is thin."""
     turned = inside_out(field, corners.mean(1), _flat_normals(corners)[:, 0])
     return np.where(turned[:, None, None], corners[:, ::-1], corners)
+
+
+def _has_area(corners: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(_cross(corners), axis=1) > 0
 
 
 def _cross(corners: np.ndarray) -> np.ndarray:
