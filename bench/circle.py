@@ -82,12 +82,15 @@ def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
     return centre, math.sqrt(solution[2] + centre @ centre)
 
 
-def drive_circle(case: Case, handling: Handling | None = None) -> Circle:
-    """Drive once around, from straight ahead.
+def drive_circle(
+    case: Case, handling: Handling | None = None, share: float = 1.0
+) -> Circle:
+    """Drive around, from straight ahead.
 
     Args:
         case: what is driven.
         handling: of the car; None for the usual one.
+        share: of the whole circle.
     """
     car: Car = CARS[case.car]
     handling = handling or Handling()
@@ -97,7 +100,8 @@ def drive_circle(case: Case, handling: Handling | None = None) -> Circle:
     for _ in range(round(_SETTLE_S / PERIOD_S)):
         vehicle.advance(case.steer)
     states = []
-    for _ in range(math.ceil(2 * math.pi * expected / case.speed_ms / PERIOD_S)):
+    around = 2 * math.pi * expected / case.speed_ms
+    for _ in range(math.ceil(share * around / PERIOD_S)):
         vehicle.advance(case.steer)
         states.append(vehicle.state)
     rows = np.array(states)
@@ -151,7 +155,7 @@ def to_document(circles: Sequence[Circle]) -> dict[str, Any]:
 def write_figure(path: str | Path, circles: Sequence[Circle]) -> None:
     """Draw the circles of each car, driven and expected, and their errors as PNG."""
     names = list(dict.fromkeys(circle.case.car for circle in circles))
-    figure = Figure(figsize=(5.5 * len(names), 9), dpi=110, layout="constrained")
+    figure = Figure(figsize=(5.5 * len(names), 9.5), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, len(names), height_ratios=(3, 2))
     for column, name in enumerate(names):
@@ -185,7 +189,8 @@ def _draw_paths(axes: Any, name: str, circles: Sequence[Circle]) -> None:
     axes.plot([], [], color="black", lw=0.7, ls="--", label="bicycle model")
     axes.set(title=name, xlabel="x - centre, metres", ylabel="y - centre, metres")
     axes.set_aspect("equal")
-    axes.legend(fontsize=7, loc="center")
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
+    axes.legend(fontsize=7, **below)
     axes.grid(alpha=0.3)
 
 

@@ -14,6 +14,7 @@ from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.mjcf_car import Handling
 from mi_nerfattack.deploy.mjcf_light import (
     SHADOW_RADIUS,
+    SUN_DISTANCE,
     add_lighting,
     read_lighting,
 )
@@ -21,7 +22,8 @@ from mi_nerfattack.deploy.mjcf_map import add_meshes, built_in_mesh, read_meshes
 
 NEAR_M = 0.05
 _SHADOW_PX = 2048
-_FAR = 4.0  # radii of the map: the sky stands at 0.7 of it
+# The sky stands at 0.7 of it; the sun's shadow map ends there, too.
+_FAR, _LEAST_FAR_M = 4.0, 2 * (SUN_DISTANCE + SHADOW_RADIUS)  # radii of the map
 
 
 def map_spec(
@@ -64,6 +66,7 @@ def _set_visual(spec: mujoco.MjSpec, vertices: np.ndarray) -> None:
     radius = max(0.5 * float(np.linalg.norm(high - low)), 1.0)
     spec.stat.center, spec.stat.extent = (low + high) / 2, radius
     view = spec.visual
-    view.map.znear, view.map.zfar = NEAR_M / radius, _FAR
+    view.map.znear = NEAR_M / radius
+    view.map.zfar = max(_FAR, _LEAST_FAR_M / radius)
     view.map.shadowclip = SHADOW_RADIUS / radius
     view.quality.shadowsize, view.quality.offsamples = _SHADOW_PX, 0

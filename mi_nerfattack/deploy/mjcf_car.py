@@ -32,7 +32,7 @@ MAX_TIMESTEP = 0.002
 
 _WHEEL_MASS = 0.0125  # of the car's mass, each
 _HEIGHT = 0.2  # of the wheelbase: centre of gravity above the ground
-_SERVO_RATE = 60.0  # rad/s, of the steering column's undamped oscillation
+_SERVO_RATE = 250.0  # rad/s, of the steering column's undamped oscillation
 _STIFF = (0.006, 1.0)  # time constant (s) and damping ratio of linkage and tyres
 
 

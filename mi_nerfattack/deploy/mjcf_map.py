@@ -8,7 +8,7 @@ lights, whose sum is clipped at one, only darken it; see
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -21,6 +21,7 @@ from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.errors import InputError
 
 _PROCEDURAL = 512  # texels along an edge of a texture that is no image
+_BORDER = 8  # texels
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ def add_meshes(
         meshes: may be empty.
         white: (3,), linear colour of a white surface in full light.
     """
-    for index, mesh in enumerate(meshes):
+    for index, mesh in enumerate(map(_padded, meshes)):
         name = f"{index:03d}_{mesh.name}"
         factor = 1.0 if mesh.shines else white
         _add_material(spec, name, mesh, _encode(mesh.texture * np.float32(factor)))
@@ -129,7 +130,7 @@ def _add_mesh(spec: Any, name: str, mesh: DrawnMesh) -> None:
     kept = length > 1e-12
     flat = np.repeat((area[kept] / length[kept, None])[:, None], 3, axis=1)
     normals = flat if mesh.normals is None else mesh.normals[mesh.faces[kept]]
-    uv = _inset(mesh)[mesh.faces[kept]]
+    uv = mesh.uv[mesh.faces[kept]]
     corners = corners[kept]
     if mesh.two_sided:
         corners = np.concatenate([corners, corners[:, ::-1]])
@@ -148,12 +149,15 @@ def _add_mesh(spec: Any, name: str, mesh: DrawnMesh) -> None:
     )
 
 
-def _inset(mesh: DrawnMesh) -> np.ndarray:
-    """Keep (n, 2) coordinates off the texture's border, where opposite edges mix."""
+def _padded(mesh: DrawnMesh) -> DrawnMesh:
+    """Continue a texture that does not repeat, whose opposite edges would mix."""
     if mesh.uv.min() < 0 or mesh.uv.max() > 1:
-        return mesh.uv
-    half = 0.5 / np.array(mesh.texture.shape[1::-1])
-    return np.clip(mesh.uv, half, 1 - half)
+        return mesh
+    size = np.array(mesh.texture.shape[1::-1])
+    border = ((_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0))
+    texture = np.pad(mesh.texture, border, mode="edge")
+    uv = (mesh.uv * size + _BORDER) / (size + 2 * _BORDER)
+    return replace(mesh, uv=uv, texture=texture)
 
 
 def _read_shape(shape: Any) -> DrawnMesh:
