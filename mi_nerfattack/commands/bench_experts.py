@@ -11,8 +11,8 @@ class BenchExperts:
     """Drive each expert on each bundled route in each environment.
 
     No images are rendered. Each expert is told the lag of its vehicle, and then that
-    of labels for all vehicles. Takes about a minute; exit code 1 where an expert that
-    was told its vehicle's lag leaves the lane centre by more than 0.1 m.
+    of labels for all vehicles. Takes about a minute; exit code 1 where an expert leaves
+    the lane centre by more than 0.1 m.
     """
 
     json: bool = False

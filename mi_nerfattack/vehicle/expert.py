@@ -19,9 +19,9 @@ __all__ = [
     "expert_for",
 ]
 
-#: Time in which a vehicle passes the look-ahead distance, seconds. With less than 0.65,
-#: a car whose wheels need 0.15 s to answer swings ever wider after a large deviation.
-LOOK_AHEAD_S = 0.7
+#: Time in which a vehicle passes the look-ahead distance, seconds. With less than half a
+#: second, a car whose wheels answer late needs long to recover from large deviations.
+LOOK_AHEAD_S = 0.55
 
 #: Time in which it passes what the curvature is averaged over, seconds.
 WINDOW_S = 0.2

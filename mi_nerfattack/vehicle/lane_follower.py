@@ -16,10 +16,11 @@ from mi_nerfattack.vehicle.route import Route
 class LaneFollower(AbstractExpert):
     """Feed-forward of the route's curvature with feedback of both errors.
 
-    Heading rate `v (kappa - 2 e / d^2 - 2 sin(psi) / d)` for cross-track error e,
-    heading error psi and look-ahead distance d: linearised, pure pursuit of a point
-    at distance d, so deviations decay over d with a damping ratio of 0.7; but the
-    feed-forward does not cut corners, which allows a gain low enough to be imitated.
+    Heading rate `v (kappa - e / d^2 - 2 sin(psi) / d)` for cross-track error e,
+    heading error psi and look-ahead distance d. Linearised, deviations decay as
+    `(1 + s/d) exp(-s/d)` over the arc length s: critically damped, which wheels that
+    answer late turn into a little overshoot. The feed-forward does not cut corners,
+    which allows gains low enough to be imitated.
 
     Args:
         route: lane centre to follow.
@@ -36,7 +37,7 @@ class LaneFollower(AbstractExpert):
 
     route: Route
     speed: float | None = None
-    look_ahead_m: float = 2.5
+    look_ahead_m: float = 2.75
     preview_m: float = 0.25
     heading_preview_m: float = 0.0
     max_heading_rate: float = 1.5
@@ -69,7 +70,7 @@ class LaneFollower(AbstractExpert):
         heading = self.route.heading_at(arc + self.heading_preview_m)
         curvature = self.route.curvature_at(arc + self.preview_m, self.window_m)
         feedback = 2 / self.look_ahead_m * np.sin(states[:, 2] - heading)
-        feedback += 2 / self.look_ahead_m**2 * cross_track
+        feedback += cross_track / self.look_ahead_m**2
         rate = float(self.speed or 0) * (curvature - feedback)
         return np.clip(rate, -self.max_heading_rate, self.max_heading_rate)
 

@@ -18,7 +18,7 @@ class PIDExpert(AbstractExpert):
     e is the cross-track error, `de/dt = v sin(psi)` with the heading error psi, so
     that a single state suffices for it and no noise is amplified; kappa is the
     route's curvature. The gains follow from a look-ahead distance d as those of
-    `LaneFollower`: `K_p = 2 l / d^2`, `K_d = 2 l / (d v)`, `K_i = K_p / T_i`. The
+    `LaneFollower`: `K_p = l / d^2`, `K_d = 2 l / (d v)`, `K_i = K_p / T_i`. The
     integral removes what a bent steering rod or slip would leave; it rests where the
     angle is at its limit and the error would push it further, and while the error is
     larger than a quarter of d, which is no lasting deviation but a recovery.
@@ -59,7 +59,7 @@ class PIDExpert(AbstractExpert):
         self.route, self.period, self.wheelbase = route, period, wheelbase
         self.max_control, self.look_ahead_m = max_control, look_ahead_m
         self.preview_m, self.window_m = preview_m, window_m
-        self.proportional = 2 * wheelbase / look_ahead_m**2
+        self.proportional = wheelbase / look_ahead_m**2
         self.derivative = 2 * wheelbase / (look_ahead_m * route.speed_ms)
         self.integral = self.proportional / integral_time
         self._sum: np.ndarray | None = None
