@@ -172,6 +172,20 @@ def test_a_video_whose_content_is_damaged(tmp_path):
         open_recording(path, None, MOUNT).image(COUNT - 1)
 
 
+def test_videos_with_a_wrong_byte_are_refused_or_read(tmp_path, rng):
+    path = write_drive_video(tmp_path)
+    raw = path.read_bytes()
+    for _ in range(40):
+        damaged = bytearray(raw)
+        damaged[rng.integers(len(raw))] ^= int(rng.integers(1, 256))
+        path.write_bytes(bytes(damaged))
+        try:
+            recording = open_recording(path, None, MOUNT)
+            assert recording.image(COUNT - 1).shape == (8, 16, 3)
+        except InputError as error:
+            assert "drive." in str(error)
+
+
 def test_a_video_of_more_pixels_than_are_read(tmp_path, monkeypatch):
     path = write_drive_video(tmp_path)
     monkeypatch.setattr(files, "MAX_IMAGE_PIXELS", 100)

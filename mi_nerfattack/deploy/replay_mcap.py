@@ -153,7 +153,7 @@ def _read_messages(
             found[topic].append(message)
     except InputError:
         raise
-    except (McapError, struct.error, ValueError, KeyError) as error:
+    except (McapError, struct.error, ValueError, KeyError, OverflowError) as error:
         raise InputError(
             f"{path}: damaged or truncated log ({type(error).__name__}: {error}); copy "
             "it again, or repair it with 'mcap recover'"

@@ -129,13 +129,16 @@ class VideoRecording(AbstractRecording):
 def _open(raw: bytes) -> Any:
     import av
 
-    return av.open(io.BytesIO(raw))
+    return av.open(io.BytesIO(raw), metadata_errors="replace")
 
 
 def _video_stream(path: Path, container: Any) -> Any:
     if not container.streams.video:
         raise InputError(f"{path}: has no pictures; truncated, or only sound")
-    return container.streams.video[0]
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise InputError(f"{path}: a codec that PyAV does not know; use H.264")
+    return stream
 
 
 def _pose_file(path: Path) -> Path:
