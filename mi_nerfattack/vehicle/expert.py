@@ -19,8 +19,8 @@ __all__ = [
     "expert_for",
 ]
 
-#: Time in which a vehicle passes the look-ahead distance, seconds. With less than half a
-#: second, a car whose wheels answer late needs long to recover from large deviations.
+#: Time in which a vehicle passes the look-ahead distance, seconds. With less than half
+#: a second, a car whose wheels answer late needs long to recover from large deviations.
 LOOK_AHEAD_S = 0.55
 
 #: Time in which it passes what the curvature is averaged over, seconds.
