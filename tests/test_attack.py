@@ -92,7 +92,7 @@ def run(*arguments, cwd, check=None, **options):
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=900,
         **options,
     )
     if check is not None:
@@ -150,7 +150,7 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_attack_resumes(folder, tmp_path, number):
     output = tmp_path / "run"
-    text = SCENARIO.replace("iterations = 3", "iterations = 60")
+    text = SCENARIO.replace("iterations = 3", "iterations = 20")
     text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
     path = folder / f"long_{number}.toml"
     path.write_text(text)
@@ -162,11 +162,11 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
         text=True,
     )
     checkpoint = output / "checkpoint.safetensors"
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not checkpoint.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     os.kill(process.pid, number)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=300)
     assert process.returncode == 130, stderr
     assert "Traceback" not in stderr and "interrupted" in stderr
     assert not list(output.glob("*.tmp*")) and not list(output.glob(".*"))
@@ -181,7 +181,7 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
     again = output / "scenario.toml"
     run("attack", again, "-o", output, "--resume", cwd=tmp_path, check=0)
     history = json.loads((output / "attack.json").read_text())
-    assert [record["iteration"] for record in history] == list(range(60))
+    assert [record["iteration"] for record in history] == list(range(20))
     assert (output / "metrics.json").exists()
 
 
