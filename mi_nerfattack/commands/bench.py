@@ -12,7 +12,7 @@ import tyro
 
 from mi_nerfattack.commands.bench_circle import BenchCircle
 from mi_nerfattack.commands.bench_experts import BenchExperts
-from mi_nerfattack.commands.bench_training import BenchDagger
+from mi_nerfattack.commands.bench_training import BenchCollect, BenchDagger
 
 
 @dataclass(frozen=True)
@@ -250,6 +250,7 @@ _Chosen = tyro.conf.OmitArgPrefixes[
             Annotated[BenchComposite, tyro.conf.subcommand("composite")],
             Annotated[BenchExperts, tyro.conf.subcommand("experts")],
             Annotated[BenchCircle, tyro.conf.subcommand("circle")],
+            Annotated[BenchCollect, tyro.conf.subcommand("collect")],
             Annotated[BenchDagger, tyro.conf.subcommand("dagger")],
         ]
     ]

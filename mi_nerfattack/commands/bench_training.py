@@ -11,6 +11,71 @@ import tyro
 
 
 @dataclass(frozen=True)
+class BenchCollect:
+    """Measure the collection of training frames by several processes against one.
+
+    Both sides in turns, medians count. Keep the machine otherwise idle. Takes some
+    minutes; exit code 1 where two workers render less than 1.7 times as fast as one.
+    """
+
+    environment: str = "mitsuba"
+    """What is rendered."""
+    workers: int = 2
+    """Processes of the side that is compared with one."""
+    repeats: int = 3
+    """Turns of each side."""
+    quick: bool = False
+    """Take few frames: to see that it works, not for figures."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Also write the result with machine, versions and date: a .json file, or a folder
+    in which it is named by date and machine."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """Measure, print and write."""
+        import json
+
+        from mi_nerfattack import variant
+
+        variant.ensure()
+        from mi_nerfattack.bench import (  # pyright: ignore[reportMissingImports]
+            collect,
+            results,
+        )
+        from mi_nerfattack.commands.bars import StageBars
+
+        sizes = {"frames": 24, "warm": 8, "shard": 4, "spp": 1} if self.quick else {}
+        settings = collect.Settings(
+            self.environment, workers=self.workers, repeats=self.repeats, **sizes
+        )
+        with StageBars() as bars:
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            document = collect.run(settings, show)
+        document = results.stamp(document, self._command())
+        if self.output is not None:
+            path = results.write(self.output, "collect", document)
+            print(f"written to {path}", file=sys.stderr)
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            for count, rate in document["median"].items():
+                print(f"{count} workers: {rate:.2f} frames/s")
+            print(f"ratio: {document['ratio']:.2f} (wanted {collect.WANTED})")
+        enough = self.quick or document["ratio"] >= collect.WANTED
+        return 0 if enough or self.workers != 2 else 1
+
+    def _command(self) -> list[str]:
+        command = ["mi-nerfattack", "bench", "collect"]
+        command += ["--environment", self.environment]
+        command += ["--workers", str(self.workers), "--repeats", str(self.repeats)]
+        return [*command, "--quick"] if self.quick else command
+
+
+@dataclass(frozen=True)
 class BenchDagger:
     """Compare DAgger with plain cloning on as many frames and gradient steps.
 
