@@ -50,7 +50,8 @@ class Train:
     start: Path | None = None
     """Policy whose weights training starts with; random ones by default."""
     skies: tuple[str, ...] = ()
-    """Times of day of rendered frames: day, morning, noon, evening, overcast."""
+    """Times of day of rendered frames: day, morning, noon, evening, overcast; all by
+    default, of a scene of your own the day alone."""
     exposures_ev: tuple[float, ...] = ()
     """Exposures of rendered frames, in powers of two."""
     spp: int = 4
@@ -136,8 +137,10 @@ class Train:
     ) -> list[AbstractSite]:
         from mi_nerfattack.policy.sites import PlaceSite, Weather
 
+        # a scene without a sunsky emitter has no times of day
+        skies = preset.weather.skies if self.scene is None else ("day",)
         weather = Weather(
-            self.skies or preset.weather.skies,
+            self.skies or skies,
             self.exposures_ev or preset.weather.exposures_ev,
             self.spp,
         )
