@@ -136,10 +136,10 @@ def test_version(run):
 def test_help_is_complete_and_loads_nothing_heavy(arguments):
     code = (
         "import sys, time\n"
-        "begin = time.perf_counter()\n"
+        "begin = time.process_time()\n"
         "from mi_nerfattack.cli import main\n"
         f"code = main({[*arguments, '--help']!r})\n"
-        "print(time.perf_counter() - begin, file=sys.stderr)\n"
+        "print(time.process_time() - begin, file=sys.stderr)\n"
         "print(*sys.modules, file=sys.stderr)\n"
         "sys.exit(code)"
     )
@@ -151,7 +151,7 @@ def test_help_is_complete_and_loads_nothing_heavy(arguments):
     if not arguments:
         assert all(name in done.stdout for name in COMMANDS)
     seconds, loaded = done.stderr.splitlines()[-2:]
-    assert float(seconds) < 5  # about 0.4 on an idle machine
+    assert float(seconds) < 2  # of CPU; about 0.4
     assert not HEAVY & set(loaded.split())
 
 
