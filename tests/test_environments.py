@@ -316,6 +316,10 @@ def test_environments_that_cannot_be_made(tmp_path, monkeypatch):
         make_environment("surrogate", replace(place, field=None))
     with pytest.raises(InputError, match="'replay': the place has no recording"):
         make_environment("replay", place)
+    for name in ("surrogate", "replay"):
+        built_in = Conditions(built_in=(object(),))
+        with pytest.raises(InputError, match=f"'{name}': takes no built-in objects"):
+            make_environment(name, replace(place, recording=tmp_path), built_in)
     monkeypatch.setitem(sys.modules, "carla", None)
     with pytest.raises(InputError, match=r"carla is not installed; pip .*\[carla\]'"):
         make_environment("carla", place)
