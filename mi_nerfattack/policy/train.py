@@ -173,7 +173,8 @@ class _Run:
         order = np.random.default_rng(entropy).permutation(self.part.rows)
         generator = torch.Generator(self.device)
         generator.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
-        self.module.train()
+        # a policy that drives in a validation takes its parameters' gradients away
+        self.module.train().requires_grad_(True)
         losses = []
         for step in range(self.steps):
             chosen = order[step * self.settings.batch :][: self.settings.batch]
