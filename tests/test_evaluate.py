@@ -14,9 +14,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from roadside import Grey, PaintedEnvironment, bent, flat_ground, small_grid, straight
+from roadside import (
+    Grey,
+    PaintedEnvironment,
+    PaintedSite,
+    bent,
+    flat_ground,
+    small_grid,
+    straight,
+)
 
 from mi_nerfattack import cli, files
+from mi_nerfattack.commands.evaluate import Evaluate
+from mi_nerfattack.commands.evaluate_options import PlaceOptions
+from mi_nerfattack.commands.train import Train
+from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy import evaluate_work
@@ -32,6 +44,8 @@ from mi_nerfattack.policy.evaluate import (
     evaluate_run,
     random_start,
 )
+from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.training_record import training_record
 from mi_nerfattack.render.camera import from_fov
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
 from mi_nerfattack.report.table import card_table
@@ -355,6 +369,37 @@ def test_a_training_s_record_is_shown_as_far_as_it_goes():
     )
     assert facts["data"] == {"mitsuba": 9} and facts["seed"] == 3
     assert facts["checksums"] is None
+
+
+def test_a_training_writes_down_its_data_and_settings(tmp_path):
+    shard = tmp_path / "round_0" / "painted" / "shard_0000"
+    shard.mkdir(parents=True)
+    files.write_json(shard / "shard.json", {"frames": 12})
+    settings = ImitationSettings({"painted": 12}, seed=5)
+    record = training_record(settings, [PaintedSite()], tmp_path, [shard], "train it")
+    assert record["data"] == {"round_0/painted": 12, "earlier/painted": 12}
+    facts = training_facts({"schema": 2, **record})
+    assert facts["command"] == "train it" and facts["seed"] == 5
+    assert facts["augmentation"]["exposure_ev"] > 0
+    assert facts["data"] == record["data"]
+
+
+def test_commands_are_written_anew_without_the_machine_s_folders():
+    options = Evaluate(
+        "/home/me/my policy.pt2",
+        runs=3,
+        routes=("left", "right"),
+        where=PlaceOptions(scene=Path("here/scene.xml")),
+        json=True,
+    )
+    assert command_line("evaluate", options) == (
+        "mi-nerfattack evaluate 'my policy.pt2' --routes left right --runs 3 "
+        "--scene here/scene.xml --json"
+    )
+    train = Train(Path("/tmp/p.safetensors"), Path("data"), frames={"mitsuba": 8})
+    assert command_line("train", train) == (
+        "mi-nerfattack train --output p.safetensors --data data --frames mitsuba 8"
+    )
 
 
 def test_pages_are_named_after_the_policy():

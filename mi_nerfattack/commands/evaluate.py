@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 import time
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -17,6 +16,7 @@ from mi_nerfattack.commands.evaluate_options import (
     PolicyOptions,
     parse_conditions,
 )
+from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Evaluate:
 
         about = {
             **work.describe(),
-            "command": self._command(),
+            "command": command_line("evaluate", self),
             "wall_s": wall_s,
             "seconds_a_drive": {
                 f"{environment}, {case}": seconds
@@ -177,10 +177,6 @@ class Evaluate:
         count = available_cores() if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
 
-    def _command(self) -> str:
-        """Write the command anew from what differs from the defaults."""
-        return " ".join(["mi-nerfattack evaluate", *words(self)])
-
 
 class _Progress:
     """Shows steps, and how long it still takes."""
@@ -197,22 +193,6 @@ class _Progress:
         left = (now - start) / (done - before) * (total - done)
         state = f"step {done}/{total}, {left / 60:.1f} min left"
         self._bars.show("driving", done, total, state)
-
-
-def words(options: Any) -> list[str]:
-    """Return the arguments that differ from the defaults, for a shell."""
-    found = []
-    for item in fields(options):
-        value = getattr(options, item.name)
-        if is_dataclass(value):
-            found += words(value)
-        elif value != item.default and item.name == "policy":
-            found.insert(0, shlex.quote(str(value)))
-        elif value != item.default:
-            found.append("--" + item.name.replace("_", "-"))
-            values = value if isinstance(value, tuple) else (value,)
-            found += [shlex.quote(str(v)) for v in values if v is not True]
-    return found
 
 
 def _check_different(option: str, names: tuple[str, ...]) -> None:

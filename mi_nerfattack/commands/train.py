@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+
+from mi_nerfattack.commands.words import command_line
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.registry import Place
@@ -92,6 +94,7 @@ class Train:
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.policy.presets import find_preset
         from mi_nerfattack.policy.sites import load_routes
+        from mi_nerfattack.policy.training_record import training_record
         from mi_nerfattack.policy.workers import Processes, available_cores
         from mi_nerfattack.report.table import card_table
 
@@ -101,18 +104,21 @@ class Train:
         place, settings = self._place(preset), self._settings(preset)
         routes = load_routes(place.routes)
         start = None if self.start is None else PilotNet.load(self.start)
+        sites, more = self._sites(preset, place, settings), self._more()
         with StageBars() as bars:
             result = imitate(
-                self._sites(preset, place, settings),
+                sites,
                 routes,
                 settings,
                 self.data,
                 Processes(available_cores() if self.workers is None else self.workers),
                 bars.show,
                 start,
-                self._more(),
+                more,
             )
-        self._write(result)
+        command = command_line("train", self)
+        record = training_record(settings, sites, self.data, more, command)
+        self._write(result, record)
         Console().print(card_table(result.card))
         print(f"{self.output}: written; program and validation are beside it")
         return 0
@@ -189,7 +195,7 @@ class Train:
 
         return [shard for folder in self.more for shard in find_shards(folder)]
 
-    def _write(self, result: Imitated) -> None:
+    def _write(self, result: Imitated, record: dict[str, Any]) -> None:
         from mi_nerfattack import files
         from mi_nerfattack.policy.export_program import SUFFIX, export_program
 
@@ -200,5 +206,6 @@ class Train:
             "environments": result.card,
             "training": result.history,
             "best_round": result.best_round,
+            **record,
         }
         files.write_json(self.output.with_suffix(".json"), document)

@@ -152,7 +152,7 @@ class EvaluateWork(AbstractWork):
         place = self.place
         paths = [place.scene, place.routes, *place.objects]
         return {
-            "policy": self.policy.file or self.policy.url,
+            "policy": _relative(self.policy.file or self.policy.url or ""),
             "policy_section": policy_content(self.policy, self.base),
             "place": [f"{path.resolve().parent.name}/{path.name}" for path in paths],
             "routes": [route.name for route in self.routes],
@@ -335,6 +335,11 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     image = mi.TensorXf(np.zeros(shape, np.float32))
     for route in routes:
         policy.step(image, route.goal, policy.initial_memory(1))
+
+
+def _relative(name: str) -> str:
+    """Drop the folder of an absolute path: it tells about the machine alone."""
+    return Path(name).name if Path(name).is_absolute() else name
 
 
 def _endless(paths: Sequence[Path]) -> itertools.cycle[Path]:

@@ -1,0 +1,75 @@
+"""What a training writes down about itself, beside the policy."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack import files
+from mi_nerfattack.policy.collect import find_shards
+from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.sites import AbstractSite
+
+
+def training_record(
+    settings: ImitationSettings,
+    sites: Sequence[AbstractSite],
+    data: Path,
+    more: Sequence[Path],
+    command: str,
+) -> dict[str, Any]:
+    """Describe a training: what its page shows.
+
+    Args:
+        settings: of the training.
+        sites: where its frames come from.
+        data: folder of the frames.
+        more: shards of earlier collections.
+        command: that was given.
+
+    Returns:
+        `command`, `seed`, `settings`, `augmentation`, `data` (frames by collection),
+        `sites` and `checksums` (SHA-256 of the sites' files), as JSON.
+    """
+    described = [site.describe() for site in sites]
+    record = {
+        "command": command,
+        "seed": settings.seed,
+        "settings": asdict(settings),
+        "augmentation": asdict(settings.training.augmentation),
+        "data": count_frames(data, more),
+        "sites": {
+            site.name: {key: value for key, value in about.items() if key != "files"}
+            for site, about in zip(sites, described, strict=True)
+        },
+        "checksums": {
+            name: digest
+            for about in described
+            for name, digest in about.get("files", {}).items()
+        },
+    }
+    return json.loads(json.dumps(record, default=str))
+
+
+def count_frames(data: Path, more: Sequence[Path] = ()) -> dict[str, int]:
+    """Count the frames of collections: by folder below `data`, earlier ones by name.
+
+    Args:
+        data: folder of the frames.
+        more: shards of earlier collections.
+    """
+    counts: Counter[str] = Counter()
+    for shard in find_shards(data):
+        name = shard.parent.relative_to(data).as_posix()
+        counts[name] += _frames(shard)
+    for shard in more:
+        counts[f"earlier/{shard.parent.name}"] += _frames(shard)
+    return dict(counts)
+
+
+def _frames(shard: Path) -> int:
+    return int(files.read_json(shard / "shard.json")["frames"])
