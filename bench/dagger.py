@@ -326,7 +326,7 @@ def write_figure(path: Path, document: dict[str, Any]) -> None:
         axes.set_ylabel("mean distance from the lane centre, cm")
         axes.set_title(
             f"{document['frames']} frames and {document['gradient_steps']} gradient "
-            f"steps each; {len(found['seeds_m'])} seeds, standard error"
+            f"steps each; {len(document['settings']['seeds'])} seeds, standard error"
         )
 
 
