@@ -13,7 +13,7 @@ WORKERS ?= 2
 
 help:
 	@echo "make demo   run the whole chain on the bundled scene, about 10 minutes"
-	@echo "make test   run the tests, about 10 minutes on 2 cores"
+	@echo "make test   run the tests, less than 20 minutes"
 	@echo "make lint   check format, lint and types"
 	@echo "make clean  remove the virtual environment and what was built"
 
