@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from roadside import PaintedSite, bent, small, straight
+from roadside import PaintedSite, bent, flat_ground, small, straight
 
 from mi_nerfattack import cli, files
 from mi_nerfattack.commands.bars import StageBars
@@ -29,6 +29,7 @@ from mi_nerfattack.policy.validation import (
     DEPARTURES,
     ERROR,
     AbstractValidation,
+    ClosedLoop,
     rank,
 )
 from mi_nerfattack.policy.workers import InThisProcess
@@ -157,6 +158,21 @@ def test_validation_every_second_epoch_and_after_the_last(data):
     assert [row["measured"] for row in history] == [False, True, True]
 
 
+def test_training_goes_on_after_a_closed_loop(data):
+    environment = SITE.open(SITE.typical())
+    loop = ClosedLoop([environment], [straight()], [], flat_ground, DRIVE, every=1)
+    module = PilotNet(1)
+    before = loop.measure(module)
+    assert all(parameter.requires_grad for parameter in module.parameters())
+    history = fit_policy(
+        module, data, TrainSettings(epochs=2, batch=12), validation=loop
+    )
+    # 3 periods on a straight lane from a random start: the error is near the start's
+    assert set(before["routes"]) == {"mitsuba straight clean"}
+    assert [row[DEPARTURES] for row in history] == [0, 0]
+    assert history[0]["train_loss"] != history[1]["train_loss"]
+
+
 def test_exported_program_gives_the_modules_controls(tmp_path):
     torch.manual_seed(3)
     module = PilotNet(3).eval()
@@ -208,7 +224,7 @@ def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
 def test_goals_cameras_and_weights_must_fit(tmp_path):
     with pytest.raises(InputError, match=r"goals \[1\]"):
         imitate([SITE], [bent()], SETTINGS, tmp_path, HERE)
-    small_camera = PaintedSite(size_px=(100, 50))
+    small_camera = PaintedSite("mitsuba", size_px=(100, 50))
     with pytest.raises(InputError, match=r"100 x 50 px; PilotNet takes 200 x 66"):
         imitate([small_camera], ROUTES, SETTINGS, tmp_path, HERE)
     with pytest.raises(InputError, match=r"start: .*\(2, 1.5, 'rad/s'\) are needed"):

@@ -173,8 +173,7 @@ class _Run:
         order = np.random.default_rng(entropy).permutation(self.part.rows)
         generator = torch.Generator(self.device)
         generator.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
-        # a policy that drives in a validation takes its parameters' gradients away
-        self.module.train().requires_grad_(True)
+        self.module.train()
         losses = []
         for step in range(self.steps):
             chosen = order[step * self.settings.batch :][: self.settings.batch]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -95,7 +96,8 @@ class ClosedLoop(AbstractValidation):
 
     def card(self, module: PilotNet) -> dict[str, Any]:
         """Drive, and return all figures; see `policy.evaluate.evaluate`."""
-        policy = TorchPolicy(module)
+        # the parameters of a policy that drives are frozen
+        policy = TorchPolicy(copy.deepcopy(module))
         arguments = (self.routes, self.objects, self.ground, self.settings)
         return evaluate(policy, self.environments, *arguments, self.progress)
 
