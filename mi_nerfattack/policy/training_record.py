@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack import files
-from mi_nerfattack.policy.collect import find_shards
 from mi_nerfattack.policy.imitate import ImitationSettings
 from mi_nerfattack.policy.sites import AbstractSite
+
+_DONE = "shard.json"  # in the folder of every complete shard
 
 
 def training_record(
@@ -63,13 +64,12 @@ def count_frames(data: Path, more: Sequence[Path] = ()) -> dict[str, int]:
         more: shards of earlier collections.
     """
     counts: Counter[str] = Counter()
-    for shard in find_shards(data):
-        name = shard.parent.relative_to(data).as_posix()
-        counts[name] += _frames(shard)
+    for done in sorted(Path(data).rglob(_DONE)):  # none where all are earlier ones
+        counts[done.parents[1].relative_to(data).as_posix()] += _frames(done.parent)
     for shard in more:
         counts[f"earlier/{shard.parent.name}"] += _frames(shard)
     return dict(counts)
 
 
 def _frames(shard: Path) -> int:
-    return int(files.read_json(shard / "shard.json")["frames"])
+    return int(files.read_json(shard / _DONE)["frames"])
