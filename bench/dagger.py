@@ -57,12 +57,12 @@ class Settings:
     """
 
     seeds: tuple[int, ...] = (0, 1, 2)
-    first: int = 1152
-    added: int = 576
+    first: int = 768
+    added: int = 384
     epochs: tuple[int, ...] = (12, 8, 10)
     cloning_epochs: int = 22
     batch: int = 64
-    runs: int = 4
+    runs: int = 3
     horizon: int = 1000
     environment: str = "mitsuba"
     spp: int = 4

@@ -80,14 +80,16 @@ class BenchDagger:
     """Compare DAgger with plain cloning on as many frames and gradient steps.
 
     Both start from the same frames and weights of three seeds; mean cross-track errors
-    of drives from random starts in the path-traced intersection. Takes about half an
-    hour on two cores; stopped, the same command continues from DATA.
+    of drives from random starts at the bundled intersection. Takes a quarter of an hour
+    on two cores; stopped, the same command continues from DATA.
     """
 
     data: Path
     """Folder of frames, checkpoints and results; made if missing."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("dagger.png")
     """Figure to write (.png); the numbers go beside it (.json)."""
+    environment: str = "mitsuba"
+    """Where frames are taken and policies drive: mitsuba, mujoco, mujoco_gl, ..."""
     workers: int | None = None
     """Processes that collect and drive; one a core by default."""
     quick: bool = False
@@ -95,6 +97,8 @@ class BenchDagger:
 
     def run(self) -> int:
         """Collect, train, drive and draw."""
+        from dataclasses import replace
+
         from mi_nerfattack import files, variant
 
         files.check_writable(self.output)
@@ -107,6 +111,7 @@ class BenchDagger:
         from mi_nerfattack.policy.workers import Processes, available_cores
 
         settings = dagger.Settings.quick() if self.quick else dagger.Settings()
+        settings = replace(settings, environment=self.environment)
         workers = Processes(available_cores() if self.workers is None else self.workers)
         with StageBars() as bars:
             document = dagger.run(
@@ -118,6 +123,7 @@ class BenchDagger:
                 ),
             )
         command = ["mi-nerfattack", "bench", "dagger", *["--quick"] * self.quick]
+        command += ["--environment", self.environment]
         document = results.stamp(document, command)
         dagger.write_figure(self.output, document)
         files.write_json(self.output.with_suffix(".json"), document)
