@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import sys
+import types
 from dataclasses import replace
 
 import drjit as dr
@@ -163,6 +164,10 @@ def test_steps_refuse_what_no_vehicle_can_do():
         environment.step(math.nan)
     with pytest.raises(InputError, match=r"pose: \[0.0, inf, 0.0\]; three finite"):
         environment.reset(a_route(), np.array([0.0, math.inf, 0.0]))
+    with pytest.raises(InputError, match="pose: 'north'; three finite numbers"):
+        environment.reset(a_route(), "north")
+    with pytest.raises(InputError, match="seed: -1; at least 0"):
+        environment.reset(a_route(), None, -1)
 
 
 def test_surrogate_shows_what_the_sensor_of_attacks_sees():
@@ -299,6 +304,8 @@ def test_conditions_and_place_are_checked(tmp_path):
         Car(max_steer=2)
     with pytest.raises(InputError, match="car.control_unit: 'deg'"):
         Car(control_unit="deg")
+    with pytest.raises(InputError, match="max_control: 1.5 rad; .* max_steer, 0.75"):
+        Car(control_unit="rad")
 
 
 def test_places_and_conditions_travel_to_workers(tmp_path):
@@ -321,11 +328,30 @@ def test_environments_that_cannot_be_made(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=f"'{name}': takes no built-in objects"):
             make_environment(name, replace(place, recording=tmp_path), built_in)
     monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(InputError, match=r"carla is not installed; pip .*\[carla\]'"):
+    with pytest.raises(InputError, match=r"'carla': its client .*pip .*\[carla\]'"):
         make_environment("carla", place)
     missing = replace(place, scene=tmp_path / "none.xml")
     with pytest.raises(InputError, match=r"none.xml: does not exist"):
         make_environment("mitsuba", missing)
+
+
+class Broken(types.ModuleType):
+    """A module whose import ends in an error of its own."""
+
+    def __getattr__(self, name):
+        raise RuntimeError("invalid value")
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mujoco_gl"])
+def test_mujoco_that_cannot_be_imported(name, tmp_path, monkeypatch):
+    place, module = write_place(tmp_path), "mi_nerfattack.deploy.mujoco_vehicle"
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=f"'{name}': .*not installed; pip install muj"):
+        make_environment(name, place)
+    monkeypatch.setitem(sys.modules, module, Broken(module))
+    monkeypatch.setenv("MUJOCO_GL", "bogus")
+    with pytest.raises(InputError, match="MUJOCO_GL=bogus .invalid value.; unset it"):
+        make_environment(name, place)
 
 
 def test_bundled_places():

@@ -13,8 +13,7 @@ from mi_nerfattack.capture.fit_cells import depth_points
 from mi_nerfattack.capture.frames import FILE_NAMES, find_transforms, read_table
 from mi_nerfattack.capture.posed import PosedImages
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera
-from mi_nerfattack.render.distortion import undistort
+from mi_nerfattack.render.camera import Camera, ray_lengths
 
 _CUBE = 2.0  # half edge of the cube, in distances of the farthest camera
 _MARGIN = 0.01  # around the box of all depth points, of its longest edge
@@ -107,11 +106,7 @@ def _read_axial(
             "bits, millimetres"
         )
     axial = _at_pixels(files.read_image16(source.parent / where), camera) * _MILLIMETRE
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    if camera.is_distorted:
-        x, y = undistort(x, y, *camera.distortion)
-    depth = np.where(axial > 0, axial * np.sqrt(1 + x * x + y * y), np.nan)
+    depth = np.where(axial > 0, axial * ray_lengths(camera), np.nan)
     return depth.astype(np.float32)
 
 

@@ -22,7 +22,8 @@ class Car:
         max_steer: largest steering angle, radians, below pi / 2.
         control_unit: of the control that a policy gives: "rad/s" of a heading rate, or
             "rad" of a steering angle.
-        max_control: largest control that has an effect, in that unit.
+        max_control: largest control that has an effect, in that unit; of a steering
+            angle at most `max_steer`.
     """
 
     wheelbase: float = 2.7
@@ -47,6 +48,11 @@ class Car:
         if self.control_unit not in ("rad/s", "rad"):
             raise InputError(
                 f"car.control_unit: {self.control_unit!r}; 'rad/s' or 'rad'"
+            )
+        if self.control_unit == "rad" and self.max_control > self.max_steer:
+            raise InputError(
+                f"car.max_control: {self.max_control!r} rad; a steering angle of at "
+                f"most max_steer, {self.max_steer!r} rad"
             )
 
 

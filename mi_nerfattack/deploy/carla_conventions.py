@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.camera import Camera, ray_lengths
 
 CENTIMETRES = 100.0
 FAR_PLANE = 1000.0  # metres; what a depth image says where there is nothing
@@ -230,12 +230,9 @@ def along_rays(planar: np.ndarray, camera: Camera) -> np.ndarray:
 
     Args:
         planar: (height, width), metres along the optical axis; may be infinite.
-        camera: intrinsics without distortion.
+        camera: intrinsics.
 
     Returns:
         (height, width), float32, metres through the pixels' centres.
     """
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    stretch = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
-    return (planar * stretch).astype(np.float32)
+    return (planar * ray_lengths(camera)).astype(np.float32)

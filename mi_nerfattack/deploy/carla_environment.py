@@ -23,7 +23,11 @@ from mi_nerfattack.deploy.carla_drivers import (
 from mi_nerfattack.deploy.carla_session import CarlaServer, CarlaSession, load_client
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.paste import Paster
-from mi_nerfattack.deploy.vehicle import planar_body, require_control
+from mi_nerfattack.deploy.vehicle import (
+    checked_pose,
+    planar_body,
+    require_control,
+)
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import Camera, CameraMount, mount_matrix
 from mi_nerfattack.vehicle.route import Route
@@ -96,11 +100,7 @@ class CarlaEnvironment(AbstractEnvironment):
     ) -> CameraFrame:
         """Spawn vehicle and cameras; nothing is random, so `seed` has no effect."""
         del seed
-        start = route.pose_at(0.0) if pose is None else np.asarray(pose, np.float64)
-        if start.shape != (3,) or not np.isfinite(start).all():
-            raise InputError(
-                f"pose: {start.tolist()}; three finite numbers x, y, theta"
-            )
+        start = checked_pose(route.pose_at(0.0) if pose is None else pose)
         with self.session.guarded("put the vehicle on the road"):
             self._cameras = None
             self.session.clear()

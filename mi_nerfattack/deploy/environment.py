@@ -59,7 +59,7 @@ class AbstractEnvironment(ABC):
             route: that is followed; some environments take their speed from it.
             pose: (3,), x and y in metres, heading in radians; None for the route's
                 start.
-            seed: of everything random until the next reset.
+            seed: of everything random until the next reset, at least 0.
 
         Returns:
             The first frame.

@@ -34,7 +34,7 @@ def map_spec(
     Args:
         scene: `mi.Scene`, metric, z up; meshes and rectangles of opaque materials.
         built_in: more objects.
-        exposure_ev: its light is multiplied by two to this power.
+        exposure_ev: its light, of lamps as well, is multiplied by two to this power.
 
     Returns:
         what compiles to a model without joints; the ground that cars drive on is the
@@ -45,10 +45,11 @@ def map_spec(
     """
     meshes = read_meshes(scene)
     meshes += [built_in_mesh(index, item) for index, item in enumerate(built_in)]
-    lighting = read_lighting(scene).scaled(2.0**exposure_ev)
+    gain = 2.0**exposure_ev
+    lighting = read_lighting(scene).scaled(gain)
     spec = mujoco.MjSpec()
     mjcf_car.add_ground(spec)
-    add_meshes(spec, meshes, lighting.white)
+    add_meshes(spec, meshes, lighting.white, gain)
     add_lighting(spec, lighting)
     _set_visual(spec, np.concatenate([mesh.vertices for mesh in meshes]))
     return spec

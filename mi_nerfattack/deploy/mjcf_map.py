@@ -77,7 +77,7 @@ def built_in_mesh(index: int, item: BuiltInObject) -> DrawnMesh:
 
 
 def add_meshes(
-    spec: mujoco.MjSpec, meshes: Sequence[DrawnMesh], white: np.ndarray
+    spec: mujoco.MjSpec, meshes: Sequence[DrawnMesh], white: np.ndarray, gain: float
 ) -> None:
     """Add meshes, their textures and materials; nothing collides with them.
 
@@ -85,10 +85,11 @@ def add_meshes(
         spec: gets them.
         meshes: may be empty.
         white: (3,), linear colour of a white surface in full light.
+        gain: of the radiance of what shines.
     """
     for index, mesh in enumerate(map(_padded, meshes)):
         name = f"{index:03d}_{mesh.name}"
-        factor = 1.0 if mesh.shines else white
+        factor = gain if mesh.shines else white
         _add_material(spec, name, mesh, _encode(mesh.texture * np.float32(factor)))
         _add_mesh(spec, name, mesh)
         spec.worldbody.add_geom(

@@ -12,7 +12,11 @@ import numpy as np
 from mi_nerfattack.deploy import mjcf_car
 from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.mjcf_car import Handling
-from mi_nerfattack.deploy.vehicle import AbstractVehicle, require_control
+from mi_nerfattack.deploy.vehicle import (
+    AbstractVehicle,
+    checked_pose,
+    require_control,
+)
 from mi_nerfattack.errors import InputError
 
 _SETTLE_S = 2.0
@@ -142,14 +146,9 @@ class MujocoVehicle(AbstractVehicle):
     def reset(self, pose: np.ndarray, speed: float, seed: int = 0) -> None:
         """Put the car on the ground, rolling straight ahead; `seed` has no effect."""
         del seed
-        start = np.asarray(pose, np.float64)
-        if start.shape != (3,) or not np.isfinite(start).all():
-            raise InputError(
-                f"pose: {start.tolist()}; three finite numbers x, y, theta"
-            )
         if not 0 <= speed < float("inf"):
             raise InputError(f"speed: {speed!r} m/s; a finite number of at least 0")
-        x, y, theta = start.tolist()
+        x, y, theta = checked_pose(pose).tolist()
         data = self._data
         mujoco.mj_resetData(self._model, data)
         data.qpos[:] = self._settled

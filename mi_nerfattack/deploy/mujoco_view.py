@@ -18,7 +18,7 @@ from mi_nerfattack.deploy.opengl import make_context
 from mi_nerfattack.deploy.paste import Paster
 from mi_nerfattack.deploy.view import AbstractView
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera
+from mi_nerfattack.render.camera import Camera, ray_lengths
 from mi_nerfattack.render.conventions import opencv_to_opengl
 from mi_nerfattack.render.posed import PosedField
 
@@ -63,7 +63,7 @@ class MujocoView(AbstractView):
         buffer.offwidth = _ACROSS * camera.width
         buffer.offheight = _DOWN * camera.height
         self._window = _Window(spec.compile(), camera)
-        self._lengths = _ray_lengths(camera)
+        self._lengths = ray_lengths(camera)
         self.show(())
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> CameraFrame:
@@ -174,10 +174,3 @@ def _close(reference: weakref.ReferenceType[_Window]) -> None:
     window = reference()
     if window is not None:
         window.close()
-
-
-def _ray_lengths(camera: Camera) -> np.ndarray:
-    """Return the distance (h, w) along the ray per distance along the axis."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)

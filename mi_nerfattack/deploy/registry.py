@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -123,14 +124,14 @@ def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    with _installed("mujoco", "pip install mujoco"):
+    with _loading_mujoco("mujoco"):
         from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
     vehicle = MujocoVehicle(place.car, period=place.period)
     return _pair("mujoco", vehicle, mitsuba_view(place, conditions), place)
 
 
 def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    with _installed("mujoco_gl", "pip install mujoco"):
+    with _loading_mujoco("mujoco_gl"):
         from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
         from mi_nerfattack.deploy.mujoco_view import MujocoView
     scene = load_scene(place.scene)
@@ -141,12 +142,10 @@ def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    with _installed("carla", "pip install 'mi-nerfattack[carla]'"):
-        import carla  # noqa: F401  # pyright: ignore[reportMissingImports]
+    from mi_nerfattack.deploy.carla_drivers import KinematicDriver
+    from mi_nerfattack.deploy.carla_environment import CarlaEnvironment
+    from mi_nerfattack.deploy.carla_session import CarlaServer
 
-        from mi_nerfattack.deploy.carla_drivers import KinematicDriver
-        from mi_nerfattack.deploy.carla_environment import CarlaEnvironment
-        from mi_nerfattack.deploy.carla_session import CarlaServer
     _refuse_built_in("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
     driver = KinematicDriver(kinematic_vehicle(place.car, place.period))
@@ -186,13 +185,22 @@ def _refuse_built_in(name: str, conditions: Conditions) -> None:
 
 
 @contextmanager
-def _installed(name: str, remedy: str) -> Iterator[None]:
-    """Turn a failed import into an `InputError` with a remedy."""
+def _loading_mujoco(name: str) -> Iterator[None]:
+    """Turn a failed import of MuJoCo into an `InputError` with a remedy.
+
+    It fails in several ways where MUJOCO_GL names what is not there.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         raise InputError(
-            f"environment {name!r}: the package {error.name} is not installed; {remedy}"
+            f"environment {name!r}: the package {error.name} is not installed; "
+            "pip install mujoco"
+        ) from error
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        raise InputError(
+            f"environment {name!r}: MuJoCo cannot be imported with "
+            f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); unset it"
         ) from error
 
 

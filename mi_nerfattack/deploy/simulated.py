@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.vehicle import AbstractVehicle
+from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
 from mi_nerfattack.deploy.view import AbstractView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import CameraMount, mount_matrix
@@ -45,11 +45,9 @@ class SimulatedEnvironment(AbstractEnvironment):
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
     ) -> CameraFrame:
         """Put the vehicle on the route's start, or elsewhere."""
-        start = route.pose_at(0.0) if pose is None else np.asarray(pose, np.float64)
-        if start.shape != (3,) or not np.isfinite(start).all():
-            raise InputError(
-                f"pose: {start.tolist()}; three finite numbers x, y, theta"
-            )
+        start = checked_pose(route.pose_at(0.0) if pose is None else pose)
+        if seed < 0:
+            raise InputError(f"seed: {seed}; at least 0")
         self.vehicle.reset(start, route.speed_ms, seed)
         self._seed, self._steps = seed, 0
         return self._observe()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,21 @@ def planar_body(state: np.ndarray) -> np.ndarray:
     matrix[:2, 1] = -np.sin(theta), np.cos(theta)
     matrix[:2, 3] = x, y
     return matrix
+
+
+def checked_pose(pose: Any) -> np.ndarray:
+    """Copy a vehicle's pose x, y (metres), theta (radians) to (3,) float64.
+
+    Raises:
+        InputError: it is not three finite numbers.
+    """
+    try:
+        array = np.array(pose, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"pose: {pose!r}; three finite numbers x, y, theta") from error
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"pose: {array.tolist()}; three finite numbers x, y, theta")
+    return array
 
 
 def require_control(control: float) -> None:

@@ -120,6 +120,19 @@ def from_fov(width: int, height: int, fov_x_deg: float) -> Camera:
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
 
+def ray_lengths(camera: Camera) -> np.ndarray:
+    """Return how far each pixel's ray goes per distance along the optical axis.
+
+    Returns:
+        (height, width), float64, at least 1, of rays through the pixels' centres.
+    """
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    if camera.is_distorted:
+        x, y = undistort(x, y, *camera.distortion)
+    return np.sqrt(1 + x * x + y * y)
+
+
 def look_at(eye: ArrayLike, target: ArrayLike) -> np.ndarray:
     """Place an upright camera (up is +z).
 
