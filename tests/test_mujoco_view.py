@@ -17,7 +17,7 @@ from mi_nerfattack.colour import linear_to_uint8
 from mi_nerfattack.deploy import opengl
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import SMALL_CAR
-from mi_nerfattack.deploy.mjcf import world_spec
+from mi_nerfattack.deploy.mjcf import world_spec, write_mjcf
 from mi_nerfattack.deploy.mjcf_light import read_lighting
 from mi_nerfattack.deploy.mjcf_map import read_meshes
 from mi_nerfattack.deploy.mujoco_view import MujocoView
@@ -315,6 +315,23 @@ def test_map_and_car_in_one_model():
     # the drawn ground is not what it stands on, and nothing is in its way
     assert abs(data.body("car").xpos[2]) < 1e-3
     assert model.geom("000_shape_0").matid[0] >= 0  # the map is drawn, too
+
+
+def test_written_model_is_read_by_mujoco(tmp_path, rng):
+    texels = rng.uniform(0.1, 0.9, (4, 8, 3)).astype(np.float32)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(texels)}
+    spec = world_spec(scene(quadrants(), sky=sky), SMALL_CAR)
+    expected = spec.compile()
+    written = write_mjcf(tmp_path / "model", spec)
+    assert [path.name for path in written[1:]] == ["texture_001.png", "model.xml"]
+    found = mujoco.MjModel.from_xml_path(str(written[-1]))
+    for key in ("tex_data", "tex_type", "geom_type", "geom_matid", "mesh_face"):
+        np.testing.assert_array_equal(getattr(found, key), getattr(expected, key), key)
+    for key in ("body_mass", "eq_data", "actuator_gainprm", "mesh_vert", "light_dir"):
+        np.testing.assert_allclose(
+            getattr(found, key), getattr(expected, key), rtol=1e-4, atol=1e-6
+        )
+    assert spec.textures[0].file == ""
 
 
 def test_what_cannot_be_drawn_is_named():
