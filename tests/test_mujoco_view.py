@@ -292,10 +292,20 @@ def test_bundled_intersection_agrees_in_depth_and_brightness(gl):
     view.close()
 
 
-def test_room_is_as_bright_as_its_lamps_make_it():
-    lighting = read_lighting(load_scene(bundled("room/scene.xml")))
+def test_room_is_as_bright_as_its_lamps_make_it(gl):
+    room, camera = load_scene(bundled("room/scene.xml")), from_fov(100, 33, 90.0)
+    lighting = read_lighting(room)
     assert not lighting.has_shadows
     assert (lighting.sky > 0.1).all() and (lighting.sun >= 0).all()
+    view, renderer = MujocoView(room, camera), ViewRenderer(room, camera)
+    states = np.array([[-0.2, -1.6, 0], [1.6, -0.2, math.pi / 2], [0.2, 1.6, math.pi]])
+    for pose in mount_matrix(states, CameraMount(0.2, 0.3, 10.0)):
+        expected = linear_to_uint8(renderer.render(pose, 16, 0).rgb).astype(float)
+        image = view.render(pose, 0).image
+        assert abs(image.mean() - expected.mean()) < 12
+        floor = np.abs(image[-10:].mean((0, 1)) - expected[-10:].mean((0, 1)))
+        assert floor.max() < 12
+    view.close()
 
 
 def test_sun_is_told_from_the_sky():

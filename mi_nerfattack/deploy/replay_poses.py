@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mi_nerfattack import files
 from mi_nerfattack.capture.frames import read_pose, read_table
@@ -163,13 +164,8 @@ def pose_matrix(
             f"{where}: position {list(position)}, quaternion {list(quaternion)}; "
             "must be finite, and the quaternion of length 1"
         )
-    w, x, y, z = values[3:] / length
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = Rotation.from_quat(values[3:], scalar_first=True).as_matrix()
     matrix[:3, 3] = values[:3]
     return matrix
 
