@@ -340,6 +340,7 @@ def _claim(folder: Path, settings: Settings) -> None:
     path, about = folder / "settings.json", asdict(settings)
     if path.is_file() and files.read_json(path) != as_json(about):
         raise InputError(
-            f"{path}: results of other settings; choose another folder or remove it"
+            f"{path}: results of other settings; choose another folder or "
+            f"remove {folder}"
         )
     files.write_json(path, about)

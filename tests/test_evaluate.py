@@ -8,6 +8,7 @@ import mi_nerfattack  # noqa: F401  before drjit
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -29,8 +30,13 @@ from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.evaluate_options import PlaceOptions
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.commands.words import command_line
-from mi_nerfattack.deploy.registry import make_environment
+from mi_nerfattack.deploy.registry import (
+    Conditions,
+    bundled_place,
+    make_environment,
+)
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.adapter import AbstractPolicy
 from mi_nerfattack.policy.evaluate import (
@@ -45,8 +51,13 @@ from mi_nerfattack.policy.evaluate import (
     random_start,
 )
 from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.placement import scene_ground
+from mi_nerfattack.policy.presets import EVALUATIONS
+from mi_nerfattack.policy.sites import load_routes
 from mi_nerfattack.policy.training_record import training_record
 from mi_nerfattack.render.camera import from_fov
+from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.report.metrics import departure_limit
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
 from mi_nerfattack.report.table import card_table
 from mi_nerfattack.vehicle.expert import expert_for
@@ -490,6 +501,40 @@ def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message
     errors = capsys.readouterr().err
     assert message in errors and "Traceback" not in errors
     assert not Path("runs").exists()
+
+
+def test_a_policy_of_another_unit_is_refused(capsys, tmp_path, monkeypatch):
+    """The bundled policy gives heading rates, the room's car takes angles."""
+    monkeypatch.chdir(tmp_path)
+    room = ["evaluate", "--place", "room", "--environments", "mitsuba"]
+    assert cli.main(room) == 2
+    assert "gives rad/s, the car of the place takes rad" in capsys.readouterr().err
+
+
+def test_the_room_has_starts_in_its_lane_and_objects_that_find_a_place():
+    room, settings = bundled_place("room"), EVALUATIONS["room"]
+    (route,) = load_routes(room.routes)
+    limit = departure_limit(route.lane_width_m, settings.car_width_m)
+    rng = np.random.default_rng(0)
+    starts = np.array([random_start(route, settings, rng) for _ in range(100)])
+    assert np.abs(route.cross_track_numpy(starts)).max() < limit
+    environment = make_environment("mitsuba", tiny(room), Conditions(spp=1))
+    ground = scene_ground(load_scene(room.scene))
+    grid, few = load_grid(room.objects[0]), replace(settings, horizon=2)
+    for run in range(8):
+        arguments = (route, RANDOM_OBJECTS, run, [grid], ground, few)
+        driven = evaluate_run(environment, Counting(), *arguments)
+        assert not driven.departed(limit).any()
+
+
+def tiny(place):
+    return replace(place, camera=from_fov(8, 3, 90.0))
+
+
+def test_the_experts_camera_suits_every_environment():
+    """CARLA's cameras have square pixels."""
+    camera = evaluate_work._EXPERT_CAMERA
+    assert camera.fx == camera.fy
 
 
 def test_a_toml_file_says_how_the_policy_is_called(place, capsys):

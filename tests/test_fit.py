@@ -195,5 +195,5 @@ def test_command_fits_a_folder(tmp_path, capsys):
 def test_command_checks_its_output_first(tmp_path, name):
     from mi_nerfattack.commands.asset import Asset
 
-    with pytest.raises(InputError, match="field files end|make it first"):
+    with pytest.raises(InputError, match="must end in|make it first"):
         Asset(tmp_path / "no.glb", tmp_path / name).run()

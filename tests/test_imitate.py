@@ -6,6 +6,7 @@ import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from roadside import PaintedSite, bent, flat_ground, small, straight
 from mi_nerfattack import cli, files
 from mi_nerfattack.commands.bars import StageBars
 from mi_nerfattack.commands.train import Train
+from mi_nerfattack.deploy.registry import bundled_place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.evaluate import EvaluateSettings
@@ -24,6 +26,7 @@ from mi_nerfattack.policy.exported import load_exported
 from mi_nerfattack.policy.imitate import ImitationSettings, imitate
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.presets import PRESETS, find_preset
+from mi_nerfattack.policy.sites import load_routes
 from mi_nerfattack.policy.train import TrainSettings, fit_policy
 from mi_nerfattack.policy.validation import (
     DEPARTURES,
@@ -33,6 +36,7 @@ from mi_nerfattack.policy.validation import (
     rank,
 )
 from mi_nerfattack.policy.workers import InThisProcess
+from mi_nerfattack.report.metrics import departure_limit
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -212,6 +216,7 @@ def test_presets_have_the_figures_of_the_paper():
     [
         ({"frames": {"moon": 3}}, "frames: of moon"),
         ({"frames": {"mitsuba": 0}}, "at least one frame"),
+        ({"validate_in": ("moon",)}, "frames: of moon"),
         ({"frames": {"mitsuba": -1}}, "frames: -1 of 'mitsuba'"),
     ],
 )
@@ -254,6 +259,22 @@ def test_train_says_what_is_wrong(tmp_path, capsys, arguments, message):
     captured = capsys.readouterr().err
     assert message in captured and captured.count("\n") == 1
     assert not (tmp_path / "policy.safetensors").exists()
+
+
+def test_frames_of_rounds_that_are_not_done_need_no_environment():
+    """The preset's rounds have surrogate frames, and the room has no field."""
+    train = Train(Path("o"), Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)
+    preset = find_preset("laptop")
+    settings, room = train._settings(preset), bundled_place("room")
+    assert [site.name for site in train._sites(preset, room, settings)] == ["mitsuba"]
+
+
+def test_a_rooms_policy_is_validated_within_its_lane():
+    settings = Train(Path("o"), Path("d"))._settings(find_preset("room"))
+    (route,) = load_routes(bundled_place("room").routes)
+    for chosen in (settings.validation, settings.final):
+        assert departure_limit(route.lane_width_m, chosen.car_width_m) > 0.15
+    assert settings.final.seed != settings.validation.seed
 
 
 def test_train_names_a_missing_scene(tmp_path, capsys):

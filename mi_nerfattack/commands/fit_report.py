@@ -35,14 +35,14 @@ def show_views(bars: StageBars, done: int, total: int) -> None:
 
 
 def check_output(path: Path) -> None:
-    """Raise InputError if a field file could not be written to a path.
+    """Raise InputError if a field or policy could not be written to a path.
 
     Called before the work starts, so that a mistyped path costs no fit.
     """
     from mi_nerfattack.errors import InputError
 
     if path.suffix != ".safetensors":
-        raise InputError(f"{path}: field files end in .safetensors")
+        raise InputError(f"{path}: this file must end in .safetensors")
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: is not a folder; make it first")
     if path.is_dir():

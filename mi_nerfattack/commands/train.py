@@ -150,7 +150,8 @@ class Train:
             self.exposures_ev or preset.weather.exposures_ev,
             self.spp,
         )
-        counts = (settings.frames, settings.dagger_frames, settings.validation_frames)
+        counts = [settings.frames, settings.validation_frames]
+        counts += [settings.dagger_frames] * (settings.dagger_rounds > 0)
         names = {name: None for part in counts for name in part if part[name]}
         names |= dict.fromkeys(self.validate_in)
         return [PlaceSite(name, place, weather) for name in names]
@@ -158,14 +159,15 @@ class Train:
     def _settings(self, preset: Preset) -> ImitationSettings:
         from dataclasses import replace
 
-        from mi_nerfattack.policy.evaluate import EvaluateSettings
         from mi_nerfattack.policy.imitate import ImitationSettings
+        from mi_nerfattack.policy.presets import EVALUATIONS
         from mi_nerfattack.policy.train import TrainSettings
 
         def given(mine: object, its: object) -> object:
             return its if mine is None else mine
 
-        base = EvaluateSettings(runs=self.runs, objects=self.objects)
+        there = EVALUATIONS[preset.place]
+        base = replace(there, runs=self.runs, objects=self.objects)
         chosen: dict = {
             name: given(getattr(self, name), getattr(preset, name))
             for name in (
@@ -187,7 +189,7 @@ class Train:
                 epochs, self.batch, learning_rate=self.learning_rate
             ),
             validation=replace(base, runs=1, objects=0),
-            final=base,
+            final=replace(base, seed=1),  # not the drives that chose the best epoch
         )
 
     def _more(self) -> list[Path]:

@@ -18,7 +18,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.registry import Place, make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_grid
-from mi_nerfattack.policy.adapter import AbstractPolicy
+from mi_nerfattack.policy.adapter import AbstractPolicy, TorchPolicy
 from mi_nerfattack.policy.evaluate import (
     CLEAN,
     EvaluateSettings,
@@ -31,8 +31,10 @@ from mi_nerfattack.policy.evaluate_identity import (
     short_digest,
 )
 from mi_nerfattack.policy.load import load_policy
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.render.camera import from_fov
 from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.report.metrics import Drive, card_figures, departure_limit
 from mi_nerfattack.resumable import read_kept, write_kept
@@ -46,8 +48,8 @@ from mi_nerfattack.versions import versions
 EXPERT = "expert"
 _ARRAYS = ("states", "controls", "cross_track_m", "time_s")
 _REMEDY = "choose another folder for the drives, or remove this one"
-#: The expert sees no image: the smallest are rendered for it.
-_EXPERT_CAMERA_PX = (8, 3)
+#: The expert sees no image: the smallest are rendered for it, of square pixels.
+_EXPERT_CAMERA = from_fov(8, 3, 90.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +226,7 @@ class Opened:
             self.close()
             place, conditions = self._work.place, under.conditions
             if blind:
-                camera = place.camera.resized(*_EXPERT_CAMERA_PX)
-                place = replace(place, camera=camera)
+                place = replace(place, camera=_EXPERT_CAMERA)
                 conditions = replace(conditions, spp=1)
             self._environment = make_environment(under.name, place, conditions)
             self._key = under.label, blind
@@ -329,8 +330,16 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
     """Show a policy a black image for every goal.
 
     Raises:
-        InputError: the camera's image or a goal does not fit.
+        InputError: the camera's image or a goal does not fit, or PilotNet's unit is
+            not the car's.
     """
+    if isinstance(policy, TorchPolicy) and isinstance(policy.module, PilotNet):
+        given, taken = policy.module.unit, place.car.control_unit
+        if given != taken and policy.control_scale == 1:
+            raise InputError(
+                f"policy: gives {given}, the car of the place takes {taken}; evaluate "
+                "a policy of this car, or convert with --control-scale"
+            )
     shape = (1, place.camera.height, place.camera.width, 3)
     image = mi.TensorXf(np.zeros(shape, np.float32))
     for route in routes:

@@ -32,6 +32,8 @@ OnStage = Callable[[str, float, float, str], None]
 
 #: Scattered states and recoveries of the expert.
 CLONING = Mixture((Scattered(), ExpertDrives()), (0.7, 0.3))
+#: Added to the seed of held-out frames; more than there are rounds.
+_HELD_OUT = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class ImitationSettings:
         dagger_rate: learning rate of these.
         expert_share: of the control periods of a round in which the expert drives.
         horizon: control periods of a drive of a round.
-        seed: of everything; overrides those of the settings below.
+        seed: of everything but the closed-loop drives; overrides those of `collecting`
+            and `training`.
         validate_every: epochs from one validation in the closed loop to the next.
         validate_in: names of the sites of these validations; none: all.
         cloning: source of the first collection's states.
@@ -129,7 +132,9 @@ def imitate(
     _check(sites, routes, settings, more)
     run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
     shards = [*more, *run.collect("round_0", settings.frames, settings.cloning, 0)]
-    held_out = run.collect("held_out", settings.validation_frames, settings.cloning, 7)
+    held_out = run.collect(
+        "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
+    )
     torch.manual_seed(settings.seed)
     car = sites[0].car
     module = PilotNet(len(routes), car.max_control, car.control_unit)
@@ -285,7 +290,7 @@ def _check(
     """Raise `InputError` for what cannot be trained."""
     names = [site.name for site in sites]
     wanted = {**settings.frames, **settings.dagger_frames, **settings.validation_frames}
-    if unknown := sorted(set(wanted) - set(names)):
+    if unknown := sorted({*wanted, *settings.validate_in} - set(names)):
         raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
     goals = sorted(route.goal for route in routes)
     frames = sum(settings.frames.values())

@@ -110,20 +110,30 @@ class Roadside:
 
 
 def scene_ground(scene: Any, highest_m: float = 0.3) -> Ground:
-    """Return the ground of a Mitsuba scene with z up.
+    """Return the ground of a Mitsuba scene with z up; of a room, below its ceiling.
 
     Args:
         scene: `mi.Scene`.
         highest_m: what is higher, or has no surface, counts as occupied, metres.
     """
+    box = scene.bbox()
+    sides = [np.linspace(box.min[i], box.max[i], 18)[1:-1] for i in range(2)]
+    seen = _first_below(scene, np.stack(np.meshgrid(*sides), -1).reshape(-1, 2), 100.0)
+    # a ceiling is above all places
+    top = float(seen.min()) - 0.1 if seen.min() > highest_m else 100.0
 
     def height(points: np.ndarray) -> np.ndarray:
-        x, y = (mi.Float(np.asarray(points[:, i], np.float32)) for i in range(2))
-        ray = mi.Ray3f(mi.Point3f(x, y, 100.0), mi.Vector3f(0, 0, -1))
-        z = 100.0 - scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
+        z = _first_below(scene, points, top)
         return np.where(np.isfinite(z) & (z < highest_m), z, np.nan)
 
     return height
+
+
+def _first_below(scene: Any, points: np.ndarray, top: float) -> np.ndarray:
+    """Return the first surface (n,) below a height at points (n, 2); -inf for none."""
+    x, y = (mi.Float(np.asarray(points[:, i], np.float32)) for i in range(2))
+    ray = mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1))
+    return top - scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
 
 
 def cut_normal(

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.collect import CollectSettings
+from mi_nerfattack.policy.evaluate import EvaluateSettings
 from mi_nerfattack.policy.placement import Roadside, Scatter
 from mi_nerfattack.policy.sites import ANY_WEATHER, Weather
 
@@ -39,13 +43,17 @@ class Preset:
     collecting: CollectSettings = field(default_factory=CollectSettings)
 
 
+#: Beside the small car's track. Places are cleared for half a full-size car, 0.9 m,
+#: 0.75 m more than half of the small one: 5 cm are left beside it.
+_ROOM_ROADSIDE = Roadside((0.15, 0.4), (0.4, 0.9), clearance_m=0.05 - 0.75)
+
 #: The small car's track: a tenth of the lengths of the intersection.
 _ROOM = CollectSettings(
     spread_m=0.3,
     ahead_m=(0.8, 2.5),
     margin_m=0.2,
     scatter=Scatter(lateral_sd_m=0.08, lateral_max_m=0.2),
-    roadside=Roadside(height_m=(0.15, 0.4), lateral_m=(0.4, 0.9)),
+    roadside=_ROOM_ROADSIDE,
 )
 
 #: Presets by name. "intersection" and "room" have the figures of appendix B.3 and B.4;
@@ -69,6 +77,17 @@ PRESETS: Mapping[str, Preset] = {
         epochs=10,
         weather=Weather(exposures_ev=ANY_WEATHER.exposures_ev),
         collecting=_ROOM,
+    ),
+}
+
+#: Starts, objects and widths of closed-loop drives, by bundled place.
+EVALUATIONS: Mapping[str, EvaluateSettings] = {
+    "intersection": EvaluateSettings(),
+    "room": EvaluateSettings(
+        scatter=Scatter(0.03, 0.09, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0),
+        ahead_m=(0.8, 0.5),
+        car_width_m=SMALL_CAR.width,
+        roadside=_ROOM_ROADSIDE,
     ),
 }
 

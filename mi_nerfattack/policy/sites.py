@@ -135,8 +135,8 @@ class PlaceSite(AbstractSite):
             )
         if self.name == SURROGATE and self.place.field is None:
             raise InputError(
-                f"frames of {SURROGATE!r}: the place has no field; make one with "
-                "'mi-nerfattack fit' and give it, or want no such frames"
+                f"environment {SURROGATE!r}: the place has no field; make one with "
+                "'mi-nerfattack fit' and give it, or leave this environment out"
             )
 
     @property

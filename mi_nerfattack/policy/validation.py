@@ -128,7 +128,7 @@ def route_errors(card: Mapping[str, Any]) -> dict[str, float]:
 
 
 def count_departures(card: Mapping[str, Any]) -> int:
-    """Return the number of steps or drives that a card counts as departures."""
+    """Return the number of drives of a card that left their lane."""
     return sum(
         figures["departures"]
         for routes in card.values()
