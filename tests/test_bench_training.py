@@ -41,7 +41,7 @@ def test_errors_are_averaged_by_seed():
     assert cloning["mean_m"] == pytest.approx(0.3)
     assert cloning["standard_error_m"] == pytest.approx(0.1 / np.sqrt(3))
     assert document["arms"]["DAgger"]["standard_error_m"] == 0
-    assert (document["frames"], document["gradient_steps"]) == (2304, 792)
+    assert (document["frames"], document["gradient_steps"]) == (1536, 528)
 
 
 def test_figure_shows_both_sides(tmp_path):
@@ -58,7 +58,7 @@ def test_results_of_other_settings_are_refused(tmp_path):
     dagger._claim(tmp_path, dagger.Settings())
     dagger._claim(tmp_path, dagger.Settings())
     with pytest.raises(InputError, match=r"settings.json: results of other settings"):
-        dagger._claim(tmp_path, dagger.Settings(runs=3))
+        dagger._claim(tmp_path, dagger.Settings(runs=4))
 
 
 def test_ratio_is_that_of_the_medians(monkeypatch):
