@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +26,8 @@ from mi_nerfattack.vehicle.route import Route
 #: Called with steps done and steps wanted, of all drives.
 OnSteps = Callable[[int, int], None]
 
-CLEAN, RANDOM_OBJECTS = "clean", "random_objects"
+#: Cases of a card, and that of the expert's drives, which is none of its own there.
+CLEAN, RANDOM_OBJECTS, EXPERT = "clean", "random_objects", "expert"
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
 STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
 
@@ -271,17 +272,41 @@ def card(
         {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}} of JSON types,
         in the order of the drives; the figures are those of `card_figures`.
     """
-    limits = {
-        route.name: departure_limit(route.lane_width_m, car_width_m) for route in routes
-    }
     groups: dict[tuple[str, str, str], list[Drive]] = {}
     for item in drives:
         groups.setdefault((item.environment, item.route, item.case), []).append(item)
-    result: dict[str, Any] = {}
-    for (environment, route, case), group in groups.items():
+    return make_card(groups, departure_limits(routes, car_width_m))
+
+
+def departure_limits(routes: Sequence[Route], car_width_m: float) -> dict[str, float]:
+    """Return the departure limit of each route by its name, metres."""
+    return {
+        route.name: departure_limit(route.lane_width_m, car_width_m) for route in routes
+    }
+
+
+def make_card(
+    drives: Mapping[tuple[str, str, str], Sequence[Drive]],
+    limits: Mapping[str, float],
+) -> dict[str, Any]:
+    """Summarise drives, and set the expert's figures beside the policy's.
+
+    Args:
+        drives: by environment, route and case.
+        limits: departure limit of each route, metres.
+    """
+    card: dict[str, Any] = {}
+    for (label, route, case), group in drives.items():
+        if case == EXPERT:
+            continue
         figures = card_figures(group, limits[route])
-        result.setdefault(environment, {}).setdefault(route, {})[case] = figures
-    return result
+        expert = drives.get((label, route, EXPERT))
+        if case == CLEAN and expert is not None:
+            seen = card_figures(expert, limits[route])
+            names = ("n", "cross_track_mean_m", "cross_track_max_m", "departures")
+            figures["expert"] = {name: seen[name] for name in names}
+        card.setdefault(label, {}).setdefault(route, {})[case] = figures
+    return card
 
 
 @contextmanager

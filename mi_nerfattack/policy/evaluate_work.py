@@ -21,9 +21,12 @@ from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.adapter import AbstractPolicy, TorchPolicy
 from mi_nerfattack.policy.evaluate import (
     CLEAN,
+    EXPERT,
     EvaluateSettings,
     ExpertPolicy,
+    departure_limits,
     evaluate_run,
+    make_card,
 )
 from mi_nerfattack.policy.evaluate_identity import (
     EnvironmentUnder,
@@ -36,7 +39,7 @@ from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.render.camera import from_fov
 from mi_nerfattack.render.scene import load_scene
-from mi_nerfattack.report.metrics import Drive, card_figures, departure_limit
+from mi_nerfattack.report.metrics import Drive
 from mi_nerfattack.resumable import read_kept, write_kept
 from mi_nerfattack.scenario import resolve
 from mi_nerfattack.sections import PolicySection
@@ -44,8 +47,6 @@ from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
 from mi_nerfattack.versions import versions
 
-#: Case of the drives of the expert, which is no case of the card.
-EXPERT = "expert"
 _ARRAYS = ("states", "controls", "cross_track_m", "time_s")
 _REMEDY = "choose another folder for the drives, or remove this one"
 #: The expert sees no image: the smallest are rendered for it, of square pixels.
@@ -297,33 +298,8 @@ def run_evaluation(
         drives.setdefault((label, job.route.name, job.case), []).append(item[0])
         seconds.setdefault((label, job.case), []).append(item[1])
     means = {key: sum(values) / len(values) for key, values in seconds.items()}
-    width = work.settings.car_width_m
-    limits = {r.name: departure_limit(r.lane_width_m, width) for r in work.routes}
+    limits = departure_limits(work.routes, work.settings.car_width_m)
     return Evaluation(make_card(drives, limits), drives, means)
-
-
-def make_card(
-    drives: Mapping[tuple[str, str, str], Sequence[Drive]],
-    limits: Mapping[str, float],
-) -> dict[str, Any]:
-    """Summarise drives, and set the expert's figures beside the policy's.
-
-    Args:
-        drives: by environment, route and case.
-        limits: departure limit of each route, metres.
-    """
-    card: dict[str, Any] = {}
-    for (label, route, case), group in drives.items():
-        if case == EXPERT:
-            continue
-        figures = card_figures(group, limits[route])
-        expert = drives.get((label, route, EXPERT))
-        if case == CLEAN and expert is not None:
-            seen = card_figures(expert, limits[route])
-            names = ("n", "cross_track_mean_m", "cross_track_max_m", "departures")
-            figures["expert"] = {name: seen[name] for name in names}
-        card.setdefault(label, {}).setdefault(route, {})[case] = figures
-    return card
 
 
 def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) -> None:
