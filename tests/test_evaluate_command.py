@@ -26,6 +26,7 @@ from mi_nerfattack.deploy.registry import (
 )
 from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.training_record import training_record
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
 
@@ -116,6 +117,23 @@ def test_an_interrupted_evaluation_continues(place, capsys, monkeypatch):
     assert cli.main([*place, "--json", "--drives", "kept"]) == 0
     assert steps == 100 + 3 * 76
     capsys.readouterr()
+
+
+def test_drives_without_objects_are_announced(place, capsys):
+    assert cli.main([*place, "--horizon", "3"]) == 0
+    assert "no drives past objects" in capsys.readouterr().err
+    assert cli.main([*place, "--horizon", "3", "--objects", "0"]) == 0
+    assert "no drives past objects" not in capsys.readouterr().err
+
+
+def test_a_damaged_record_is_found_before_the_first_drive(place, capsys):
+    PilotNet(1, 0.6, "rad/s").save("net.safetensors")
+    Path("net.json").write_text("{")
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = "net.safetensors"
+    assert cli.main([*place, "--page", "out"]) == 2
+    assert "net.json" in capsys.readouterr().err
+    assert not Path("runs").exists()
 
 
 def test_conditions_are_rows_of_their_own(place, capsys):
@@ -238,15 +256,14 @@ def test_bad_options_are_one_message(place, capsys, change, message):
 def test_an_environment_that_is_not_installed_is_one_message(
     place, capsys, monkeypatch
 ):
+    """And before anything is driven in the environments named before it."""
     monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    monkeypatch.delitem(
-        sys.modules, "mi_nerfattack.deploy.mujoco_vehicle", raising=False
-    )
-    assert cli.main([*place, "--environments", "mujoco"]) == 2
+    monkeypatch.setitem(sys.modules, "carla", None)
+    assert cli.main([*place, "--environments", "mitsuba", "carla"]) == 2
     errors = capsys.readouterr().err
-    assert "pip install" in errors and "mujoco" in errors
-    assert "Traceback" not in errors
+    assert "pip install" in errors and "carla" in errors
+    assert "Traceback" not in errors and "step" not in errors
+    assert not list(Path("runs").rglob("*.safetensors"))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -88,14 +88,17 @@ class Evaluate:
             files.make_folder(self.page)
         variant.ensure()
         work, workers = self._work(), self._workers()
+        record = None if self.page is None else work.record()
         start = time.monotonic()
         with StageBars() as bars:
             bars.say(f"drives are kept in {work.folder}")
+            if self.objects and not work.place.objects:
+                bars.say("no drives past objects: the scene needs its --object FILE")
             found = run_evaluation(work, workers, _Progress(bars).show)
         if self.output is not None:
             files.write_json(self.output, found.card)
         if self.page is not None:
-            self._write_page(self.page, work, found, time.monotonic() - start)
+            self._write_page(self.page, work, record, found, time.monotonic() - start)
         if self.json:
             print(json.dumps(found.card, allow_nan=False))
         else:
@@ -103,7 +106,12 @@ class Evaluate:
         return 0
 
     def _write_page(
-        self, folder: Path, work: EvaluateWork, found: Evaluation, wall_s: float
+        self,
+        folder: Path,
+        work: EvaluateWork,
+        record: dict[str, Any] | None,
+        found: Evaluation,
+        wall_s: float,
     ) -> None:
         from mi_nerfattack.report.policy_page import write_policy_page
 
@@ -116,7 +124,7 @@ class Evaluate:
                 for (environment, case), seconds in found.seconds.items()
             },
         }
-        path = write_policy_page(folder, about, work.record(), found.card, found.drives)
+        path = write_policy_page(folder, about, record, found.card, found.drives)
         print(f"{path}: written", file=sys.stderr)
 
     def _work(self) -> EvaluateWork:

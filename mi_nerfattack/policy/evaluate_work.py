@@ -281,6 +281,9 @@ def run_evaluation(
     found = [work.read(job) for job in jobs]
     left = [index for index, item in enumerate(found) if item is None]
     done, total = sum(steps) - sum(steps[index] for index in left), sum(steps)
+    # what cannot be made is told now, not after the hours of those before it
+    for under in dict.fromkeys(jobs[index].environment for index in left):
+        make_environment(under.name, work.place, under.conditions).close()
 
     def count(units: int) -> None:
         nonlocal done
