@@ -326,3 +326,20 @@ def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
     assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
     assert cli.main([*place, "--goals", "3"]) == 2
     assert "mine.toml: says itself" in capsys.readouterr().err
+
+
+def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
+    text = '[policy]\nkind = "callable"\nfile = "seen.py:drive"\n[camera]\n'
+    Path("mine.toml").write_text(text + "width = 40\nheight = 20\nfov_x_deg = 60.0\n")
+    Path("seen.py").write_text(
+        "def drive(image, goal, step):\n"
+        "    assert image.shape[1:] == (3, 20, 40), image.shape\n"
+        "    return [0.0] * len(image)\n"
+    )
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = "mine.toml"
+    assert cli.main([*place, "--horizon", "2"]) == 0
+    Path("mine.toml").write_text(text + "width = 0\n")
+    capsys.readouterr()
+    assert cli.main([*place, "--horizon", "2"]) == 2
+    assert "mine.toml: camera.width: " in capsys.readouterr().err

@@ -15,6 +15,7 @@ from mi_nerfattack.commands.evaluate_options import (
     PlaceOptions,
     PolicyOptions,
     parse_conditions,
+    policy_camera,
 )
 from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.errors import InputError
@@ -39,7 +40,8 @@ class Evaluate:
 
     policy: tyro.conf.Positional[str | None] = None
     """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
-    file with a section [policy] as a scenario has; the bundled one by default."""
+    file with the sections [policy] and, for a camera of its own, [camera] of a
+    scenario; the bundled policy by default."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
     """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla."""
     routes: tuple[str, ...] = ()
@@ -134,7 +136,9 @@ class Evaluate:
         from mi_nerfattack.policy.load import load_policy
 
         section, base = self.options.section(self.policy)
-        place = self.where.build()
+        place, seen = self.where.build(), policy_camera(self.policy)
+        if seen is not None:
+            place = replace(place, camera=seen[0], mount=seen[1])
         routes, under = self._routes(place.routes), self._environments()
         settings = self._settings()
         check_policy(load_policy(section, base), place, routes)

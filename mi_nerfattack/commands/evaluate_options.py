@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.registry import Place
     from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
-    from mi_nerfattack.sections import PolicySection
+    from mi_nerfattack.render.camera import Camera, CameraMount
+    from mi_nerfattack.sections import PolicySection, Section
 
+_Section = TypeVar("_Section", bound="Section")
 #: The policy that is evaluated where none is given.
 BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 
@@ -74,13 +76,19 @@ class PolicyOptions:
         Raises:
             InputError: an option does not fit, or the TOML file is not usable.
         """
-        if policy is not None and policy.lower().endswith(".toml"):
+        from mi_nerfattack.sections import PolicySection
+
+        if _is_toml(policy):
             if self != PolicyOptions():
                 raise InputError(
                     f"{policy}: says itself how the policy is called; leave out "
                     "--kind, --weights-file, --goal, --goals, --control-scale, --column"
                 )
-            return _read_section(Path(policy)), Path(policy).parent
+            values = _read_toml(policy).get("policy")
+            if not isinstance(values, dict):
+                raise InputError(f"{policy}: has no section [policy]")
+            section = _checked(f"{policy}: policy", PolicySection, values)
+            return section, Path(policy).parent
         chosen = policy or BUNDLED_POLICY
         values = {
             "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
@@ -91,7 +99,7 @@ class PolicyOptions:
             "control_scale": self.control_scale,
             "output": self.column,
         }
-        return _checked(chosen, values), Path()
+        return _checked(f"{chosen}: policy", PolicySection, values), Path()
 
 
 def parse_conditions(
@@ -123,26 +131,43 @@ def parse_conditions(
     return tuple(found)
 
 
-def _read_section(path: Path) -> PolicySection:
+def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
+    """Return the camera that a policy's TOML file describes, where it describes one.
+
+    Args:
+        policy: as given to `PolicyOptions.section`.
+
+    Raises:
+        InputError: the section [camera] is not usable.
+    """
+    from mi_nerfattack.attack.world import build_camera
+    from mi_nerfattack.sections import CameraSection
+
+    values = _read_toml(policy).get("camera") if _is_toml(policy) else None
+    if values is None:
+        return None
+    return build_camera(_checked(f"{policy}: camera", CameraSection, values))
+
+
+def _is_toml(policy: str | None) -> TypeGuard[str]:
+    return policy is not None and policy.lower().endswith(".toml")
+
+
+def _read_toml(policy: str) -> dict[str, Any]:
     from mi_nerfattack import files
 
-    values = files.read_toml(path).get("policy")
-    if not isinstance(values, dict):
-        raise InputError(f"{path}: has no section [policy]")
-    return _checked(str(path), values)
+    return files.read_toml(Path(policy))
 
 
-def _checked(name: str, values: dict[str, object]) -> PolicySection:
+def _checked(name: str, model: type[_Section], values: object) -> _Section:
+    """Return a section of a scenario; `name` is its file's and its own."""
     from pydantic import ValidationError
 
-    from mi_nerfattack.sections import PolicySection
-
     try:
-        return PolicySection.model_validate_json(json.dumps(values, default=str))
+        return model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as err:
         first = err.errors()[0]
         location = [str(part) for part in first["loc"]]
         if first["type"] == "keys":
             location.append(str(first.get("ctx", {})["key"]))
-        key = ".".join(["policy", *location])
-        raise InputError(f"{name}: {key}: {first['msg']}") from err
+        raise InputError(f"{'.'.join([name, *location])}: {first['msg']}") from err
