@@ -45,7 +45,7 @@ from mi_nerfattack.scenario import resolve
 from mi_nerfattack.sections import PolicySection
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
-from mi_nerfattack.versions import versions
+from mi_nerfattack.versions import environment_versions, versions
 
 _ARRAYS = ("states", "controls", "cross_track_m", "time_s")
 _REMEDY = "choose another folder for the drives, or remove this one"
@@ -165,7 +165,14 @@ class EvaluateWork(AbstractWork):
                 for c in (under.conditions,)
             },
             "settings": asdict(self.settings),
-            "versions": versions(),
+            "versions": {
+                **versions(),
+                **{
+                    package: version
+                    for under in self.environments
+                    for package, version in environment_versions(under.name).items()
+                },
+            },
         }
 
     def record(self) -> dict[str, Any] | None:
