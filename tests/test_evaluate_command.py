@@ -14,6 +14,7 @@ from roadside import (
     Grey,
     PaintedEnvironment,
     PaintedSite,
+    small_grid,
 )
 
 from mi_nerfattack import cli, files
@@ -24,6 +25,7 @@ from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.deploy.registry import (
     make_environment,
 )
+from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.imitate import ImitationSettings
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -253,13 +255,29 @@ def test_bad_options_are_one_message(place, capsys, change, message):
     assert not list(Path().rglob("*.safetensors"))
 
 
+def test_routes_that_cannot_be_measured_are_told_before_the_first_drive(
+    place, capsys, monkeypatch
+):
+    monkeypatch.setattr(evaluate_work, "make_environment", None)  # nothing is driven
+    narrow = {"straight": {**ROUTES["straight"], "lane_width_m": 1.7}}
+    files.write_json("routes.json", narrow)
+    assert cli.main(place) == 2
+    assert "route 'straight': car_width_m, lane_width_m: 1.8" in capsys.readouterr().err
+    short = {"straight": {**ROUTES["straight"], "points_m": [[0, 0], [9, 0]]}}
+    files.write_json("routes.json", short)
+    save_field("box.safetensors", small_grid())
+    assert cli.main([*place, "--object", "box.safetensors"]) == 2
+    assert "on route 'straight' of 9.0 m" in capsys.readouterr().err
+
+
 def test_an_environment_that_is_not_installed_is_one_message(
     place, capsys, monkeypatch
 ):
     """And before anything is driven in the environments named before it."""
     monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
     monkeypatch.setitem(sys.modules, "carla", None)
-    assert cli.main([*place, "--environments", "mitsuba", "carla"]) == 2
+    town = ["--server", "127.0.0.1:2000/Town01", "--workers", "1"]
+    assert cli.main([*place, "--environments", "mitsuba", "carla", *town]) == 2
     errors = capsys.readouterr().err
     assert "pip install" in errors and "carla" in errors
     assert "Traceback" not in errors and "step" not in errors

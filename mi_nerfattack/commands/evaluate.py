@@ -65,7 +65,8 @@ class Evaluate:
     options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
     """How the policy is called."""
     workers: int | None = None
-    """Processes that drive; one a core by default. 1 drives in this process."""
+    """Processes that drive; one a core by default. 1 drives in this process, as carla
+    always does."""
     drives: Path = Path("runs/evaluate")
     """Folder of finished drives; those of other evaluations can be in it, too."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -95,7 +96,8 @@ class Evaluate:
         with StageBars() as bars:
             bars.say(f"drives are kept in {work.folder}")
             if self.objects and not work.place.objects:
-                bars.say("no drives past objects: the scene needs its --object FILE")
+                town = "a town its --scene, " * (self.where.server is not None)
+                bars.say(f"no drives past objects: {town}a scene its --object FILE")
             found = run_evaluation(work, workers, _Progress(bars).show)
         if self.output is not None:
             files.write_json(self.output, found.card)
@@ -136,11 +138,11 @@ class Evaluate:
         from mi_nerfattack.policy.load import load_policy
 
         section, base = self.options.section(self.policy)
+        under = self._environments()
         place, seen = self.where.build(), policy_camera(self.policy)
         if seen is not None:
             place = replace(place, camera=seen[0], mount=seen[1])
-        routes, under = self._routes(place.routes), self._environments()
-        settings = self._settings()
+        routes, settings = self._routes(place.routes), self._settings()
         check_policy(load_policy(section, base), place, routes)
         identities = identify(section, base, place, under, routes, settings)
         return EvaluateWork(
@@ -178,6 +180,7 @@ class Evaluate:
                     f"--environments: {name!r}; one of {', '.join(known)} (a recording "
                     "does not answer to a policy)"
                 )
+        self.where.check(self.environments)
         return parse_conditions(self.environments, self.conditions, self.spp)
 
     def _workers(self) -> AbstractWorkers:
@@ -187,7 +190,8 @@ class Evaluate:
             available_cores,
         )
 
-        count = available_cores() if self.workers is None else self.workers
+        default = 1 if "carla" in self.environments else available_cores()
+        count = default if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
 
 

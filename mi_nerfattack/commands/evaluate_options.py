@@ -35,6 +35,39 @@ class PlaceOptions:
     object: tuple[Path, ...] = ()
     """Grid fields that stand beside the road with random textures; the bundled place's
     by default."""
+    server: str | None = None
+    """Server of carla, and the town of --routes-file: HOST:PORT/TOWN."""
+
+    def check(self, environments: tuple[str, ...]) -> None:
+        """Check that what CARLA needs is given, and only for CARLA.
+
+        Args:
+            environments: their names.
+
+        Raises:
+            InputError: the server's town, its routes or its scene is missing, or the
+                server is of no use.
+        """
+        from mi_nerfattack.deploy.carla_session import CarlaServer
+
+        if "carla" not in environments:
+            if self.server is not None:
+                raise InputError(
+                    f"--server: {self.server!r}; only the environment carla has one: "
+                    "name it in --environments"
+                )
+            return
+        town = CarlaServer.parse(self.server).town if self.server else None
+        if town is None or self.routes_file is None:
+            raise InputError(
+                "--environments: carla drives along routes of a town; give --server "
+                "HOST:PORT/TOWN and --routes-file (deploy.carla_route makes routes)"
+            )
+        if self.scene is None and (len(environments) > 1 or self.object):
+            raise InputError(
+                "--environments: carla beside others, or past objects, needs the "
+                "town's --scene: the bundled ones are elsewhere"
+            )
 
     def build(self) -> Place:
         """Return the place; camera and car are those of the bundled one."""
@@ -45,11 +78,14 @@ class PlaceOptions:
             if self.routes_file is None:
                 raise InputError(f"--scene: {self.scene}; it needs its --routes-file")
             place = replace(place, scene=self.scene, field=None, objects=())
+        elif self.server is not None:  # where the ground of a town is nobody knows
+            place = replace(place, field=None, objects=())
         return replace(
             place,
             field=self.field or place.field,
             routes=self.routes_file or place.routes,
             objects=self.object or place.objects,
+            server=self.server or place.server,
         )
 
 
