@@ -43,7 +43,8 @@ class Evaluate:
     file with the sections [policy] and, for a camera of its own, [camera] of a
     scenario; the bundled policy by default."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
-    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla."""
+    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla (needs --server and
+    --routes-file)."""
     routes: tuple[str, ...] = ()
     """Routes by name; all by default."""
     runs: int = 20
