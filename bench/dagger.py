@@ -17,7 +17,7 @@ from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.collect import CollectSettings, collect
 from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.evaluate import CLEAN, EvaluateSettings, evaluate_run
-from mi_nerfattack.policy.imitate import CLONING
+from mi_nerfattack.policy.imitate_settings import CLONING
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.sites import PlaceSite, Weather, as_json, load_routes
 from mi_nerfattack.policy.sources import PolicyDrives

@@ -189,7 +189,7 @@ def test_a_training_writes_down_its_data_and_settings(tmp_path):
     files.write_json(shard / "shard.json", {"frames": 12})
     settings = ImitationSettings({"painted": 12}, seed=5)
     record = training_record(settings, [PaintedSite()], tmp_path, [shard], "train it")
-    assert record["data"] == {"round_0/painted": 12, "earlier/painted": 12}
+    assert record["data"] == {"round_0/painted": 12}
     nothing = training_record(settings, [], tmp_path / "empty", [shard], "")
     assert nothing["data"] == {"earlier/painted": 12}
     facts = training_facts({"schema": 2, **record})
