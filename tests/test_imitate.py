@@ -233,7 +233,7 @@ def test_presets_have_the_figures_of_the_paper():
         ),
         (
             {"final": dataclasses.replace(DRIVE, objects=1, ahead_m=(37.0, 2.0))},
-            "route 'straight': 40.0 m; at least 41.0 m to drive past objects",
+            "on route 'straight' of 40.0 m, objects 1 of 1; the route must be longer",
         ),
     ],
 )

@@ -14,12 +14,13 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.collect import OnFrames, collect
 from mi_nerfattack.policy.dataset import FrameDataset, divide_shards
+from mi_nerfattack.policy.evaluate import check_roadside, departure_limits
 from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.sites import AbstractSite
 from mi_nerfattack.policy.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.policy.train import Progress, fit_policy
-from mi_nerfattack.policy.validation import ClosedLoop, check_drives, rank
+from mi_nerfattack.policy.validation import ClosedLoop, rank
 from mi_nerfattack.policy.workers import AbstractWorkers
 from mi_nerfattack.vehicle.route import Route
 
@@ -267,8 +268,9 @@ def _check(
             "is held out, or give validation_frames"
         )
     for drives in (settings.validation, settings.final):
-        objects = drives.objects > 0 and bool(sites[0].load_objects())
-        check_drives(routes, drives, objects)
+        departure_limits(routes, drives.car_width_m)
+        if drives.objects and (objects := _load_objects(sites[0], drives.objects)):
+            check_roadside(routes, drives, len(objects))
 
 
 def check_camera(site: AbstractSite) -> None:

@@ -11,14 +11,9 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.adapter import TorchPolicy
-from mi_nerfattack.policy.evaluate import (
-    EvaluateSettings,
-    departure_limits,
-    evaluate,
-)
+from mi_nerfattack.policy.evaluate import EvaluateSettings, evaluate
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.placement import Ground
 from mi_nerfattack.vehicle.route import Route
@@ -114,30 +109,6 @@ class ClosedLoop(AbstractValidation):
             "settings": asdict(self.settings),
             "every": self.every,
         }
-
-
-def check_drives(
-    routes: Sequence[Route], settings: EvaluateSettings, objects: bool
-) -> None:
-    """Raise `InputError` for routes too narrow or too short to drive and be measured.
-
-    Args:
-        routes: to drive.
-        settings: of the drives.
-        objects: whether there are any.
-    """
-    first, before = settings.ahead_m
-    least = first + before + settings.margin_m
-    for route in routes:
-        try:
-            departure_limits([route], settings.car_width_m)
-        except InputError as err:
-            raise InputError(f"route {route.name!r}: {err}") from err
-        if objects and settings.objects and route.length < least:
-            raise InputError(
-                f"route {route.name!r}: {route.length:.1f} m; at least {least:.1f} m "
-                "to drive past objects, or objects = 0"
-            )
 
 
 def rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
