@@ -12,7 +12,7 @@ from typing import Any
 from mi_nerfattack.deploy.registry import bundled_place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.collect import CollectSettings, collect
-from mi_nerfattack.policy.imitate import CLONING
+from mi_nerfattack.policy.imitate_settings import CLONING
 from mi_nerfattack.policy.sites import PlaceSite, Weather, load_routes
 from mi_nerfattack.policy.workers import Processes
 

@@ -17,7 +17,7 @@ from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.collect import CollectSettings, collect
 from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.evaluate import CLEAN, EvaluateSettings, evaluate_run
-from mi_nerfattack.policy.imitate import CLONING
+from mi_nerfattack.policy.imitate_settings import CLONING
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.sites import PlaceSite, Weather, as_json, load_routes
 from mi_nerfattack.policy.sources import PolicyDrives
@@ -307,26 +307,31 @@ class _Drives(AbstractWork):
 
 
 def write_figure(path: Path, document: dict[str, Any]) -> None:
-    """Draw the mean error of both arms: bars with standard errors, a dot a seed."""
+    """Draw the errors of both arms: small dots are drives, large ones seeds."""
     with chart(path, 4.2) as figure:
         axes = figure.subplots()
         for place, (arm, colour) in enumerate(zip(ARMS, (BLUE, ORANGE), strict=True)):
             found = document["arms"][arm]
             mean, error = 100 * found["mean_m"], 100 * found["standard_error_m"]
-            axes.bar(place, mean, 0.55, color=colour, alpha=0.35)
-            axes.errorbar(place, mean, error, color="black", capsize=8, linewidth=1.5)
-            seeds = 100 * np.array(found["seeds_m"])
-            offset = np.linspace(-0.12, 0.12, len(seeds)) if len(seeds) > 1 else [0.0]
-            axes.plot(place + np.array(offset), seeds, "o", color=colour)
-            text = f"{mean:.1f} cm\n{found['departures']} departures"
-            axes.annotate(text, (place + 0.3, mean), fontsize=8)
+            ends = np.linspace(place - 0.18, place + 0.18, len(found["seeds_m"]) + 1)
+            across = (ends[:-1] + ends[1:]) / 2
+            drives = 100 * np.array(found["drives_m"])  # (seeds, drives)
+            axes.plot(across, drives, ".", color=colour, alpha=0.4)
+            axes.plot(across, drives.mean(1), "o", color=colour, markersize=8)
+            axes.hlines(mean, place - 0.22, place + 0.22, color="black")
+            text = (
+                f"mean {mean:.1f} cm\nstandard error {error:.1f} cm\n"
+                f"{found['departures']} of {drives.size} drives\n"
+                "left the lane"
+            )
+            axes.annotate(text, (place + 0.25, mean), fontsize=8, va="center")
         axes.set_xticks(range(len(ARMS)), ARMS)
         axes.set_xlim(-0.6, len(ARMS) - 0.2)
-        axes.set_ylim(bottom=0)
-        axes.set_ylabel("mean distance from the lane centre, cm")
+        axes.set_yscale("log")
+        axes.set_ylabel("distance from the lane centre, cm")
         axes.set_title(
             f"{document['frames']} frames and {document['gradient_steps']} gradient "
-            f"steps each; {len(document['settings']['seeds'])} seeds, standard error"
+            f"steps each; {len(document['settings']['seeds'])} seeds"
         )
 
 

@@ -24,3 +24,21 @@ def versions() -> dict[str, str]:
         "llvm": ".".join(map(str, llvm.version() or ())),
         "variant": str(mi.variant()),
     }
+
+
+def environment_versions(name: str) -> dict[str, str]:
+    """Return the versions of packages that one deployment environment needs.
+
+    Args:
+        name: key of `deploy.registry.ENVIRONMENTS`.
+    """
+    found = {}
+    for package in _NEEDED.get(name, ()):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"  # making the environment says so
+    return found
+
+
+_NEEDED = {"mujoco": ("mujoco",), "mujoco_gl": ("mujoco",), "carla": ("carla",)}

@@ -67,6 +67,19 @@ def test_a_route_along_an_opendrive_map_of_the_real_client():
     np.testing.assert_allclose(there.points[-1], in_bend[-1], atol=0.8)
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.499999, 0.5, 0.500001, 0.75])
+@pytest.mark.parametrize("spacing", [0.3, 1.0, 2.0])
+def test_a_way_is_found_from_any_place_of_a_lane(offset, spacing):
+    """Also from 10.5 m, where 11.5 and 12.5 are both rounded to 12."""
+    carla = pytest.importorskip("carla")
+    town, x = carla.Map("bend", OPENDRIVE), 10.0 + offset
+    end, choice = (30.0 + offset, -1.75), {"spacing_m": spacing}
+    route = route_from_town(town, carla, (x, -1.0), end=end, **choice)
+    np.testing.assert_allclose(route.points[0], [x, -1.75], atol=1e-3)
+    np.testing.assert_allclose(route.points[-1], end, atol=0.75 * spacing + 1e-3)
+    assert route.length == pytest.approx(20.0, abs=0.75 * spacing + 1e-3)
+
+
 def _road(number: int, geometry: str, length: float, link: str, lane_link: str) -> str:
     return f"""<road name="r{number}" length="{length}" id="{number}" junction="-1">
 <link>{link}</link><planView>{geometry}</planView><elevationProfile/>

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
+import dataclasses
 import json
 from pathlib import Path
 
@@ -233,6 +234,8 @@ def test_folder_of_other_settings_is_refused(site, weights, tmp_path):
         again(seed=6)
     with pytest.raises(InputError, match="differ in expert, routes"):
         again(routes=[bent()])
+    with pytest.raises(InputError, match="differ in routes"):  # where drives end
+        again(routes=[dataclasses.replace(straight(), lane_width_m=3.0)])
     with pytest.raises(InputError, match="differ in site"):
         again(site=PaintedSite(size_px=(4, 4)))
     with pytest.raises(InputError, match="differ in source"):

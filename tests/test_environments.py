@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import pickle
 import sys
-import types
 from dataclasses import replace
 
 import drjit as dr
@@ -292,6 +291,7 @@ def test_conditions_and_place_are_checked(tmp_path):
     place = write_place(tmp_path)
     for change, message in (
         ({"spp": 0}, "spp: 0; at least 1"),
+        ({"spp": 2.5}, "spp: 2.5; at least 1 sample per pixel, whole"),
         ({"exposure_ev": math.inf}, "exposure_ev: inf; must be finite"),
     ):
         with pytest.raises(InputError, match=message):
@@ -335,20 +335,20 @@ def test_environments_that_cannot_be_made(tmp_path, monkeypatch):
         make_environment("mitsuba", missing)
 
 
-class Broken(types.ModuleType):
-    """A module whose import ends in an error of its own."""
-
-    def __getattr__(self, name):
-        raise RuntimeError("invalid value")
-
-
 @pytest.mark.parametrize("name", ["mujoco", "mujoco_gl"])
 def test_mujoco_that_cannot_be_imported(name, tmp_path, monkeypatch):
-    place, module = write_place(tmp_path), "mi_nerfattack.deploy.mujoco_vehicle"
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=f"'{name}': .*not installed; pip install muj"):
+    place = write_place(tmp_path)
+    for loaded in list(sys.modules):
+        if loaded.startswith(
+            ("mi_nerfattack.deploy.mujoco", "mi_nerfattack.deploy.mj")
+        ):
+            monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match="mujoco is not installed; pip install mujoco"):
         make_environment(name, place)
-    monkeypatch.setitem(sys.modules, module, Broken(module))
+    monkeypatch.delitem(sys.modules, "mujoco")
+    (tmp_path / "mujoco.py").write_text("raise RuntimeError('invalid value')")
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "bogus")
     with pytest.raises(InputError, match="MUJOCO_GL=bogus .invalid value.; unset it"):
         make_environment(name, place)

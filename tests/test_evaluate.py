@@ -211,6 +211,35 @@ def test_evaluate_drives_everything_and_counts_steps():
     assert card_table(found).row_count == 8
 
 
+def test_an_environment_has_any_name():
+    settings = EvaluateSettings(runs=1, horizon=2)
+    arguments = ([straight()], [], flat_ground, settings)
+    found = evaluate(Counting(), [surrogate("mine")], *arguments)
+    assert found["mine"]["straight"][CLEAN]["n"] == 1
+    assert card_table(found).row_count == 1
+
+
+@pytest.mark.parametrize(
+    ("objects", "change", "message"),
+    [
+        (0, {"car_width_m": 4.0}, "route 'straight': car_width_m, .* 4.0, 3.5"),
+        (1, {"ahead_m": (40.0, 2.0)}, "'left' of 12.0 m.*objects 0"),
+        (1, {"objects": 2}, "objects 2 of 1"),
+    ],
+)
+def test_what_cannot_be_measured_is_told_before_the_first_drive(
+    objects, change, message
+):
+    short = Route("left", 1, np.array([[0.0, 0.0], [12.0, 0.0]]))
+    long = Route("straight", 0, np.array([[0.0, 0.0], [90.0, 0.0]]))
+    policy, settings = Counting(), EvaluateSettings(runs=1, **change)
+    fields = [small_grid() for _ in range(objects)]
+    arguments = ([surrogate()], [long, short], fields, flat_ground, settings)
+    with pytest.raises(InputError, match=message):
+        evaluate(policy, *arguments)
+    assert not policy.seen
+
+
 def test_the_expert_drives_by_the_state():
     environment, route = surrogate(), straight()
     expert = ExpertPolicy(environment, expert_for("rad/s", route, 0.1))

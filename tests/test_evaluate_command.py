@@ -14,6 +14,7 @@ from roadside import (
     Grey,
     PaintedEnvironment,
     PaintedSite,
+    small_grid,
 )
 
 from mi_nerfattack import cli, files
@@ -24,8 +25,10 @@ from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.deploy.registry import (
     make_environment,
 )
+from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.training_record import training_record
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
 
@@ -118,6 +121,23 @@ def test_an_interrupted_evaluation_continues(place, capsys, monkeypatch):
     capsys.readouterr()
 
 
+def test_drives_without_objects_are_announced(place, capsys):
+    assert cli.main([*place, "--horizon", "3"]) == 0
+    assert "no drives past objects" in capsys.readouterr().err
+    assert cli.main([*place, "--horizon", "3", "--objects", "0"]) == 0
+    assert "no drives past objects" not in capsys.readouterr().err
+
+
+def test_a_damaged_record_is_found_before_the_first_drive(place, capsys):
+    PilotNet(1, 0.6, "rad/s").save("net.safetensors")
+    Path("net.json").write_text("{")
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = "net.safetensors"
+    assert cli.main([*place, "--page", "out"]) == 2
+    assert "net.json" in capsys.readouterr().err
+    assert not Path("runs").exists()
+
+
 def test_conditions_are_rows_of_their_own(place, capsys):
     place += ["--horizon", "3", "--conditions", "day", "evening", "noon:+1"]
     assert cli.main([*place, "--json"]) == 0
@@ -169,7 +189,7 @@ def test_a_training_writes_down_its_data_and_settings(tmp_path):
     files.write_json(shard / "shard.json", {"frames": 12})
     settings = ImitationSettings({"painted": 12}, seed=5)
     record = training_record(settings, [PaintedSite()], tmp_path, [shard], "train it")
-    assert record["data"] == {"round_0/painted": 12, "earlier/painted": 12}
+    assert record["data"] == {"round_0/painted": 12}
     nothing = training_record(settings, [], tmp_path / "empty", [shard], "")
     assert nothing["data"] == {"earlier/painted": 12}
     facts = training_facts({"schema": 2, **record})
@@ -235,18 +255,33 @@ def test_bad_options_are_one_message(place, capsys, change, message):
     assert not list(Path().rglob("*.safetensors"))
 
 
+def test_routes_that_cannot_be_measured_are_told_before_the_first_drive(
+    place, capsys, monkeypatch
+):
+    monkeypatch.setattr(evaluate_work, "make_environment", None)  # nothing is driven
+    narrow = {"straight": {**ROUTES["straight"], "lane_width_m": 1.7}}
+    files.write_json("routes.json", narrow)
+    assert cli.main(place) == 2
+    assert "route 'straight': car_width_m, lane_width_m: 1.8" in capsys.readouterr().err
+    short = {"straight": {**ROUTES["straight"], "points_m": [[0, 0], [9, 0]]}}
+    files.write_json("routes.json", short)
+    save_field("box.safetensors", small_grid())
+    assert cli.main([*place, "--object", "box.safetensors"]) == 2
+    assert "on route 'straight' of 9.0 m" in capsys.readouterr().err
+
+
 def test_an_environment_that_is_not_installed_is_one_message(
     place, capsys, monkeypatch
 ):
+    """And before anything is driven in the environments named before it."""
     monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    monkeypatch.delitem(
-        sys.modules, "mi_nerfattack.deploy.mujoco_vehicle", raising=False
-    )
-    assert cli.main([*place, "--environments", "mujoco"]) == 2
+    monkeypatch.setitem(sys.modules, "carla", None)
+    town = ["--server", "127.0.0.1:2000/Town01", "--workers", "1"]
+    assert cli.main([*place, "--environments", "mitsuba", "carla", *town]) == 2
     errors = capsys.readouterr().err
-    assert "pip install" in errors and "mujoco" in errors
-    assert "Traceback" not in errors
+    assert "pip install" in errors and "carla" in errors
+    assert "Traceback" not in errors and "step" not in errors
+    assert not list(Path("runs").rglob("*.safetensors"))
 
 
 @pytest.mark.parametrize(
@@ -309,3 +344,20 @@ def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
     assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
     assert cli.main([*place, "--goals", "3"]) == 2
     assert "mine.toml: says itself" in capsys.readouterr().err
+
+
+def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
+    text = '[policy]\nkind = "callable"\nfile = "seen.py:drive"\n[camera]\n'
+    Path("mine.toml").write_text(text + "width = 40\nheight = 20\nfov_x_deg = 60.0\n")
+    Path("seen.py").write_text(
+        "def drive(image, goal, step):\n"
+        "    assert image.shape[1:] == (3, 20, 40), image.shape\n"
+        "    return [0.0] * len(image)\n"
+    )
+    place = [word for word in place if word not in ("--kind", "callable")]
+    place[1] = "mine.toml"
+    assert cli.main([*place, "--horizon", "2"]) == 0
+    Path("mine.toml").write_text(text + "width = 0\n")
+    capsys.readouterr()
+    assert cli.main([*place, "--horizon", "2"]) == 2
+    assert "mine.toml: camera.width: " in capsys.readouterr().err

@@ -179,6 +179,28 @@ def test_closed_route_has_no_end():
     assert not driving.step(np.zeros(1))[3]
 
 
+def test_a_lane_that_is_no_wider_than_the_car_is_refused(tmp_path):
+    narrow, wide = (Route(str(w), 0, LINE, lane_width_m=w) for w in (0.6, 3.5))
+    message = r"route '0.6': its lane is 0.6 m wide, the vehicle 1.8 m; give the vehi"
+    with pytest.raises(InputError, match=message):
+        DrivingEnv(Blind(), [wide, narrow])
+    with pytest.raises(InputError, match="the vehicle 0.0 m"):
+        DrivingEnv(Blind(), [wide], width=0.0)
+    driving = DrivingEnv(Blind(), [narrow], width=0.3)
+    driving.reset(seed=0)
+    assert not driving.step(np.zeros(1))[2]
+
+
+def test_images_of_a_recording_are_not_resized(tmp_path):
+    place = place_for("replay", tmp_path)
+    own = make_gym("replay", place)
+    camera = own.environment.camera
+    own.close()
+    with pytest.raises(InputError, match="size_px: 5 x 4 px; environment 'replay' has"):
+        make_gym("replay", place, size_px=(5, 4))
+    make_gym("replay", place, size_px=(camera.width, camera.height)).close()
+
+
 def test_bad_input(tmp_path):
     driving = blind()
     with pytest.raises(InputError, match="routes: none; at least one"):

@@ -23,7 +23,8 @@ from mi_nerfattack.policy.dataset import FrameDataset
 from mi_nerfattack.policy.evaluate import EvaluateSettings
 from mi_nerfattack.policy.export_program import export_program
 from mi_nerfattack.policy.exported import load_exported
-from mi_nerfattack.policy.imitate import ImitationSettings, imitate
+from mi_nerfattack.policy.imitate import _check, _load_objects, imitate
+from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.presets import PRESETS, find_preset
 from mi_nerfattack.policy.sites import load_routes
@@ -218,12 +219,50 @@ def test_presets_have_the_figures_of_the_paper():
         ({"frames": {"mitsuba": 0}}, "at least one frame"),
         ({"validate_in": ("moon",)}, "frames: of moon"),
         ({"frames": {"mitsuba": -1}}, "frames: -1 of 'mitsuba'"),
+        ({"validate_every": 0}, "validate_every: 0; a whole number of at least 1"),
+        ({"dagger_epochs": 0}, "dagger_epochs: 0; a whole number of at least 1"),
+        ({"dagger_rounds": -1}, "dagger_rounds: -1; a whole number of at least 0"),
+        ({"dagger_rate": 0.0}, r"dagger_rate: 0.0; in \(0, 1\)"),
+        ({"expert_share": 1.1}, r"expert_share: 1.1; in \[0, 1\]"),
+        ({"dagger_frames": {"mitsuba": 0}}, "dagger_rounds: 1 without dagger_frames"),
+        ({"frames": {"mitsuba": 32}}, "frames: 32, one shard of up to 32; at least"),
+        # a lane of 3.5 m, a route of 40 m
+        (
+            {"final": dataclasses.replace(DRIVE, car_width_m=4.0)},
+            "route 'straight': car_width_m, lane_width_m: 4.0, 3.5",
+        ),
+        (
+            {"final": dataclasses.replace(DRIVE, objects=1, ahead_m=(37.0, 2.0))},
+            "on route 'straight' of 40.0 m, objects 1 of 1; the route must be longer",
+        ),
     ],
 )
 def test_what_cannot_be_trained_is_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         settings = dataclasses.replace(SETTINGS, **change)
         imitate([SITE], ROUTES, settings, tmp_path, HERE)
+    assert not list(tmp_path.iterdir())  # told before the first frame
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": {"mitsuba": 64, "surrogate": 0}},
+        {"dagger_rounds": 0, "dagger_frames": {"surrogate": 8}},
+    ],
+)
+def test_sites_without_frames_need_not_be_there(change):
+    settings = dataclasses.replace(SETTINGS, **change)
+    assert settings.sites == ("mitsuba",)
+    _check([SITE], ROUTES, settings, [])
+
+
+def test_there_are_as_many_objects_as_stand_beside_the_road():
+    assert len(SITE.load_objects()) == 1
+    objects = _load_objects(SITE, 3)
+    assert len({id(item) for item in objects}) == 3
+    assert len(_load_objects(SITE, 0)) == 1
+    assert _load_objects(PaintedSite(objects=False), 2) == []
 
 
 def test_goals_cameras_and_weights_must_fit(tmp_path):
@@ -250,6 +289,12 @@ def run_train(tmp_path, *arguments: str) -> int:
         (["--skies", "dusk"], "sky: 'dusk'"),
         (["--more", "{empty}"], "no frames in it"),
         (["--workers", "0"], "workers: 0"),
+        (["--validate-every", "0"], "validate_every: 0;"),
+        (["--preset", "intersection", "--dagger-rounds", "2"], "without dagger_frames"),
+        (["--scene", "mine.xml"], "--scene: mine.xml; it needs its --routes"),
+        (["--frames", "carla", "64"], "drive in CARLA with 'mi-nerfattack evaluate'"),
+        (["--validate-in", "carla"], "environment: 'carla'; a server answers to one"),
+        (["--frames", "replay", "64"], "a recording does not answer to a policy"),
     ],
 )
 def test_train_says_what_is_wrong(tmp_path, capsys, arguments, message):

@@ -15,7 +15,7 @@ from mi_nerfattack.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.adapter import TorchPolicy
 from mi_nerfattack.policy.augment import Augmentation
-from mi_nerfattack.policy.dataset import FrameDataset, write_shard
+from mi_nerfattack.policy.dataset import FrameDataset, divide_shards, write_shard
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.train import TrainSettings, fit_policy
 
@@ -237,6 +237,30 @@ def test_split_keeps_blocks_together():
     assert set(np.unique(held // 50, return_counts=True)[1]) == {50}
 
 
+def test_shards_are_held_out_by_themselves(tmp_path, rng):
+    shards = [tmp_path / f"{number}" for number in range(60)]
+    for shard in shards:
+        frames, goals, controls = coloured(3, rng)
+        write_shard(shard, frames[:, :2, :2], goals, controls)
+    train, held = divide_shards(shards, 0.25)
+    # 60 draws: 15 are expected, with a standard deviation of 3.4
+    assert 5 <= len(held) <= 25
+    assert sorted(train + held) == sorted(shards)
+    parts = [divide_shards([shard], 0.25) for shard in shards]
+    assert [item for _, part in parts for item in part] == held
+    assert divide_shards(shards, 0.0) == (shards, [])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.999])
+def test_the_first_shards_are_never_all_on_one_side(tmp_path, rng, fraction):
+    shards = [tmp_path / name for name in "abc"]
+    for shard in shards:
+        frames, goals, controls = coloured(3, rng)
+        write_shard(shard, frames[:, :2, :2], goals, controls)
+    train, held = divide_shards(shards, fraction, least=1)
+    assert (len(train), len(held)) == ((2, 1) if fraction == 0 else (1, 2))
+
+
 def test_dataset_errors(tmp_path, rng):
     frames, goals, controls = coloured(4, rng)
     with pytest.raises(InputError, match="as many of each"):
@@ -330,8 +354,13 @@ def test_training_continues_after_an_interruption(data, tmp_path):
     assert continued == history
     for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(InputError, match="other settings or data"):
+    with pytest.raises(InputError, match=r"other settings or data \(settings\)"):
         train(data, dataclasses.replace(SETTINGS, seed=4), checkpoint=path)
+    other = dataclasses.replace(data, frames=tuple(255 - f for f in data.frames))
+    with pytest.raises(InputError, match=r"data \(rows, held_out\)"):
+        train(other, checkpoint=path)
+    with pytest.raises(InputError, match=r"data \(start\)"):
+        fit_policy(PilotNet(), data, SETTINGS, checkpoint=path)
 
 
 def test_training_errors(data):

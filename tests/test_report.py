@@ -60,7 +60,7 @@ def make_document(drives=None):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": "moon"}, "environment: 'moon'"),
+        ({"environment": ""}, "environment: ''; a non-empty name"),
         ({"case": "bayes"}, "case: 'bayes'"),
         ({"route": ""}, "route"),
         ({"run": -1}, "run: -1"),
@@ -101,6 +101,15 @@ def test_step_at_the_limit_has_not_departed():
 
 
 # Metrics
+
+
+def test_environments_of_your_own_come_after_ours():
+    names = ("zoo", "mine", "deployment", "surrogate")
+    drives = [make_drive([0.1], environment=name) for name in names]
+    found = metrics.summarise(drives, LIMITS)["straight"]
+    assert list(found) == ["surrogate", "deployment", "mine", "zoo"]
+    with pytest.raises(InputError, match=r"straight\.mine"):  # an attack has the two
+        make_document(drives)
 
 
 def test_sums_by_hand():
@@ -294,6 +303,15 @@ def test_overhead_of_one_environment_without_object(tmp_path):
     image = files.read_image(tmp_path / "one.png")
     assert image.shape[1] == plots.WIDTH_PX
     assert count(image, YELLOW) == 0
+
+
+def test_overhead_has_a_panel_for_an_environment_of_your_own(tmp_path):
+    drives = [make_drive([0.1, 0.2], name, "unperturbed") for name in ("a", "b")]
+    plots.overhead(tmp_path / "one.png", drives[:1], ROUTE, 3.5, [], 0.85)
+    plots.overhead(tmp_path / "two.png", drives, ROUTE, 3.5, [], 0.85)
+    one, two = (files.read_image(tmp_path / f"{name}.png") for name in ("one", "two"))
+    assert count(two, BLUE) > 0 < count(one, BLUE)
+    assert one.shape != two.shape
 
 
 def test_errors_and_convergence(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.render.scene import load_scene, scene_files
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -63,6 +63,35 @@ def test_files_are_found_beside_the_scene_and_the_resolver_is_put_back(tmp_path)
     with pytest.raises(InputError):
         load_scene(write(tmp_path, shape.replace("quad", "none")))
     assert list(mi.file_resolver()) == before
+
+
+def test_all_files_that_a_scene_names_are_listed(tmp_path):
+    (tmp_path / "parts").mkdir()
+    for name in ("quad.ply", "parts/quad.ply", "sky.exr", "unused.ply"):
+        (tmp_path / name).write_text(QUAD)
+    (tmp_path / "eta.spd").write_text("400 1\n700 1\n")
+    shape = '<shape type="ply"><string name="filename" value="{}"/>{}</shape>'
+    (tmp_path / "parts" / "inner.xml").write_text(
+        f'<scene version="3.0.0">{shape.format("parts/quad.ply", "")}</scene>'
+    )
+    metal = '<bsdf type="conductor"><spectrum name="eta" filename="eta.spd"/></bsdf>'
+    body = (
+        '<default name="mesh" value="quad.ply"/><include filename="parts/inner.xml"/>'
+        '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+        + shape.format("$mesh", metal)
+        + shape.format("missing.ply", "").replace("<shape ", '<shape id="none" ')
+    )
+    before = list(mi.file_resolver())
+    found = scene_files(write(tmp_path, body))
+    names = {path.relative_to(tmp_path.resolve()).as_posix() for path in found}
+    xml = {"scene.xml", "parts/inner.xml"}
+    assert names == {*xml, "quad.ply", "parts/quad.ply", "sky.exr", "eta.spd"}
+    assert len(found) == len(names)
+    assert list(mi.file_resolver()) == before
+    with pytest.raises(InputError, match=r"scene\.xml: .*XML file"):
+        scene_files(write(tmp_path, "<oops"))
+    with pytest.raises(InputError, match="none.xml: does not exist"):
+        scene_files(tmp_path / "none.xml")
 
 
 FIELD = """<integrator type="field_integrator"><volume type="grid_field">

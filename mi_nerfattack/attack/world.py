@@ -25,6 +25,7 @@ from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario import Scenario, resolve
+from mi_nerfattack.sections import CameraSection
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route import Route
 
@@ -118,7 +119,7 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
         )
         for field, item in zip(fields, scenario.objects, strict=True)
     ]
-    camera, mount = build_camera(scenario)
+    camera, mount = build_camera(scenario.camera)
     route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
     dynamics = build_dynamics(scenario.vehicle, base)
     objective = build_objective(scenario, route, dynamics, base)
@@ -194,9 +195,8 @@ def initial_states(
     return route.pose_at(*shifts)
 
 
-def build_camera(scenario: Scenario) -> tuple[Camera, CameraMount]:
+def build_camera(section: CameraSection) -> tuple[Camera, CameraMount]:
     """Make intrinsics and mount."""
-    section = scenario.camera
     camera = from_fov(section.width, section.height, section.fov_x_deg)
     mount = CameraMount(section.height_m, section.forward_m, section.pitch_deg)
     return camera, mount

@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -15,6 +15,7 @@ from mi_nerfattack.commands.evaluate_options import (
     PlaceOptions,
     PolicyOptions,
     parse_conditions,
+    policy_camera,
 )
 from mi_nerfattack.commands.words import command_line
 from mi_nerfattack.errors import InputError
@@ -39,9 +40,11 @@ class Evaluate:
 
     policy: tyro.conf.Positional[str | None] = None
     """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
-    file with a section [policy] as a scenario has; the bundled one by default."""
+    file with the sections [policy] and, for a camera of its own, [camera] of a
+    scenario; the bundled policy by default."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
-    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla."""
+    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla (needs --server and
+    --routes-file)."""
     routes: tuple[str, ...] = ()
     """Routes by name; all by default."""
     runs: int = 20
@@ -63,7 +66,8 @@ class Evaluate:
     options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
     """How the policy is called."""
     workers: int | None = None
-    """Processes that drive; one a core by default. 1 drives in this process."""
+    """Processes that drive; one a core by default. 1 drives in this process, as carla
+    always does."""
     drives: Path = Path("runs/evaluate")
     """Folder of finished drives; those of other evaluations can be in it, too."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -88,14 +92,18 @@ class Evaluate:
             files.make_folder(self.page)
         variant.ensure()
         work, workers = self._work(), self._workers()
+        record = None if self.page is None else work.record()
         start = time.monotonic()
         with StageBars() as bars:
             bars.say(f"drives are kept in {work.folder}")
+            if self.objects and not work.place.objects:
+                town = "a town its --scene, " * (self.where.server is not None)
+                bars.say(f"no drives past objects: {town}a scene its --object FILE")
             found = run_evaluation(work, workers, _Progress(bars).show)
         if self.output is not None:
             files.write_json(self.output, found.card)
         if self.page is not None:
-            self._write_page(self.page, work, found, time.monotonic() - start)
+            self._write_page(self.page, work, record, found, time.monotonic() - start)
         if self.json:
             print(json.dumps(found.card, allow_nan=False))
         else:
@@ -103,7 +111,12 @@ class Evaluate:
         return 0
 
     def _write_page(
-        self, folder: Path, work: EvaluateWork, found: Evaluation, wall_s: float
+        self,
+        folder: Path,
+        work: EvaluateWork,
+        record: dict[str, Any] | None,
+        found: Evaluation,
+        wall_s: float,
     ) -> None:
         from mi_nerfattack.report.policy_page import write_policy_page
 
@@ -116,7 +129,7 @@ class Evaluate:
                 for (environment, case), seconds in found.seconds.items()
             },
         }
-        path = write_policy_page(folder, about, work.record(), found.card, found.drives)
+        path = write_policy_page(folder, about, record, found.card, found.drives)
         print(f"{path}: written", file=sys.stderr)
 
     def _work(self) -> EvaluateWork:
@@ -126,9 +139,11 @@ class Evaluate:
         from mi_nerfattack.policy.load import load_policy
 
         section, base = self.options.section(self.policy)
-        place = self.where.build()
-        routes, under = self._routes(place.routes), self._environments()
-        settings = self._settings()
+        under = self._environments()
+        place, seen = self.where.build(), policy_camera(self.policy)
+        if seen is not None:
+            place = replace(place, camera=seen[0], mount=seen[1])
+        routes, settings = self._routes(place.routes), self._settings()
         check_policy(load_policy(section, base), place, routes)
         identities = identify(section, base, place, under, routes, settings)
         return EvaluateWork(
@@ -166,6 +181,7 @@ class Evaluate:
                     f"--environments: {name!r}; one of {', '.join(known)} (a recording "
                     "does not answer to a policy)"
                 )
+        self.where.check(self.environments)
         return parse_conditions(self.environments, self.conditions, self.spp)
 
     def _workers(self) -> AbstractWorkers:
@@ -175,7 +191,8 @@ class Evaluate:
             available_cores,
         )
 
-        count = available_cores() if self.workers is None else self.workers
+        default = 1 if "carla" in self.environments else available_cores()
+        count = default if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
 
 

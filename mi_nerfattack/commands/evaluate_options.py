@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.registry import Place
     from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
-    from mi_nerfattack.sections import PolicySection
+    from mi_nerfattack.render.camera import Camera, CameraMount
+    from mi_nerfattack.sections import PolicySection, Section
 
+_Section = TypeVar("_Section", bound="Section")
 #: The policy that is evaluated where none is given.
 BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 
@@ -33,6 +35,39 @@ class PlaceOptions:
     object: tuple[Path, ...] = ()
     """Grid fields that stand beside the road with random textures; the bundled place's
     by default."""
+    server: str | None = None
+    """Server of carla, and the town of --routes-file: HOST:PORT/TOWN."""
+
+    def check(self, environments: tuple[str, ...]) -> None:
+        """Check that what CARLA needs is given, and only for CARLA.
+
+        Args:
+            environments: their names.
+
+        Raises:
+            InputError: the server's town, its routes or its scene is missing, or the
+                server is of no use.
+        """
+        from mi_nerfattack.deploy.carla_session import CarlaServer
+
+        if "carla" not in environments:
+            if self.server is not None:
+                raise InputError(
+                    f"--server: {self.server!r}; only the environment carla has one: "
+                    "name it in --environments"
+                )
+            return
+        town = CarlaServer.parse(self.server).town if self.server else None
+        if town is None or self.routes_file is None:
+            raise InputError(
+                "--environments: carla drives along routes of a town; give --server "
+                "HOST:PORT/TOWN and --routes-file (deploy.carla_route makes routes)"
+            )
+        if self.scene is None and (len(environments) > 1 or self.object):
+            raise InputError(
+                "--environments: carla beside others, or past objects, needs the "
+                "town's --scene: the bundled ones are elsewhere"
+            )
 
     def build(self) -> Place:
         """Return the place; camera and car are those of the bundled one."""
@@ -43,11 +78,14 @@ class PlaceOptions:
             if self.routes_file is None:
                 raise InputError(f"--scene: {self.scene}; it needs its --routes-file")
             place = replace(place, scene=self.scene, field=None, objects=())
+        elif self.server is not None:  # where the ground of a town is nobody knows
+            place = replace(place, field=None, objects=())
         return replace(
             place,
             field=self.field or place.field,
             routes=self.routes_file or place.routes,
             objects=self.object or place.objects,
+            server=self.server or place.server,
         )
 
 
@@ -74,13 +112,19 @@ class PolicyOptions:
         Raises:
             InputError: an option does not fit, or the TOML file is not usable.
         """
-        if policy is not None and policy.lower().endswith(".toml"):
+        from mi_nerfattack.sections import PolicySection
+
+        if _is_toml(policy):
             if self != PolicyOptions():
                 raise InputError(
                     f"{policy}: says itself how the policy is called; leave out "
                     "--kind, --weights-file, --goal, --goals, --control-scale, --column"
                 )
-            return _read_section(Path(policy)), Path(policy).parent
+            values = _read_toml(policy).get("policy")
+            if not isinstance(values, dict):
+                raise InputError(f"{policy}: has no section [policy]")
+            section = _checked(f"{policy}: policy", PolicySection, values)
+            return section, Path(policy).parent
         chosen = policy or BUNDLED_POLICY
         values = {
             "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
@@ -91,7 +135,7 @@ class PolicyOptions:
             "control_scale": self.control_scale,
             "output": self.column,
         }
-        return _checked(chosen, values), Path()
+        return _checked(f"{chosen}: policy", PolicySection, values), Path()
 
 
 def parse_conditions(
@@ -123,26 +167,43 @@ def parse_conditions(
     return tuple(found)
 
 
-def _read_section(path: Path) -> PolicySection:
+def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
+    """Return the camera that a policy's TOML file describes, where it describes one.
+
+    Args:
+        policy: as given to `PolicyOptions.section`.
+
+    Raises:
+        InputError: the section [camera] is not usable.
+    """
+    from mi_nerfattack.attack.world import build_camera
+    from mi_nerfattack.sections import CameraSection
+
+    values = _read_toml(policy).get("camera") if _is_toml(policy) else None
+    if values is None:
+        return None
+    return build_camera(_checked(f"{policy}: camera", CameraSection, values))
+
+
+def _is_toml(policy: str | None) -> TypeGuard[str]:
+    return policy is not None and policy.lower().endswith(".toml")
+
+
+def _read_toml(policy: str) -> dict[str, Any]:
     from mi_nerfattack import files
 
-    values = files.read_toml(path).get("policy")
-    if not isinstance(values, dict):
-        raise InputError(f"{path}: has no section [policy]")
-    return _checked(str(path), values)
+    return files.read_toml(Path(policy))
 
 
-def _checked(name: str, values: dict[str, object]) -> PolicySection:
+def _checked(name: str, model: type[_Section], values: object) -> _Section:
+    """Return a section of a scenario; `name` is its file's and its own."""
     from pydantic import ValidationError
 
-    from mi_nerfattack.sections import PolicySection
-
     try:
-        return PolicySection.model_validate_json(json.dumps(values, default=str))
+        return model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as err:
         first = err.errors()[0]
         location = [str(part) for part in first["loc"]]
         if first["type"] == "keys":
             location.append(str(first.get("ctx", {})["key"]))
-        key = ".".join(["policy", *location])
-        raise InputError(f"{name}: {key}: {first['msg']}") from err
+        raise InputError(f"{'.'.join([name, *location])}: {first['msg']}") from err

@@ -9,12 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mi_nerfattack.commands.words import command_line
+from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.registry import Place
-    from mi_nerfattack.policy.imitate import Imitated, ImitationSettings
+    from mi_nerfattack.policy.imitate import Imitated
+    from mi_nerfattack.policy.imitate_settings import ImitationSettings
     from mi_nerfattack.policy.presets import Preset
     from mi_nerfattack.policy.sites import AbstractSite
+
+#: Environments that cannot train, and what to do.
+_REFUSED = {
+    "carla": "a server answers to one client, and training needs several; train in "
+    "another environment, and drive in CARLA with 'mi-nerfattack evaluate'",
+    "replay": "a recording does not answer to a policy; train in another environment",
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,7 @@ class Train:
     """Sizes of all that is not given here: laptop (about 10,000 frames), intersection
     (192,000) or room (21,584), the last two as in the paper."""
     scene: Path | None = None
-    """Mitsuba XML of the scene; the preset's by default."""
+    """Mitsuba XML of the scene, which needs --routes; the preset's by default."""
     field: Path | None = None
     """Field file of the scene, for the surrogate; the preset's by default."""
     object: tuple[Path, ...] = ()
@@ -117,7 +126,7 @@ class Train:
                 more,
             )
         command = command_line("train", self)
-        record = training_record(settings, sites, self.data, more, command)
+        record = training_record(settings, sites, self.data, result.shards, command)
         self._write(result, record)
         Console().print(card_table(result.card))
         print(f"{self.output}: written; program and validation are beside it")
@@ -130,6 +139,8 @@ class Train:
 
         place = bundled_place(preset.place)
         if self.scene is not None:  # the bundled field is not of this scene
+            if self.routes is None:
+                raise InputError(f"--scene: {self.scene}; it needs its --routes")
             place = replace(place, scene=self.scene, field=None)
         return replace(
             place,
@@ -150,16 +161,15 @@ class Train:
             self.exposures_ev or preset.weather.exposures_ev,
             self.spp,
         )
-        counts = [settings.frames, settings.validation_frames]
-        counts += [settings.dagger_frames] * (settings.dagger_rounds > 0)
-        names = {name: None for part in counts for name in part if part[name]}
-        names |= dict.fromkeys(self.validate_in)
-        return [PlaceSite(name, place, weather) for name in names]
+        for name in settings.sites:
+            if name in _REFUSED:
+                raise InputError(f"environment: {name!r}; {_REFUSED[name]}")
+        return [PlaceSite(name, place, weather) for name in settings.sites]
 
     def _settings(self, preset: Preset) -> ImitationSettings:
         from dataclasses import replace
 
-        from mi_nerfattack.policy.imitate import ImitationSettings
+        from mi_nerfattack.policy.imitate_settings import ImitationSettings
         from mi_nerfattack.policy.presets import EVALUATIONS
         from mi_nerfattack.policy.train import TrainSettings
 

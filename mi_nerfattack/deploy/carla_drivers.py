@@ -92,6 +92,7 @@ class AbstractCarlaDriver(ABC):
         axles: Axles,
         pose: np.ndarray,
         speed: float,
+        height: float,
     ) -> None:
         """Take over a vehicle that stands at a pose, and keep it there.
 
@@ -101,6 +102,7 @@ class AbstractCarlaDriver(ABC):
             axles: of it.
             pose: (3,), x and y in metres, heading in radians.
             speed: to be kept, metres per second.
+            height: of the road there, metres.
         """
 
     @abstractmethod
@@ -123,7 +125,8 @@ class AbstractCarlaDriver(ABC):
 class KinematicDriver(AbstractCarlaDriver):
     """Sets the pose by a model of ours, as the appendix did; no physics in CARLA.
 
-    The vehicle keeps the height above the road and stays level.
+    The vehicle stays level, on the lane that is nearest to where it was before: on a
+    bridge it stays above what it crosses.
 
     Args:
         vehicle: the model.
@@ -141,9 +144,11 @@ class KinematicDriver(AbstractCarlaDriver):
         axles: Axles,
         pose: np.ndarray,
         speed: float,
+        height: float,
     ) -> None:
         """Switch the actor's physics off."""
         self._session, self._actor, self._axles = session, actor, axles
+        self._height = height
         self.vehicle.reset(pose, speed)
         actor.set_simulate_physics(False)
         self._place()
@@ -164,7 +169,9 @@ class KinematicDriver(AbstractCarlaDriver):
     def _place(self) -> None:
         body = self.vehicle.body_to_world
         actor_to_world = self._axles.actor_to_world(body)
-        actor_to_world[2, 3] = road_height(self._session, actor_to_world)
+        actor_to_world[2, 3] = self._height
+        self._height = road_height(self._session, actor_to_world)
+        actor_to_world[2, 3] = self._height
         pose = body_to_carla(actor_to_world)
         self._actor.set_transform(self._session.transform(pose))
 
@@ -205,8 +212,10 @@ class PhysicalDriver(AbstractCarlaDriver):
         axles: Axles,
         pose: np.ndarray,
         speed: float,
+        height: float,
     ) -> None:
         """Read the car's steering, and brake."""
+        del height  # its wheels stand on the road
         self._session, self._actor, self._axles = session, actor, axles
         self._speed, self._missing_m, self._heading = speed, 0.0, float(pose[2])
         self._period = session.world.get_settings().fixed_delta_seconds
@@ -272,7 +281,7 @@ class PhysicalDriver(AbstractCarlaDriver):
 
 
 def road_height(session: CarlaSession, actor_to_world: np.ndarray) -> float:
-    """Return z of the lane nearest to an actor's pose (4, 4), metres.
+    """Return z of the lane nearest to an actor's pose (4, 4), also in height, metres.
 
     Raises:
         InputError: the town has no lane.

@@ -104,14 +104,14 @@ class CarlaEnvironment(AbstractEnvironment):
         with self.session.guarded("put the vehicle on the road"):
             self._cameras = None
             self.session.clear()
-            axles = self._spawn(start)
+            axles, height = self._spawn(start)
             self._used_axles = axles
             body_to_camera = axles.body_to_world(np.eye(4)) @ self._mount
             self._cameras = CarlaCameras(
                 self.session, self.camera, self._actor, body_to_camera, self._attributes
             )
-            frame = 0
-            self.driver.begin(self.session, self._actor, axles, start, route.speed_ms)
+            frame, speed = 0, route.speed_ms
+            self.driver.begin(self.session, self._actor, axles, start, speed, height)
             for _ in range(max(1, round(_SETTLE_S / self.period))):
                 frame = self.session.tick()
             seen = self._observe(frame)
@@ -144,23 +144,30 @@ class CarlaEnvironment(AbstractEnvironment):
         self._cameras = None
         self.session.close()
 
-    def _spawn(self, start: np.ndarray) -> Axles:
-        """Spawn the vehicle with its rear axle at a pose, standing."""
+    def _spawn(self, start: np.ndarray) -> tuple[Axles, float]:
+        """Spawn the vehicle with its rear axle at a pose, standing.
+
+        Returns:
+            its axles, and the height of the road there: of the lane nearest to z = 0.
+        """
         session = self.session
         body = planar_body(start)
         place = body if self._axles is None else self._axles.actor_to_world(body)
-        place[2, 3] = road_height(session, place) + _DROP_M
+        height = road_height(session, place)
+        place[2, 3] = height + _DROP_M
         role = {"role_name": "hero"}
         self._actor = session.spawn(self._vehicle, body_to_carla(place), role)
         if self._axles is not None:
-            return self._axles
+            return self._axles, height
         session.tick()
         measured = body_from_carla(read_pose(self._actor.get_transform()))
         axles = read_axles(self._actor, measured)
-        place = axles.actor_to_world(body)
-        place[2, 3] = road_height(session, place) + _DROP_M
+        place = axles.actor_to_world(planar_body(start))
+        place[2, 3] = height
+        height = road_height(session, place)
+        place[2, 3] = height + _DROP_M
         self._actor.set_transform(session.transform(body_to_carla(place)))
-        return axles
+        return axles, height
 
     def _observe(self, frame: int) -> CameraFrame:
         snapshot = self.session.world.get_snapshot().find(self._actor.id)

@@ -170,7 +170,8 @@ def _unroll(trail: Any) -> list[Any]:
 
 
 def _key(waypoint: Any, spacing_m: float) -> tuple[int, ...]:
-    place = round(waypoint.s / spacing_m)
+    # by half a spacing: rounding takes no two neighbours of a lane for one
+    place = round(2 * waypoint.s / spacing_m)
     return waypoint.road_id, waypoint.section_id, waypoint.lane_id, place
 
 

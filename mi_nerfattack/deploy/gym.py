@@ -18,6 +18,7 @@ from mi_nerfattack.deploy.registry import (
     make_environment,
 )
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.report.metrics import departure_limit
 from mi_nerfattack.vehicle.route import Route
 
 #: Depth that observations have where there is nothing, and the largest, metres.
@@ -50,10 +51,14 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     Args:
         environment: what is driven; it is closed with this one.
         routes: at least one.
-        width: of the vehicle, metres.
+        width: of the vehicle, metres; less than that of every lane.
         max_steps: of an episode.
         margin_m: arc length before the route's end at which an episode is truncated.
         render_mode: "rgb_array" or None.
+
+    Raises:
+        InputError: no route, a lane that is no wider than the vehicle, or an argument
+            out of range.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -73,6 +78,7 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             raise InputError(f"max_steps: {max_steps}; at least 1")
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode: {render_mode!r}; 'rgb_array' or None")
+        self._limits = {r.name: _departure_limit(r, width) for r in routes}
         self.environment, self.routes = environment, {r.name: r for r in routes}
         self.width, self.max_steps, self.margin_m = width, max_steps, margin_m
         self.render_mode = render_mode
@@ -122,7 +128,7 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._frame, self._steps = frame, self._steps + 1
         info = self._info()
         error = abs(info["cross_track_m"])
-        departed = error > (self._route.lane_width_m - self.width) / 2
+        departed = error > self._limits[self._route.name]
         over = self._steps >= self.max_steps or self.environment.is_over
         if not self._route.closed:
             over |= info["arc_length_m"] >= self._route.length - self.margin_m
@@ -156,6 +162,17 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         }
 
 
+def _departure_limit(route: Route, width: float) -> float:
+    try:
+        return departure_limit(route.lane_width_m, width)
+    except InputError as error:
+        raise InputError(
+            f"route {route.name!r}: its lane is {route.lane_width_m} m wide, the "
+            f"vehicle {width} m; give the vehicle's width in metres "
+            "(DrivingEnv(..., width=0.3)), or take a wider lane"
+        ) from error
+
+
 def _observations(
     environment: AbstractEnvironment, routes: Sequence[Route]
 ) -> gymnasium.spaces.Dict:
@@ -187,9 +204,14 @@ def make_gym(
         place: or the name of a bundled one.
         conditions: of light and camera.
         routes: names in the place's file; all of them by default.
-        size_px: width and height of the images; the place's camera decides by default.
+        size_px: width and height of the images; the place's camera decides by default,
+            and a recording's own in any case.
         render_mode: "rgb_array" or None.
         **more: to `DrivingEnv`.
+
+    Raises:
+        InputError: the environment cannot be made, has images of another size than
+            `size_px`, or does not suit the routes.
     """
     from mi_nerfattack import variant
 
@@ -203,7 +225,24 @@ def make_gym(
         found = Route.all_from_file(place.routes)
     environment = make_environment(name, place, conditions)
     more.setdefault("width", place.car.width)
-    return DrivingEnv(environment, found, render_mode=render_mode, **more)
+    try:
+        _check_size(name, environment, size_px)
+        return DrivingEnv(environment, found, render_mode=render_mode, **more)
+    except InputError:
+        environment.close()
+        raise
+
+
+def _check_size(
+    name: str, environment: AbstractEnvironment, size_px: tuple[int, int] | None
+) -> None:
+    camera = environment.camera
+    if size_px is not None and tuple(size_px) != (camera.width, camera.height):
+        raise InputError(
+            f"size_px: {size_px[0]} x {size_px[1]} px; environment {name!r} has images "
+            f"of {camera.width} x {camera.height} px, as recorded; leave size_px out "
+            "and resize what you observe"
+        )
 
 
 def register() -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mi_nerfattack import files
@@ -21,6 +20,7 @@ from mi_nerfattack.deploy.mjcf_light import (
     read_lighting,
 )
 from mi_nerfattack.deploy.mjcf_map import add_meshes, built_in_mesh, read_meshes
+from mi_nerfattack.deploy.mujoco_module import mujoco
 
 NEAR_M = 0.05
 _SHADOW_PX = 2048

@@ -18,10 +18,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mi_nerfattack.deploy.car import Car
+from mi_nerfattack.deploy.mujoco_module import mujoco
 from mi_nerfattack.errors import InputError
 
 BODY, COLUMN, AXLE = "car", "column", "rear_axle"

@@ -15,11 +15,11 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import mujoco
 import numpy as np
 
 from mi_nerfattack.colour import linear_to_uint8
 from mi_nerfattack.deploy.mjcf_map import rgb_rows
+from mi_nerfattack.deploy.mujoco_module import mujoco
 
 SUN = "sun"
 #: Radius around the camera in which the sun casts shadows, metres.

@@ -13,11 +13,11 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import mujoco
 import numpy as np
 
 from mi_nerfattack.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.deploy.built_in import BuiltInObject
+from mi_nerfattack.deploy.mujoco_module import mujoco
 from mi_nerfattack.errors import InputError
 
 _PROCEDURAL = 512  # texels along an edge of a texture that is no image

@@ -6,12 +6,12 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from mi_nerfattack.deploy import mjcf_car
 from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.mjcf_car import Handling
+from mi_nerfattack.deploy.mujoco_module import mujoco
 from mi_nerfattack.deploy.vehicle import (
     AbstractVehicle,
     checked_pose,

@@ -7,13 +7,13 @@ import weakref
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.mjcf import NEAR_M, map_spec
 from mi_nerfattack.deploy.mjcf_light import SHADOW_RADIUS, SUN_DISTANCE
+from mi_nerfattack.deploy.mujoco_module import mujoco
 from mi_nerfattack.deploy.opengl import make_context
 from mi_nerfattack.deploy.paste import Paster
 from mi_nerfattack.deploy.view import AbstractView

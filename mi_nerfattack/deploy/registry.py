@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,8 +84,8 @@ class Conditions:
             raise InputError(f"sky: {self.sky!r}; one of {', '.join(DAYLIGHT)}")
         if not math.isfinite(self.exposure_ev):
             raise InputError(f"exposure_ev: {self.exposure_ev}; must be finite")
-        if self.spp < 1:
-            raise InputError(f"spp: {self.spp}; at least 1 sample per pixel")
+        if not isinstance(self.spp, int) or self.spp < 1:
+            raise InputError(f"spp: {self.spp!r}; at least 1 sample per pixel, whole")
 
 
 def kinematic_vehicle(car: Car, period: float) -> KinematicVehicle:
@@ -124,16 +122,16 @@ def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    with _loading_mujoco("mujoco"):
-        from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+    from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+
     vehicle = MujocoVehicle(place.car, period=place.period)
     return _pair("mujoco", vehicle, mitsuba_view(place, conditions), place)
 
 
 def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    with _loading_mujoco("mujoco_gl"):
-        from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
-        from mi_nerfattack.deploy.mujoco_view import MujocoView
+    from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+    from mi_nerfattack.deploy.mujoco_view import MujocoView
+
     scene = load_scene(place.scene)
     set_daylight(scene, conditions.sky)
     view = MujocoView(scene, place.camera, conditions.built_in, conditions.exposure_ev)
@@ -182,26 +180,6 @@ def _refuse_built_in(name: str, conditions: Conditions) -> None:
             f"environment {name!r}: takes no built-in objects; show fields, which it "
             "pastes or composes"
         )
-
-
-@contextmanager
-def _loading_mujoco(name: str) -> Iterator[None]:
-    """Turn a failed import of MuJoCo into an `InputError` with a remedy.
-
-    It fails in several ways where MUJOCO_GL names what is not there.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"environment {name!r}: the package {error.name} is not installed; "
-            "pip install mujoco"
-        ) from error
-    except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise InputError(
-            f"environment {name!r}: MuJoCo cannot be imported with "
-            f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); unset it"
-        ) from error
 
 
 def _pair(

@@ -347,8 +347,9 @@ def _claim(root: Path, about: dict[str, Any]) -> None:
 
 
 def _digest(routes: Sequence[Route]) -> str:
-    """Return a checksum of names, goals, points, speeds and shapes."""
-    text = json.dumps(
-        [[r.name, r.goal, r.speed_ms, r.closed, r.points.tolist()] for r in routes]
-    )
-    return hashlib.sha256(text.encode()).hexdigest()
+    """Return a checksum of names, goals, lanes' widths, speeds, points and shapes."""
+    about = [
+        [r.name, r.goal, r.lane_width_m, r.speed_ms, r.closed, r.points.tolist()]
+        for r in routes
+    ]
+    return hashlib.sha256(json.dumps(about).encode()).hexdigest()

@@ -7,9 +7,12 @@ the disk and are read row by row.
 
 from __future__ import annotations
 
+import hashlib
 import io
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +83,15 @@ class FrameDataset:
         """Count the rows."""
         return len(self.goals)
 
+    @cached_property
+    def digest(self) -> str:
+        """Return the SHA-256 of frames, goals and controls; all of them are read."""
+        total = hashlib.sha256()
+        for array in (*self.frames, self.goals, self.controls):
+            total.update(str((array.shape, array.dtype)).encode())
+            total.update(np.ascontiguousarray(array).reshape(-1).data)
+        return total.hexdigest()
+
     def read_frames(self, rows: np.ndarray) -> np.ndarray:
         """Copy frames (k, height, width, 3) uint8 of the given row numbers (k,)."""
         starts = np.cumsum([0, *(len(array) for array in self.frames)])
@@ -138,6 +150,41 @@ def write_shard(
         buffer = io.BytesIO()
         np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
         files.write_bytes(folder / f"{name}.npy", buffer.getvalue())
+
+
+def divide_shards(
+    shards: Sequence[Path], fraction: float, least: int = 0
+) -> tuple[list[Path], list[Path]]:
+    """Divide shards into those to train on and those to hold out.
+
+    A shard's own controls decide about it, whatever the others are: it keeps its role
+    when more shards come. Shards share neither drives nor textures.
+
+    Args:
+        shards: folders written by `write_shard`.
+        fraction: held out, of many; in [0, 1).
+        least: held out at least, where one is left to train on; those nearest to being
+            held out anyway.
+
+    Returns:
+        Shards to train on and held-out ones, in their order; with `least` the first
+        are not empty.
+    """
+    drawn = np.array([_draw_of(shard) for shard in shards])
+    count = int((drawn < fraction).sum())
+    if least:
+        count = min(max(count, least), len(shards) - 1)
+    held = set(np.argsort(drawn, kind="stable")[:count].tolist())
+    parts: tuple[list[Path], list[Path]] = [], []
+    for index, shard in enumerate(shards):
+        parts[index in held].append(shard)
+    return parts
+
+
+def _draw_of(shard: Path) -> float:
+    """Return a number in [0, 1) that looks random and is the shard's own."""
+    controls = _map_column(shard / "controls.npy", COLUMNS["controls"])
+    return zlib.crc32(controls.tobytes()) / 2**32
 
 
 def _map_column(path: Path, dtype: type) -> np.ndarray:

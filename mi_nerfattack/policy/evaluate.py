@@ -240,8 +240,15 @@ def evaluate(
 
     Returns:
         {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}}, see `card`.
+
+    Raises:
+        InputError: before the first drive, a lane that is too narrow for the car or a
+            route too short for objects; then whatever a drive raises.
     """
     cases = settings.cases if objects else (CLEAN,)
+    departure_limits(routes, settings.car_width_m)
+    if RANDOM_OBJECTS in cases:
+        check_roadside(routes, settings, len(objects))
     jobs = [
         (environment, route, case, run)
         for environment in environments
@@ -279,10 +286,18 @@ def card(
 
 
 def departure_limits(routes: Sequence[Route], car_width_m: float) -> dict[str, float]:
-    """Return the departure limit of each route by its name, metres."""
-    return {
-        route.name: departure_limit(route.lane_width_m, car_width_m) for route in routes
-    }
+    """Return the departure limit of each route by its name, metres.
+
+    Raises:
+        InputError: a lane is narrower than the car.
+    """
+    limits = {}
+    for route in routes:
+        try:
+            limits[route.name] = departure_limit(route.lane_width_m, car_width_m)
+        except InputError as error:
+            raise InputError(f"route {route.name!r}: {error}") from error
+    return limits
 
 
 def make_card(
@@ -320,6 +335,36 @@ def own_textures(objects: Sequence[GridField]) -> Iterator[None]:
             item.set_parameter("texture", texture)
 
 
+def check_roadside(
+    routes: Sequence[Route], settings: EvaluateSettings, count: int
+) -> None:
+    """Check that objects find room beside routes.
+
+    Args:
+        routes: all must be long enough.
+        settings: see there.
+        count: number of fields at hand.
+
+    Raises:
+        InputError: a route is too short, or the fields are too few.
+    """
+    for route in routes:
+        first, last = _object_stretch(route, settings)
+        if first > last or settings.objects > count:
+            raise InputError(
+                f"EvaluateSettings: ahead_m {settings.ahead_m} on route "
+                f"{route.name!r} of {route.length:.1f} m, objects {settings.objects} "
+                f"of {count}; the route must be longer, and each object a field of its "
+                "own; or leave the objects out (objects 0)"
+            )
+
+
+def _object_stretch(route: Route, settings: EvaluateSettings) -> tuple[float, float]:
+    """Return the least and the most arc length of objects, metres."""
+    first, before = settings.ahead_m
+    return first, route.length - settings.margin_m - before
+
+
 def _generator(
     settings: EvaluateSettings, route: Route, run: int
 ) -> np.random.Generator:
@@ -338,17 +383,11 @@ def _roadside(
     """Give some of the objects random textures and places."""
     if not objects:
         return
-    first, before = settings.ahead_m
-    last = route.length - settings.margin_m - before
-    if first > last or settings.objects > len(objects):
-        raise InputError(
-            f"EvaluateSettings: ahead_m {settings.ahead_m} on route {route.name!r} of "
-            f"{route.length:.1f} m, objects {settings.objects} of {len(objects)}; the "
-            "route must be longer, and each object a field of its own"
-        )
+    check_roadside([route], settings, len(objects))
+    stretch = _object_stretch(route, settings)
     for index in range(settings.objects):
         item = objects[(run + index) % len(objects)]
         texture = random_texture(item, "mixed", int(rng.integers(2**31)))
         item.set_parameter("texture", texture)
-        pose = settings.roadside.place(item, route, (first, last), ground, rng)
+        pose = settings.roadside.place(item, route, stretch, ground, rng)
         yield PosedField(item, pose)

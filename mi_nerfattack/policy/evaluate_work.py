@@ -22,8 +22,10 @@ from mi_nerfattack.policy.adapter import AbstractPolicy, TorchPolicy
 from mi_nerfattack.policy.evaluate import (
     CLEAN,
     EXPERT,
+    RANDOM_OBJECTS,
     EvaluateSettings,
     ExpertPolicy,
+    check_roadside,
     departure_limits,
     evaluate_run,
     make_card,
@@ -36,7 +38,13 @@ from mi_nerfattack.policy.evaluate_identity import (
 from mi_nerfattack.policy.load import load_policy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.placement import scene_ground
-from mi_nerfattack.policy.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.policy.sites import CARLA
+from mi_nerfattack.policy.workers import (
+    AbstractWork,
+    AbstractWorkers,
+    InThisProcess,
+    OnUnits,
+)
 from mi_nerfattack.render.camera import from_fov
 from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.report.metrics import Drive
@@ -45,7 +53,7 @@ from mi_nerfattack.scenario import resolve
 from mi_nerfattack.sections import PolicySection
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route import Route
-from mi_nerfattack.versions import versions
+from mi_nerfattack.versions import environment_versions, versions
 
 _ARRAYS = ("states", "controls", "cross_track_m", "time_s")
 _REMEDY = "choose another folder for the drives, or remove this one"
@@ -88,13 +96,17 @@ class EvaluateWork(AbstractWork):
     identities: Mapping[tuple[str, str], Mapping[str, str]]
 
     @property
+    def cases(self) -> tuple[str, ...]:
+        """Names of the cases; without objects there is one."""
+        return self.settings.cases if self.place.objects else (CLEAN,)
+
+    @property
     def jobs(self) -> list[Job]:
         """Every drive; those of one environment and of one sort together."""
-        cases = self.settings.cases if self.place.objects else (CLEAN,)
         return [
             Job(environment, route, case, run)
             for environment in self.environments
-            for sort in ((EXPERT,), cases)
+            for sort in ((EXPERT,), self.cases)
             for route in self.routes
             for case in sort
             for run in range(self.settings.runs)
@@ -152,12 +164,16 @@ class EvaluateWork(AbstractWork):
 
     def describe(self) -> dict[str, Any]:
         """Return policy, place, routes, environments and settings, as JSON."""
-        place = self.place
-        paths = [place.scene, place.routes, *place.objects]
+        place, names = self.place, {under.name for under in self.environments}
+        paths = [place.routes, *place.objects]
+        paths = paths if names == {CARLA} else [place.scene, *paths]
+        where = [f"{path.resolve().parent.name}/{path.name}" for path in paths]
+        if CARLA in names:  # not the machine that it runs on
+            where.append(f"CARLA's {place.server.partition('/')[2] or 'loaded town'}")
         return {
             "policy": _relative(self.policy.file or self.policy.url or ""),
             "policy_section": policy_content(self.policy, self.base),
-            "place": [f"{path.resolve().parent.name}/{path.name}" for path in paths],
+            "place": where,
             "routes": [route.name for route in self.routes],
             "environments_under": {
                 under.label: {"sky": c.sky, "exposure_ev": c.exposure_ev, "spp": c.spp}
@@ -165,7 +181,14 @@ class EvaluateWork(AbstractWork):
                 for c in (under.conditions,)
             },
             "settings": asdict(self.settings),
-            "versions": versions(),
+            "versions": {
+                **versions(),
+                **{
+                    package: version
+                    for under in self.environments
+                    for package, version in environment_versions(under.name).items()
+                },
+            },
         }
 
     def record(self) -> dict[str, Any] | None:
@@ -273,14 +296,23 @@ def run_evaluation(
         progress: called with control periods done and wanted.
 
     Raises:
-        InputError: an environment cannot be made, the policy does not take its
-            images, or the folder holds drives of another evaluation.
+        InputError: before the first drive, a lane narrower than the car, a route too
+            short for objects, an environment that cannot be made, several processes
+            for CARLA, or drives of another evaluation in the folder; later, a policy
+            that does not take the images.
     """
+    limits = departure_limits(work.routes, work.settings.car_width_m)
+    if RANDOM_OBJECTS in work.cases:
+        check_roadside(work.routes, work.settings, work.settings.objects)
+    _check_workers(work, workers)
     jobs = work.jobs
     steps = [work.steps(job) for job in jobs]
     found = [work.read(job) for job in jobs]
     left = [index for index, item in enumerate(found) if item is None]
     done, total = sum(steps) - sum(steps[index] for index in left), sum(steps)
+    # what cannot be made is told now, not after the hours of those before it
+    for under in dict.fromkeys(jobs[index].environment for index in left):
+        make_environment(under.name, work.place, under.conditions).close()
 
     def count(units: int) -> None:
         nonlocal done
@@ -298,8 +330,16 @@ def run_evaluation(
         drives.setdefault((label, job.route.name, job.case), []).append(item[0])
         seconds.setdefault((label, job.case), []).append(item[1])
     means = {key: sum(values) / len(values) for key, values in seconds.items()}
-    limits = departure_limits(work.routes, work.settings.car_width_m)
     return Evaluation(make_card(drives, limits), drives, means)
+
+
+def _check_workers(work: EvaluateWork, workers: AbstractWorkers) -> None:
+    named = CARLA in (under.name for under in work.environments)
+    if named and not isinstance(workers, InThisProcess):
+        raise InputError(
+            "workers: several processes for the environment 'carla', which would tick "
+            "one server and could end without giving it back; 1 drives in this process"
+        )
 
 
 def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) -> None:

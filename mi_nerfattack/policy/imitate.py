@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.collect import CollectSettings, OnFrames, collect
-from mi_nerfattack.policy.dataset import FrameDataset
-from mi_nerfattack.policy.evaluate import EvaluateSettings
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.policy.collect import OnFrames, collect
+from mi_nerfattack.policy.dataset import FrameDataset, divide_shards
+from mi_nerfattack.policy.evaluate import check_roadside, departure_limits
+from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.sites import AbstractSite
-from mi_nerfattack.policy.sources import (
-    AbstractSource,
-    ExpertDrives,
-    Mixture,
-    PolicyDrives,
-    Scattered,
-)
-from mi_nerfattack.policy.train import Progress, TrainSettings, fit_policy
+from mi_nerfattack.policy.sources import AbstractSource, PolicyDrives
+from mi_nerfattack.policy.train import Progress, fit_policy
 from mi_nerfattack.policy.validation import ClosedLoop, rank
 from mi_nerfattack.policy.workers import AbstractWorkers
 from mi_nerfattack.vehicle.route import Route
@@ -30,75 +27,23 @@ from mi_nerfattack.vehicle.route import Route
 #: Called with the name of the stage, units done and wanted, and what to show.
 OnStage = Callable[[str, float, float, str], None]
 
-#: Scattered states and recoveries of the expert.
-CLONING = Mixture((Scattered(), ExpertDrives()), (0.7, 0.3))
-#: Added to the seed of held-out frames; more than there are rounds.
+#: Number of the collection of held-out frames; more than there are rounds.
 _HELD_OUT = 1 << 20
-
-
-@dataclass(frozen=True)
-class ImitationSettings:
-    """Choices of the whole way from a place to a policy.
-
-    Args:
-        frames: of the first collection, by site.
-        validation_frames: of a collection for the held-out loss, by site; none: a part
-            of the others.
-        dagger_rounds: number of rounds.
-        dagger_frames: added in every round, by site.
-        dagger_epochs: epochs of the training after each round, which starts from the
-            weights before.
-        dagger_rate: learning rate of these.
-        expert_share: of the control periods of a round in which the expert drives.
-        horizon: control periods of a drive of a round.
-        seed: of everything but the closed-loop drives; overrides those of `collecting`
-            and `training`.
-        validate_every: epochs from one validation in the closed loop to the next.
-        validate_in: names of the sites of these validations; none: all.
-        cloning: source of the first collection's states.
-        collecting: of the frames; their number and seed are overridden.
-        training: of the first training.
-        validation: of the closed-loop drives between epochs.
-        final: of those at the end.
-    """
-
-    frames: Mapping[str, int]
-    validation_frames: Mapping[str, int] = field(default_factory=dict)
-    dagger_rounds: int = 0
-    dagger_frames: Mapping[str, int] = field(default_factory=dict)
-    dagger_epochs: int = 3
-    dagger_rate: float = 5e-4
-    expert_share: float = 0.0
-    horizon: int = 16
-    seed: int = 0
-    validate_every: int = 4
-    validate_in: tuple[str, ...] = ()
-    cloning: AbstractSource = CLONING
-    collecting: CollectSettings = field(default_factory=CollectSettings)
-    training: TrainSettings = field(default_factory=TrainSettings)
-    validation: EvaluateSettings = field(
-        default_factory=lambda: EvaluateSettings(runs=1)
-    )
-    final: EvaluateSettings = field(default_factory=lambda: EvaluateSettings(runs=2))
-
-    def __post_init__(self) -> None:
-        for name in ("frames", "validation_frames", "dagger_frames"):
-            for site, count in getattr(self, name).items():
-                if not isinstance(count, int) or count < 0:
-                    raise InputError(f"{name}: {count!r} of {site!r}; at least 0")
 
 
 @dataclass(frozen=True, eq=False)
 class Imitated:
     """A trained policy, the history of each training, and its closed-loop card.
 
-    The policy is that of the best validation of all rounds.
+    The policy is that of the best validation of all rounds; the shards are all that
+    were trained on or held out.
     """
 
     module: PilotNet
     history: list[list[dict[str, Any]]]
     best_round: int
     card: dict[str, Any]
+    shards: list[Path]
 
 
 def imitate(
@@ -126,13 +71,14 @@ def imitate(
         more: shards of earlier collections to train on, too.
 
     Raises:
-        InputError: no frames wanted, an unknown site, a goal missing, a camera that
-            does not fit, or the folder holds what was made with other settings.
+        InputError: no frames wanted, an unknown site, a goal missing, a camera or a
+            route that does not fit, or the folder holds what was made with other
+            settings.
     """
     _check(sites, routes, settings, more)
     run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
-    shards = [*more, *run.collect("round_0", settings.frames, settings.cloning, 0)]
-    held_out = run.collect(
+    run.take([*more, *run.collect("round_0", settings.frames, settings.cloning, 0)])
+    run.held_out += run.collect(
         "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
     )
     torch.manual_seed(settings.seed)
@@ -141,19 +87,19 @@ def imitate(
     if start is not None:
         _take_weights(module, start)
     with run:
-        history = [run.train(module, shards, held_out, 0)]
+        history = [run.train(module, 0)]
         weights = [run.save(module, 0)]
         for number in range(1, settings.dagger_rounds + 1):
             drives = PolicyDrives(weights[-1], settings.horizon, settings.expert_share)
             wanted = settings.dagger_frames
-            shards += run.collect(f"round_{number}", wanted, drives, number)
-            history.append(run.train(module, shards, held_out, number))
+            run.take(run.collect(f"round_{number}", wanted, drives, number))
+            history.append(run.train(module, number))
             weights.append(run.save(module, number))
         ranks = [min(rank(row) for row in rows if row["measured"]) for rows in history]
         best = ranks.index(min(ranks))
         module = PilotNet.load(weights[best])
         card = run.card(module)
-    return Imitated(module, history, best, card)
+    return Imitated(module, history, best, card, [*run.training, *run.held_out])
 
 
 class _Imitation:
@@ -170,17 +116,19 @@ class _Imitation:
     ) -> None:
         self.sites, self.routes, self.settings = sites, routes, settings
         self.folder, self.workers, self.progress = folder, workers, progress
+        self.training: list[Path] = []
+        self.held_out: list[Path] = []
         self._loop: ClosedLoop | None = None
 
     def __enter__(self) -> _Imitation:
         """Load what validation drives in, after the workers have gone."""
-        sites = self.sites
-        objects = sites[0].load_objects()
+        site, settings = self.sites[0], self.settings
+        wanted = max(settings.validation.objects, settings.final.objects)
         self._loop = ClosedLoop(
             [site.open(site.typical()) for site in self._validated()],
             self.routes,
-            objects,
-            sites[0].load_ground(),
+            _load_objects(site, wanted),
+            site.load_ground(),
             self.settings.validation,
             self.settings.validate_every,
             self._steps("validation"),
@@ -213,22 +161,29 @@ class _Imitation:
             settings = replace(
                 self.settings.collecting,
                 frames=frames[site.name],
-                seed=self.settings.seed + number,
+                seed=self._seed(number),
             )
             arguments = (settings, self.folder / name, self.workers)
             show = self._frames(f"{name}, {site.name}")
             shards += collect(site, self.routes, source, *arguments, show)
         return shards
 
-    def train(
-        self,
-        module: PilotNet,
-        shards: Sequence[Path],
-        held_out: Sequence[Path],
-        number: int,
-    ) -> list[dict[str, Any]]:
+    def take(self, shards: Sequence[Path]) -> None:
+        """Add shards to those of training, some to the held-out ones.
+
+        They stay there: a round starts from weights that have seen the former.
+        """
+        training = shards
+        if self.settings.holds_out_shards:
+            least = 0 if self.held_out else 1
+            fraction = self.settings.training.held_out
+            training, held_out = divide_shards(shards, fraction, least)
+            self.held_out += held_out
+        self.training += training
+
+    def train(self, module: PilotNet, number: int) -> list[dict[str, Any]]:
         """Train once, with a checkpoint after each epoch."""
-        settings = replace(self.settings.training, seed=self.settings.seed + number)
+        settings = replace(self.settings.training, seed=self._seed(number))
         if number:
             settings = replace(
                 settings,
@@ -247,11 +202,11 @@ class _Imitation:
         module.to(**layout)
         return fit_policy(
             module,
-            FrameDataset.from_folders(shards),
+            FrameDataset.from_folders(self.training),
             settings,
             self.folder / f"checkpoint_{number}.safetensors",
             progress=step,
-            held_out=FrameDataset.from_folders(held_out) if held_out else None,
+            held_out=FrameDataset.from_folders(self.held_out),
             validation=self.loop,
         )
 
@@ -267,6 +222,11 @@ class _Imitation:
             self.loop, settings=self.settings.final, progress=self._steps("card")
         )
         return final.card(module)
+
+    def _seed(self, number: int) -> int:
+        """Return the seed of a round: those of other seeds' rounds are others."""
+        entropy = [self.settings.seed, number]
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def _frames(self, stage: str) -> OnFrames:
         def show(done: int, total: int, left_s: float) -> None:
@@ -289,8 +249,7 @@ def _check(
 ) -> None:
     """Raise `InputError` for what cannot be trained."""
     names = [site.name for site in sites]
-    wanted = {**settings.frames, **settings.dagger_frames, **settings.validation_frames}
-    if unknown := sorted({*wanted, *settings.validate_in} - set(names)):
+    if unknown := sorted(set(settings.sites) - set(names)):
         raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
     goals = sorted(route.goal for route in routes)
     frames = sum(settings.frames.values())
@@ -301,6 +260,17 @@ def _check(
         )
     for site in sites:
         check_camera(site)
+    size = settings.collecting.shard
+    count = len(more) + sum(-(-n // size) for n in settings.frames.values())
+    if settings.holds_out_shards and count < 2:
+        raise InputError(
+            f"frames: {frames}, one shard of up to {size}; at least two, of which one "
+            "is held out, or give validation_frames"
+        )
+    for drives in (settings.validation, settings.final):
+        departure_limits(routes, drives.car_width_m)
+        if drives.objects and (objects := _load_objects(sites[0], drives.objects)):
+            check_roadside(routes, drives, len(objects))
 
 
 def check_camera(site: AbstractSite) -> None:
@@ -312,6 +282,17 @@ def check_camera(site: AbstractSite) -> None:
             f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
             f"takes {width} x {height}"
         )
+
+
+def _load_objects(site: AbstractSite, count: int) -> list[GridField]:
+    """Load a site's objects, if there are any, so often that they are enough.
+
+    Each is a field of its own, with a texture of its own.
+    """
+    objects = site.load_objects()
+    while 0 < len(objects) < count:
+        objects += site.load_objects()
+    return objects
 
 
 def _take_weights(module: PilotNet, start: PilotNet) -> None:

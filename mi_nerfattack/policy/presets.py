@@ -23,7 +23,7 @@ class Preset:
         place: key of `deploy.registry.bundled_place`.
         frames: of the first collection, by environment.
         validation_frames: of the collection that the held-out loss is measured on, by
-            environment; none: a tenth of the others.
+            environment; none: about a tenth of the others.
         dagger_rounds: in which the policy drives and the expert labels.
         dagger_frames: of each round, by environment.
         epochs: passes over the frames.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,15 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.placement import Ground, scene_ground
 from mi_nerfattack.render.camera import Camera
-from mi_nerfattack.render.scene import load_scene
+from mi_nerfattack.render.scene import load_scene, scene_files
 from mi_nerfattack.vehicle.expert import AbstractExpert, expert_for
 from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.versions import environment_versions
 
 #: The environment whose light does not change.
 SURROGATE = "surrogate"
+#: The environment that a server decides about.
+CARLA = "carla"
 
 
 @dataclass(frozen=True)
@@ -179,19 +183,18 @@ class PlaceSite(AbstractSite):
     def describe(self) -> dict[str, Any]:
         """Return checksums of the files, and the numbers."""
         place = self.place
-        paths = [place.scene, *_beside(place.scene), *place.objects]
+        paths = [*scene_files(place.scene), *place.objects]
         if place.field is not None:
             paths.append(place.field)
-        # the folder tells files of equal names apart
-        sums = {f"{p.resolve().parent.name}/{p.name}": _checksum(p) for p in paths}
         return {
             "environment": self.name,
-            "files": sums,
+            "files": _checksums(paths),
             "camera": asdict(place.camera),
             "mount": asdict(place.mount),
             "car": asdict(place.car),
             "period": place.period,
             "weather": asdict(self.weather),
+            **_engine(self.name, place),
         }
 
 
@@ -221,18 +224,21 @@ def load_routes(path: str | Path) -> list[Route]:
     return [Route.from_file(path, name) for name in table]
 
 
-def _beside(scene: Path) -> list[Path]:
-    """Return the meshes and textures that a scene's folder holds."""
-    folders = [scene.parent / name for name in ("meshes", "textures")]
-    return [
-        p for f in folders if f.is_dir() for p in sorted(f.iterdir()) if p.is_file()
-    ]
+def _engine(name: str, place: Place) -> dict[str, str]:
+    """Return versions and server of what an environment needs besides Mitsuba."""
+    server = {"server": place.server} if name == CARLA else {}
+    return {**environment_versions(name), **server}
 
 
-def _checksum(path: Path) -> str:
-    total = hashlib.sha256()
-    total.update(files.read_bytes(path, files.MAX_TENSOR_BYTES))
-    return total.hexdigest()
+def _checksums(paths: Sequence[Path]) -> dict[str, str]:
+    """Return checksums by file and folder, which tells files of equal names apart."""
+    sums: dict[str, str] = {}
+    for path in paths:
+        key = f"{path.resolve().parent.name}/{path.name}"
+        raw = files.read_bytes(path, files.MAX_TENSOR_BYTES)
+        # where folders, too, have equal names, one checksum follows the other
+        sums[key] = sums.get(key, "") + hashlib.sha256(raw).hexdigest()
+    return sums
 
 
 def as_json(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -52,6 +53,8 @@ class TrainSettings:
             raise InputError(
                 f"TrainSettings.learning_rate: {self.learning_rate!r}; in (0, 1)"
             )
+        if not 0 < self.held_out < 1:
+            raise InputError(f"TrainSettings.held_out: {self.held_out!r}; in (0, 1)")
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def fit_policy(
 
     The loss is the mean squared difference of control divided by the largest
     control. With a checkpoint, each epoch ends by writing it atomically, and a run
-    with the same settings and data continues after the last whole epoch.
+    with the same settings, data and first weights continues after the last whole epoch.
 
     Args:
         module: changed in place; ends on the CPU in evaluation mode.
@@ -101,7 +104,7 @@ def fit_policy(
 
     Raises:
         InputError: goals or controls out of the policy's range; a checkpoint of
-            other settings or data; a loss that is not finite.
+            other settings, data or first weights; a loss that is not finite.
     """
     _check_labels(module, data)
     if held_out is None:
@@ -138,10 +141,9 @@ class Part:
         """Take all rows of a dataset."""
         return cls(data, np.arange(len(data)))
 
-    def describe(self) -> list[float]:
-        """Return what tells datasets apart: rows, sums of controls and their sizes."""
-        controls = self.data.controls
-        return [len(self.rows), float(controls.sum()), float(np.abs(controls).sum())]
+    def describe(self) -> list[Any]:
+        """Return what tells parts apart: number of rows, checksum of the data."""
+        return [len(self.rows), self.data.digest]
 
 
 class _Run:
@@ -165,6 +167,7 @@ class _Run:
             weight_decay=settings.weight_decay,
         )
         self.best = copy.deepcopy(module.state_dict())
+        self.start = _digest_weights(module)
         self.history: list[dict[str, Any]] = []
 
     def epoch(self, epoch: int, progress: Callable[[Progress], None] | None) -> float:
@@ -241,13 +244,13 @@ class _Run:
         files.write_safetensors(path, arrays, metadata)
 
     def restore(self, path: str | Path) -> None:
-        """Read what `save` wrote for the same settings and data."""
+        """Read what `save` wrote for the same settings, data and first weights."""
         arrays, metadata = files.read_safetensors(path)
         if metadata.get("run") != self._fingerprint():
             raise InputError(
                 f"{path}: written with other settings or data "
-                f"({metadata.get('run')}); remove it or restore the settings "
-                f"({self._fingerprint()})"
+                f"({self._differences(metadata.get('run', '{}'))}); remove it or "
+                "restore them"
             )
         groups: dict[str, dict[str, np.ndarray]] = {"last": {}, "best": {}, "adam": {}}
         for name, value in arrays.items():
@@ -277,10 +280,16 @@ class _Run:
                 "validation": self.validation.describe(),
                 "rows": self.part.describe(),
                 "held_out": self.held.describe(),
+                "start": self.start,
                 "goals": self.module.goals,
                 "max_control": self.module.max_control,
             }
         )
+
+    def _differences(self, found: str) -> str:
+        """Name the parts of a checkpoint's fingerprint that differ from this run's."""
+        theirs, mine = json.loads(found), json.loads(self._fingerprint())
+        return ", ".join(key for key in mine if theirs.get(key) != mine[key])
 
     def _batch(self, data: FrameDataset, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
         """Read frames (uint8), goals and controls in [-1, 1] onto the device."""
@@ -302,6 +311,15 @@ class _Run:
         fall = 0.505 + 0.495 * np.cos(np.pi * step / total)
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * warm * fall
+
+
+def _digest_weights(module: PilotNet) -> str:
+    """Return the SHA-256 of a policy's weights."""
+    total = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        total.update(name.encode())
+        total.update(value.cpu().contiguous().view(-1).numpy())
+    return total.hexdigest()
 
 
 def _check_labels(module: PilotNet, data: FrameDataset) -> None:

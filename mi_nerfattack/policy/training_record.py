@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack import files
-from mi_nerfattack.policy.imitate import ImitationSettings
+from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.sites import AbstractSite
 
 _DONE = "shard.json"  # in the folder of every complete shard
@@ -20,7 +20,7 @@ def training_record(
     settings: ImitationSettings,
     sites: Sequence[AbstractSite],
     data: Path,
-    more: Sequence[Path],
+    shards: Sequence[Path],
     command: str,
 ) -> dict[str, Any]:
     """Describe a training: what its page shows.
@@ -29,7 +29,7 @@ def training_record(
         settings: of the training.
         sites: where its frames come from.
         data: folder of the frames.
-        more: shards of earlier collections.
+        shards: that were trained and validated on.
         command: that was given.
 
     Returns:
@@ -42,7 +42,7 @@ def training_record(
         "seed": settings.seed,
         "settings": asdict(settings),
         "augmentation": asdict(settings.training.augmentation),
-        "data": count_frames(data, more),
+        "data": count_frames(data, shards),
         "sites": {
             site.name: {key: value for key, value in about.items() if key != "files"}
             for site, about in zip(sites, described, strict=True)
@@ -56,18 +56,18 @@ def training_record(
     return json.loads(json.dumps(record, default=str))
 
 
-def count_frames(data: Path, more: Sequence[Path] = ()) -> dict[str, int]:
-    """Count the frames of collections: by folder below `data`, earlier ones by name.
+def count_frames(data: Path, shards: Sequence[Path]) -> dict[str, int]:
+    """Count the frames of shards: by folder below `data`, earlier ones by name.
 
     Args:
-        data: folder of the frames.
-        more: shards of earlier collections.
+        data: folder of the frames of this training.
+        shards: each counts as often as it is there.
     """
     counts: Counter[str] = Counter()
-    for done in sorted(Path(data).rglob(_DONE)):  # none where all are earlier ones
-        counts[done.parents[1].relative_to(data).as_posix()] += _frames(done.parent)
-    for shard in more:
-        counts[f"earlier/{shard.parent.name}"] += _frames(shard)
+    for shard in sorted(shards):
+        own = shard.is_relative_to(data)
+        place = shard.parent.relative_to(data).as_posix() if own else ""
+        counts[place or f"earlier/{shard.parent.name}"] += _frames(shard)
     return dict(counts)
 
 

@@ -10,9 +10,11 @@ from typing import Any
 
 import mitsuba as mi
 
+from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
 
 _CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+_FILENAME = re.compile(r"""filename\s*=\s*["']([^"'$]+)["']""")
 
 
 def load_scene(
@@ -37,13 +39,9 @@ def load_scene(
         InputError: whatever the parser or a plugin refuses, in one line with the file;
             a root element that is no scene; a size for a film with a crop window.
     """
-    source = Path(path)
-    if not source.is_file():
-        raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
-    config = mi.parser.ParserConfig(mi.variant())
-    config.parallel = False  # Python plugins
+    config = _config()
     try:
-        with _resolved_from(source.resolve().parent):
+        with _resolved_from(path):
             state = mi.parser.parse_file(config, str(path), **(parameters or {}))
             if size_px is not None:
                 _resize_films(path, state, size_px)
@@ -58,6 +56,45 @@ def load_scene(
             f"{path}: describes a {type(scene).__name__}; its root must be <scene>"
         )
     return scene
+
+
+def scene_files(path: str | Path) -> list[Path]:
+    """List a scene's file and all files that it names, as far as they exist.
+
+    Args:
+        path: XML file; included ones are followed.
+
+    Returns:
+        in the order of the text, each once: the XML files first, then meshes, images,
+        volumes, fields and spectra.
+
+    Raises:
+        InputError: the XML cannot be read.
+    """
+    with _resolved_from(path):
+        try:
+            state = mi.parser.parse_file(_config(), str(path))
+        except RuntimeError as error:
+            raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
+        texts = [Path(str(name)) for name in state.files]
+        names = [
+            str(node.props[key])
+            for node in state.nodes
+            for key in node.props
+            if "file" in key
+        ]
+        for text in texts:  # the parser replaces a spectrum's file by its numbers
+            names += _FILENAME.findall(files.read_text(text))
+        resolver = mi.file_resolver()
+        found = [Path(str(resolver.resolve(name))) for name in names if name]
+    there = [item.resolve() for item in (*texts, *found) if item.is_file()]
+    return list(dict.fromkeys(there))
+
+
+def _config() -> Any:
+    config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False  # Python plugins
+    return config
 
 
 def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> None:
@@ -75,11 +112,14 @@ def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> Non
 
 
 @contextmanager
-def _resolved_from(folder: Path) -> Iterator[None]:
-    """Let Mitsuba look for files in a folder first, as its own loader does."""
+def _resolved_from(path: str | Path) -> Iterator[None]:
+    """Let Mitsuba look for files beside a scene's first, as its own loader does."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
-    resolver.prepend(str(folder))
+    resolver.prepend(str(source.resolve().parent))
     mi.set_file_resolver(resolver)
     try:
         yield

@@ -17,7 +17,8 @@ import pydantic
 from mi_nerfattack.errors import InputError
 
 SCHEMA = 1
-#: The first two are those of `metrics.json`, the others those of policy cards.
+#: In the order of documents and plots; others follow, by name. `metrics.json` has the
+#: first two alone.
 ENVIRONMENTS = (
     "surrogate",
     "deployment",
@@ -36,7 +37,7 @@ class Drive:
     """One closed-loop drive of T >= 1 steps; its arrays are read-only float64 copies.
 
     Args:
-        environment: one of `ENVIRONMENTS`.
+        environment: its name, one of `ENVIRONMENTS` or your own.
         route: name of the reference route.
         case: one of `CASES`.
         run: index among the drives of one route, environment and case, from 0.
@@ -48,7 +49,8 @@ class Drive:
         time_s: (T,), time of `states[1:]`, seconds, increasing.
 
     Raises:
-        InputError: for an unknown name, a wrong shape or a value that is not finite.
+        InputError: for an unknown case, an empty name, a wrong shape or a value that is
+            not finite.
     """
 
     environment: str
@@ -62,10 +64,14 @@ class Drive:
     time_s: np.ndarray
 
     def __post_init__(self) -> None:
-        _check_choice("environment", self.environment, ENVIRONMENTS)
-        _check_choice("case", self.case, CASES)
-        if not isinstance(self.route, str) or not self.route:
-            raise InputError(f"Drive.route: {self.route!r}; a non-empty name is needed")
+        if self.case not in CASES:
+            raise InputError(
+                f"Drive.case: {self.case!r}; must be one of {', '.join(CASES)}"
+            )
+        for name in ("environment", "route"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value:
+                raise InputError(f"Drive.{name}: {value!r}; a non-empty name is needed")
         for name in ("run", "seed"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
@@ -384,12 +390,11 @@ def _mean_interval(means: np.ndarray, seed: int) -> list[float] | None:
     return [float(interval.low), float(interval.high)]
 
 
-def _order(key: tuple[str, str, str]) -> tuple[str, int, int]:
-    return key[0], ENVIRONMENTS.index(key[1]), CASES.index(key[2])
+def environment_order(name: str) -> tuple[int, str]:
+    """Return what sorts environments for documents and plots."""
+    known = ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS)
+    return known, name
 
 
-def _check_choice(name: str, value: Any, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise InputError(
-            f"Drive.{name}: {value!r}; must be one of {', '.join(allowed)}"
-        )
+def _order(key: tuple[str, str, str]) -> tuple[str, tuple[int, str], int]:
+    return key[0], environment_order(key[1]), CASES.index(key[2])

@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.report.charts import DPI, RC, WIDTH_PX, save
-from mi_nerfattack.report.metrics import CASES, ENVIRONMENTS, Drive
+from mi_nerfattack.report.metrics import CASES, Drive, environment_order
 
 _STYLES: dict[str, dict[str, Any]] = {
     "random": {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
@@ -155,10 +155,8 @@ def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
     routes = sorted({drive.route for drive in drives})
     if len(routes) != 1:
         raise InputError(f"drives: routes {routes}; a plot shows exactly one route")
-    groups = {
-        name: [d for d in drives if d.environment == name] for name in ENVIRONMENTS
-    }
-    return {name: group for name, group in groups.items() if group}
+    names = sorted({drive.environment for drive in drives}, key=environment_order)
+    return {name: [d for d in drives if d.environment == name] for name in names}
 
 
 def _cases(drives: Sequence[Drive]) -> list[str]:
