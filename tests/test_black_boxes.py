@@ -126,7 +126,7 @@ GOOD = (200, b'{"control": [0.5, -0.25]}', 0)
 def test_http_protocol_and_retries(served, rng, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
     made, seen = handler((503, b"", 0), GOOD, (200, b"", 9), GOOD)
-    policy = HttpPolicy(served(made), timeout_s=1.0, retries=1, control_scale=2.0)
+    policy = HttpPolicy(served(made), timeout_s=3.0, retries=1, control_scale=2.0)
     image, memory = camera(2, rng), policy.initial_memory(2)
     for step in range(2):
         control, memory = policy.step(image, [0, 2], memory)
@@ -155,7 +155,8 @@ def test_http_protocol_and_retries(served, rng, monkeypatch):
 def test_http_errors(answers, message, served, rng, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
     url = served(handler(*answers)[0])
-    policy = HttpPolicy(url, timeout_s=0.5, retries=1)
+    slow = any(wait for _, _, wait in answers)
+    policy = HttpPolicy(url, timeout_s=0.5 if slow else 20.0, retries=1)
     with pytest.raises(InputError, match=f"{url}: {message}"):
         policy.control(camera(2, rng), 0)
 

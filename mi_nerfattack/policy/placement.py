@@ -131,7 +131,8 @@ def scene_ground(scene: Any, highest_m: float = 0.3) -> Ground:
 
 def _first_below(scene: Any, points: np.ndarray, top: float) -> np.ndarray:
     """Return the first surface (n,) below a height at points (n, 2); -inf for none."""
-    x, y = (mi.Float(np.asarray(points[:, i], np.float32)) for i in range(2))
+    # lists: memory from NumPy has an alignment of its own, and so its own kernels
+    x, y = (mi.Float(points[:, i].tolist()) for i in range(2))
     ray = mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1))
     return top - scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
 
