@@ -83,7 +83,7 @@ def assert_close(found, expected, tolerance=1e-8):
     [
         ("dubins", "rk4", 1, 0, 1),
         ("dubins", "euler", 1, 0, 10),
-        ("ackermann_rate", "rk4", 3, 4, 8),
+        ("ackermann_rate", "rk4", 3, 4, 5),
         ("bicycle", "implicit_midpoint", 2, 1, 5),
     ],
 )

@@ -75,7 +75,7 @@ def make_loop(
 
     A coarse one has few samples a ray; `fog` is the logarithm of the scene's density.
     """
-    wider = 5 if coarse else 1
+    wider = 12 if coarse else 1
     scene = blob(GridLayout(2, 6, 9), 25.0, fog, 0.5 * wider, 1)
     item = blob(GridLayout(3, 6, 12), 1.0, 2.5, 0.08 * wider, 2)
     sensor = FieldSensor(
