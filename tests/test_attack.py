@@ -150,7 +150,7 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_attack_resumes(folder, tmp_path, number):
     output = tmp_path / "run"
-    text = SCENARIO.replace("iterations = 3", "iterations = 20")
+    text = SCENARIO.replace("iterations = 3", "iterations = 10")
     text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
     path = folder / f"long_{number}.toml"
     path.write_text(text)
@@ -181,7 +181,7 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
     again = output / "scenario.toml"
     run("attack", again, "-o", output, "--resume", cwd=tmp_path, check=0)
     history = json.loads((output / "attack.json").read_text())
-    assert [record["iteration"] for record in history] == list(range(20))
+    assert [record["iteration"] for record in history] == list(range(10))
     assert (output / "metrics.json").exists()
 
 
