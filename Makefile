@@ -13,7 +13,7 @@ WORKERS ?= 2
 
 help:
 	@echo "make demo   run the whole chain on the bundled scene, about 10 minutes"
-	@echo "make test   run the tests, less than 20 minutes"
+	@echo "make test   run the tests, about 20 minutes; less once kernels are compiled"
 	@echo "make lint   check format, lint and types"
 	@echo "make clean  remove the virtual environment and what was built"
 
