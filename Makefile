@@ -12,7 +12,7 @@ WORKERS ?= 2
 .PHONY: help demo test lint check-python clean
 
 help:
-	@echo "make demo   run the whole chain on the bundled scene, about 10 minutes"
+	@echo "make demo   run the whole chain on the bundled scene, less than 10 minutes"
 	@echo "make test   run the tests, about 20 minutes; less once kernels are compiled"
 	@echo "make lint   check format, lint and types"
 	@echo "make clean  remove the virtual environment and what was built"
