@@ -267,10 +267,12 @@ def _check(
             f"frames: {frames}, one shard of up to {size}; at least two, of which one "
             "is held out, or give validation_frames"
         )
-    for drives in (settings.validation, settings.final):
+    measured = (settings.validation, settings.final)
+    found = len(_load_objects(sites[0], max(drives.objects for drives in measured)))
+    for drives in measured:
         departure_limits(routes, drives.car_width_m)
-        if drives.objects and (objects := _load_objects(sites[0], drives.objects)):
-            check_roadside(routes, drives, len(objects))
+        if drives.objects and found:
+            check_roadside(routes, drives, found)
 
 
 def check_camera(site: AbstractSite) -> None:
