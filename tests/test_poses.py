@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -14,10 +14,11 @@ import pytest
 from PIL import Image
 
 from mi_nerfattack import cli, files
+from mi_nerfattack.capture.colmap_process import MARK
 from mi_nerfattack.capture.frames import read_images
 from mi_nerfattack.capture.poses import PoseOptions, estimate_poses, upright
-from mi_nerfattack.capture.structure import Structure, _Steps
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.capture.structure import Structure, _Stages
+from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera import Camera, from_fov, look_at
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -231,9 +232,10 @@ class TestUnusable:
         self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
 
     def test_without_pycolmap(self, tmp_path, monkeypatch):
-        monkeypatch.setitem(sys.modules, "pycolmap", None)
+        (tmp_path / "pycolmap.py").write_text("raise ImportError('gone')")
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         folder = self.photographs(tmp_path / "p", 3)
-        self.refused(folder, "pycolmap: .*pip install pycolmap")
+        self.refused(folder, "pycolmap: gone; .*pip install pycolmap")
 
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_scale(self, scale):
@@ -256,55 +258,88 @@ class TestUnusable:
         assert (folder / "0.jpg").read_bytes() == before
 
 
-class Token:
-    """Stands for pycolmap's token of cancellation."""
+class TestProcess:
+    """pycolmap's process, with modules of its name that fail on purpose."""
 
-    def __init__(self) -> None:
-        self.cancelled = threading.Event()
-        self.cancel = self.cancelled.set
+    @pytest.fixture
+    def poses(self, tmp_path, monkeypatch):
+        """Estimate poses with a pycolmap whose extract_features is the given code."""
+        folder = TestUnusable().photographs(tmp_path / "p", 3)
 
+        def call(code: str, progress=lambda *_: None) -> None:
+            lines = [
+                "import os, pathlib, signal, sys, time",
+                "class CameraMode: SINGLE = 0",
+                "def set_random_seed(seed): pass",
+                "def extract_features(database, *_):",
+                *(f"    {line}" for line in code.splitlines()),
+            ]
+            (tmp_path / "pycolmap.py").write_text("\n".join(lines) + "\n")
+            monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+            estimate_poses(folder, tmp_path / "out", progress=progress)
 
-def test_interrupt_cancels_and_waits(tmp_path):
-    def interrupt(stage: str, done: int, total: int) -> None:
-        raise KeyboardInterrupt
+        return call
 
-    def work(cancellation_token: Token) -> None:
-        assert cancellation_token.cancelled.wait(10)
-        time.sleep(0.1)
-        ended.append(True)
-        raise InterruptedError
+    @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+    @pytest.mark.parametrize("name", ["SIGBUS", "SIGKILL"])
+    def test_crash_is_a_message(self, poses, tmp_path, name):
+        code = f"print('E full', flush=True)\nos.kill(os.getpid(), signal.{name})"
+        message = f"ended by {name} at the stage 'features' .*E full.*--long-edge"
+        with pytest.raises(SetupError, match=message):
+            poses(code)
+        assert not (tmp_path / "out").exists()
 
-    ended: list[bool] = []
-    steps = _Steps(tmp_path / "database.db", Token(), interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        steps.run("features", 3, lambda: 0, work)
-    assert ended
+    def test_exception_is_a_message(self, poses):
+        with pytest.raises(SetupError, match="code 1 .*ZeroDivisionError: why"):
+            poses("raise ZeroDivisionError('why')")
 
+    def test_interrupt_ends_the_process(self, poses, tmp_path):
+        pid = tmp_path / "pid"
+        code = (
+            f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
+            "print('I Processed file [2/3]', flush=True)\n"
+            "time.sleep(100)"
+        )
+        seen = []
 
-def test_failures_of_the_thread_arrive(tmp_path):
-    def work(cancellation_token: Token) -> None:
-        raise ZeroDivisionError
+        def interrupt(*call) -> None:
+            seen.append(call)
+            if call == ("features", 2, 3):
+                raise KeyboardInterrupt
 
-    steps = _Steps(tmp_path / "database.db", Token(), lambda *_: None)
-    with pytest.raises(ZeroDivisionError):
-        steps.run("features", 3, "SELECT 1", work)
+        start = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            poses(code, interrupt)
+        assert time.monotonic() - start < 50
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid.read_text()), 0)
+        assert ("features", 0, 3) in seen
 
+    def test_process_ends_with_its_parent(self, tmp_path):
+        (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
+        command = [sys.executable, "-m", "mi_nerfattack.capture.colmap_process"]
+        task = json.dumps({"work": "", "folder": "", "names": []})
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        result = subprocess.run(
+            command, input=task + "\n", text=True, timeout=50, env=environment
+        )
+        assert result.returncode == 1
 
-_TERMINATED = """
-import os, signal, sys
-import mi_nerfattack
-from mi_nerfattack.capture import structure
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
-structure._pycolmap()
-os.kill(os.getpid(), signal.SIGTERM)
-"""
-
-
-def test_pycolmap_leaves_sigterm_to_us():
-    pytest.importorskip("pycolmap")
-    command = [sys.executable, "-c", _TERMINATED]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 7 and result.stderr == ""
+    @pytest.mark.parametrize(
+        ("line", "done"),
+        [
+            ("Processed file [3/4]", 45),
+            ("Processing image [3/4]", 30),
+            ("Processing block [1/3, 3/3]", 13),
+            ("Processing block [3/3, 1/3]", 40),
+        ],
+    )
+    def test_progress_of_a_log_line(self, line, done):
+        calls = []
+        stages = _Stages(lambda *call: calls.append(call))
+        told = MARK + json.dumps({"stage": "s", "total": 60})
+        stages.follow([told, f"I2026 7 pairing.cc:2] {line}\n"])
+        assert calls == [("s", 0, 60), ("s", done, 60)]
 
 
 def write_turned(path: Path, image: np.ndarray) -> None:

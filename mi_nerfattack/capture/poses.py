@@ -104,6 +104,7 @@ def estimate_poses(
     Raises:
         InputError: too few photographs, an unreadable one, several sizes, or too few
             could be placed. Nothing is written then.
+        SetupError: pycolmap failed or crashed; nothing is written either.
     """
     options = options or PoseOptions()
     root = Path(photographs)
