@@ -68,6 +68,22 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     return raw
 
 
+def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -> None:
+    """Read rows of a file that holds rows of one size, one after the other.
+
+    Args:
+        path: a regular file.
+        start: bytes before its first row.
+        rows: (k,) numbers from 0.
+        out: (k, ...), in C order; filled.
+    """
+    with _reported(path), open(path, "rb", buffering=0) as file:
+        for row, place in zip(rows.tolist(), out, strict=True):
+            file.seek(start + row * place.nbytes)
+            if file.readinto(place.reshape(-1).view(np.uint8).data) != place.nbytes:
+                raise InputError(f"{path}: ends before row {row}; copy it again")
+
+
 def read_text(path: str | Path) -> str:
     """Read a UTF-8 text file of at most 256 MiB; a byte order mark is dropped."""
     raw = read_bytes(path, MAX_TEXT_BYTES)

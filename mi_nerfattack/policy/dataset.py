@@ -23,18 +23,44 @@ from mi_nerfattack.errors import InputError
 COLUMNS = {"frames": np.uint8, "goals": np.int64, "controls": np.float32}
 
 
+class FramesFile:
+    """Frames of one shard on the disk, read row by row.
+
+    No file stays open or mapped: either holds a descriptor, of which a process may have
+    1,024 on many systems, and large collections have more shards.
+
+    Args:
+        path: `frames.npy`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        column = _map_column(path, np.uint8)
+        self.path, self._start = path, column.offset
+        self.shape, self.dtype = column.shape, column.dtype
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return self.shape[0]
+
+    def __getitem__(self, rows: np.ndarray) -> np.ndarray:
+        """Read rows (k,): (k, height, width, 3), as an array in memory gives them."""
+        result = np.empty((len(rows), *self.shape[1:]), np.uint8)
+        files.read_rows(self.path, self._start, rows, result)
+        return result
+
+
 @dataclass(frozen=True, eq=False)
 class FrameDataset:
     """Rows of several shards under one index.
 
     Args:
-        frames: one array (n_k, height, width, 3) uint8 sRGB for each shard, in
-            memory or memory-mapped.
+        frames: (n_k, height, width, 3) uint8 sRGB for each shard, in memory or on the
+            disk.
         goals: (sum n_k,) int64.
         controls: (sum n_k,) float32, rad/s.
     """
 
-    frames: tuple[np.ndarray, ...]
+    frames: tuple[np.ndarray | FramesFile, ...]
     goals: np.ndarray
     controls: np.ndarray
 
@@ -64,17 +90,19 @@ class FrameDataset:
         if not folders:
             raise InputError("dataset: no folders; give at least one shard")
         shards = [
-            [
-                _map_column(Path(folder) / f"{name}.npy", COLUMNS[name])
-                for name in COLUMNS
-            ]
+            (
+                FramesFile(Path(folder) / "frames.npy"),
+                _read_column(Path(folder), "goals"),
+                _read_column(Path(folder), "controls"),
+            )
             for folder in folders
         ]
         for folder, shard in zip(folders, shards, strict=True):
             if len({len(column) for column in shard}) != 1:
                 raise InputError(
                     f"{folder}: {[len(column) for column in shard]} rows of "
-                    f"{list(COLUMNS)}; write the shard again"
+                    f"{list(COLUMNS)}; remove the folder, and the command that "
+                    "collected it renders it again"
                 )
         frames, goals, controls = zip(*shards, strict=True)
         return cls(tuple(frames), np.concatenate(goals), np.concatenate(controls))
@@ -89,7 +117,7 @@ class FrameDataset:
         total = hashlib.sha256()
         for array in (*self.frames, self.goals, self.controls):
             total.update(str((array.shape, array.dtype)).encode())
-            total.update(np.ascontiguousarray(array).reshape(-1).data)
+            total.update(array[np.arange(len(array))].reshape(-1).data)
         return total.hexdigest()
 
     def read_frames(self, rows: np.ndarray) -> np.ndarray:
@@ -183,20 +211,29 @@ def divide_shards(
 
 def _draw_of(shard: Path) -> float:
     """Return a number in [0, 1) that looks random and is the shard's own."""
-    controls = _map_column(shard / "controls.npy", COLUMNS["controls"])
-    return zlib.crc32(controls.tobytes()) / 2**32
+    return zlib.crc32(_read_column(shard, "controls").tobytes()) / 2**32
 
 
-def _map_column(path: Path, dtype: type) -> np.ndarray:
+def _read_column(shard: Path, name: str) -> np.ndarray:
+    """Copy one of the small .npy files of a shard into memory, checked."""
+    return np.array(_map_column(shard / f"{name}.npy", COLUMNS[name]))
+
+
+def _map_column(path: Path, dtype: type) -> np.memmap:
     """Memory-map one .npy file and check its type and shape."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); write it again") from error
+        raise InputError(
+            f"{path}: cannot be read ({error}); remove its folder, and the command "
+            "that collected it renders it again"
+        ) from error
     image = len(array.shape) == 4 and array.shape[3] == 3
-    if array.dtype != dtype or not (image if dtype is np.uint8 else array.ndim == 1):
+    fits = array.dtype == dtype and array.flags.c_contiguous
+    if not fits or not (image if dtype is np.uint8 else array.ndim == 1):
         raise InputError(
             f"{path}: {array.dtype} {array.shape}; {np.dtype(dtype)} of shape "
-            f"{'(n, height, width, 3)' if dtype is np.uint8 else '(n,)'} is needed"
+            f"{'(n, height, width, 3)' if dtype is np.uint8 else '(n,)'}, in C order, "
+            "is needed"
         )
     return array
