@@ -85,6 +85,45 @@ def test_killed_collection_continues_without_gaps_or_duplicates(tmp_path):
     assert contents(part) == contents(whole)
 
 
+STARTING = """
+if __name__ == "__mp_main__":  # what a process imports before it works
+    import pathlib, time
+    pathlib.Path("started").touch()
+    time.sleep(60)
+
+from test_collect_workers import Piece
+from mi_nerfattack.policy.workers import Processes
+
+if __name__ == "__main__":
+    try:
+        Processes(2).run(Piece(None), range(2), print)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs process groups")
+def test_ctrl_c_while_workers_start_is_told_once(tmp_path):
+    """A terminal sends it to all processes."""
+    (tmp_path / "run.py").write_text(STARTING)
+    process = subprocess.Popen(
+        [sys.executable, "run.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "started").exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.communicate(timeout=30) == ("interrupted\n", "")
+
+
 @dataclass(frozen=True)
 class Piece(AbstractWork):
     """Ends its process at piece 2, or raises there."""

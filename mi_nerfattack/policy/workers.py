@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -91,11 +94,12 @@ class Processes(AbstractWorkers):
 
     def run(self, work: AbstractWork, pieces: Sequence[int], report: OnUnits) -> None:
         """Do all pieces."""
-        team = [_Member(work) for _ in range(min(self.count, len(pieces)))]
+        team: list[_Member] = []
         left = list(reversed(pieces))
         try:
-            for member in team:
-                member.give(left)
+            for _ in range(min(self.count, len(pieces))):
+                team.append(_Member(work))
+                team[-1].give(left)
             while busy := {m.connection: m for m in team if m.piece is not None}:
                 for connection in wait(list(busy)):
                     member = busy[connection]  # pyright: ignore[reportArgumentType]
@@ -121,7 +125,8 @@ class _Member:
         self.connection, theirs = context.Pipe()
         self.piece: int | None = None
         self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-        self._process.start()
+        with _blocked_interrupts():
+            self._process.start()
         theirs.close()  # so that its end is noticed
 
     def give(self, left: list[int]) -> None:
@@ -170,9 +175,26 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+@contextmanager
+def _blocked_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C, which a terminal sends to all, from processes that start here.
+
+    They inherit the mask; else it would end them, with a traceback each, in the seconds
+    until `_serve` runs.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # not on Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # its start would unblock them
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _serve(work: AbstractWork, connection: Connection) -> None:
     """Do pieces until there are no more; runs in a process of its own."""
-    import signal
     import traceback
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the employer decides
