@@ -19,7 +19,8 @@ from mi_nerfattack.commands.bars import StageBars
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.registry import bundled_place
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.dataset import FrameDataset
+from mi_nerfattack.folders import exclusive
+from mi_nerfattack.policy.dataset import FrameDataset, write_shard
 from mi_nerfattack.policy.evaluate import EvaluateSettings
 from mi_nerfattack.policy.export_program import export_program
 from mi_nerfattack.policy.exported import load_exported
@@ -273,6 +274,49 @@ def test_goals_cameras_and_weights_must_fit(tmp_path):
         imitate([small_camera], ROUTES, SETTINGS, tmp_path, HERE)
     with pytest.raises(InputError, match=r"start: .*\(2, 1.5, 'rad/s'\) are needed"):
         imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=PilotNet(5))
+    assert not list(tmp_path.iterdir())  # told before the first frame
+
+
+@pytest.mark.parametrize(
+    ("size", "goal", "message"),
+    [
+        ((100, 50), 0, "other: frames of 100 x 50 px; PilotNet takes 200 x 66"),
+        ((200, 66), 2, "other: goals: 2 to 2; at least 0 and below 2"),
+    ],
+)
+def test_earlier_frames_must_fit(tmp_path, size, goal, message):
+    other = tmp_path / "other"
+    write_shard(other, np.zeros((1, size[1], size[0], 3), np.uint8), [goal], [0.0])
+    with pytest.raises(InputError, match=message):
+        imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE, more=[other])
+    assert not (tmp_path / "data").exists()  # told before the first frame
+
+
+@dataclasses.dataclass(frozen=True)
+class MissingSite(PaintedSite):
+    """Needs a package that is not there."""
+
+    def open(self, conditions):
+        raise InputError("environment 'gone': pip install it")
+
+
+def test_an_environment_that_is_not_there_is_told_before_the_first_frame(tmp_path):
+    missing = MissingSite("mujoco", size_px=(200, 66))
+    settings = dataclasses.replace(SETTINGS, frames={"mitsuba": 64, "mujoco": 1})
+    with pytest.raises(InputError, match="pip install it"):
+        imitate([SITE, missing], ROUTES, settings, tmp_path, HERE)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_process_works_in_a_folder(tmp_path):
+    partial = tmp_path / "round_0" / ".frames.npy.0123456789ab.tmp"
+    files.make_folder(partial.parent)
+    partial.touch()  # of a killed writer
+    with exclusive(tmp_path), pytest.raises(InputError, match="another process works"):
+        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE)
+    assert list(tmp_path.rglob("*")) == [partial.parent, partial]
+    imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE)
+    assert not partial.exists()
 
 
 def run_train(tmp_path, *arguments: str) -> int:

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.folders import exclusive, remove_partial
 from mi_nerfattack.policy.collect import OnFrames, collect
 from mi_nerfattack.policy.dataset import FrameDataset, divide_shards
 from mi_nerfattack.policy.evaluate import check_roadside, departure_limits
@@ -19,7 +21,7 @@ from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.sites import AbstractSite
 from mi_nerfattack.policy.sources import AbstractSource, PolicyDrives
-from mi_nerfattack.policy.train import Progress, fit_policy
+from mi_nerfattack.policy.train import Progress, check_labels, fit_policy
 from mi_nerfattack.policy.validation import ClosedLoop, rank
 from mi_nerfattack.policy.workers import AbstractWorkers
 from mi_nerfattack.vehicle.route import Route
@@ -71,35 +73,23 @@ def imitate(
         more: shards of earlier collections to train on, too.
 
     Raises:
-        InputError: no frames wanted, an unknown site, a goal missing, a camera or a
-            route that does not fit, or the folder holds what was made with other
-            settings.
+        InputError: before the first frame, no frames wanted, an unknown site, one
+            that cannot be opened, a goal missing, a camera, a route, first weights or
+            frames of `more` that do not fit, or another process that works in the
+            folder; then, where the folder holds what was made with other settings.
     """
     _check(sites, routes, settings, more)
-    run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
-    run.take([*more, *run.collect("round_0", settings.frames, settings.cloning, 0)])
-    run.held_out += run.collect(
-        "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
-    )
     torch.manual_seed(settings.seed)
     car = sites[0].car
     module = PilotNet(len(routes), car.max_control, car.control_unit)
     if start is not None:
         _take_weights(module, start)
-    with run:
-        history = [run.train(module, 0)]
-        weights = [run.save(module, 0)]
-        for number in range(1, settings.dagger_rounds + 1):
-            drives = PolicyDrives(weights[-1], settings.horizon, settings.expert_share)
-            wanted = settings.dagger_frames
-            run.take(run.collect(f"round_{number}", wanted, drives, number))
-            history.append(run.train(module, number))
-            weights.append(run.save(module, number))
-        ranks = [min(rank(row) for row in rows if row["measured"]) for rows in history]
-        best = ranks.index(min(ranks))
-        module = PilotNet.load(weights[best])
-        card = run.card(module)
-    return Imitated(module, history, best, card, [*run.training, *run.held_out])
+    if more:
+        _check_frames(module, more)
+    with exclusive(files.make_folder(folder)):
+        remove_partial(folder)  # of killed writers
+        run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
+        return run.run(module, more)
 
 
 class _Imitation:
@@ -119,6 +109,34 @@ class _Imitation:
         self.training: list[Path] = []
         self.held_out: list[Path] = []
         self._loop: ClosedLoop | None = None
+
+    def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
+        """Do all stages, beginning with the weights of `module`."""
+        settings = self.settings
+        self.take(
+            [*more, *self.collect("round_0", settings.frames, settings.cloning, 0)]
+        )
+        self.held_out += self.collect(
+            "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
+        )
+        with self:
+            history = [self.train(module, 0)]
+            weights = [self.save(module, 0)]
+            for number in range(1, settings.dagger_rounds + 1):
+                drives = PolicyDrives(
+                    weights[-1], settings.horizon, settings.expert_share
+                )
+                wanted = settings.dagger_frames
+                self.take(self.collect(f"round_{number}", wanted, drives, number))
+                history.append(self.train(module, number))
+                weights.append(self.save(module, number))
+            ranks = [
+                min(rank(row) for row in rows if row["measured"]) for rows in history
+            ]
+            best = ranks.index(min(ranks))
+            module = PilotNet.load(weights[best])
+            card = self.card(module)
+        return Imitated(module, history, best, card, [*self.training, *self.held_out])
 
     def __enter__(self) -> _Imitation:
         """Load what validation drives in, after the workers have gone."""
@@ -273,6 +291,9 @@ def _check(
         departure_limits(routes, drives.car_width_m)
         if drives.objects and found:
             check_roadside(routes, drives, found)
+    # what cannot be made is told now, not after the hours of those before it
+    for site in sites:
+        site.open(site.typical()).close()
 
 
 def check_camera(site: AbstractSite) -> None:
@@ -295,6 +316,22 @@ def _load_objects(site: AbstractSite, count: int) -> list[GridField]:
     while 0 < len(objects) < count:
         objects += site.load_objects()
     return objects
+
+
+def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
+    """Raise `InputError` unless a policy can be trained on shards."""
+    for shard in shards:
+        data = FrameDataset.from_folders([shard])
+        height, width = data.frames[0].shape[1:3]
+        if (height, width) != IMAGE_SHAPE:
+            raise InputError(
+                f"{shard}: frames of {width} x {height} px; PilotNet takes "
+                f"{IMAGE_SHAPE[1]} x {IMAGE_SHAPE[0]}"
+            )
+        try:
+            check_labels(module, data)
+        except InputError as error:
+            raise InputError(f"{shard}: {error}") from error
 
 
 def _take_weights(module: PilotNet, start: PilotNet) -> None:

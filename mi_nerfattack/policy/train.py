@@ -106,12 +106,12 @@ def fit_policy(
         InputError: goals or controls out of the policy's range; a checkpoint of
             other settings, data or first weights; a loss that is not finite.
     """
-    _check_labels(module, data)
+    check_labels(module, data)
     if held_out is None:
         train_rows, held_rows = data.split(settings.held_out, settings.seed)
         held = Part(data, held_rows)
     else:
-        _check_labels(module, held_out)
+        check_labels(module, held_out)
         train_rows, held = np.arange(len(data)), Part.of_all(held_out)
     module.to(device).requires_grad_(True)
     parts = Part(data, train_rows), held
@@ -322,7 +322,7 @@ def _digest_weights(module: PilotNet) -> str:
     return total.hexdigest()
 
 
-def _check_labels(module: PilotNet, data: FrameDataset) -> None:
+def check_labels(module: PilotNet, data: FrameDataset) -> None:
     """Raise `InputError` for goals or controls that the policy cannot express."""
     low, high = int(data.goals.min()), int(data.goals.max())
     if low < 0 or high >= module.goals:
