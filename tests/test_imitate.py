@@ -350,6 +350,16 @@ def test_train_says_what_is_wrong(tmp_path, capsys, arguments, message):
     assert not (tmp_path / "policy.safetensors").exists()
 
 
+@pytest.mark.parametrize("name", ["policy.safetensors", "policy.pt2", "policy.json"])
+def test_what_cannot_be_written_is_told_before_the_first_frame(tmp_path, capsys, name):
+    if name.endswith("tensors"):
+        (tmp_path / name).symlink_to(tmp_path / "nowhere" / name)
+    else:
+        (tmp_path / name).mkdir()
+    assert run_train(tmp_path, "--frames", "moon", "1") == 2
+    assert str(tmp_path / name) in capsys.readouterr().err
+
+
 def test_frames_of_rounds_that_are_not_done_need_no_environment():
     """The preset's rounds have surrogate frames, and the room has no field."""
     train = Train(Path("o"), Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)

@@ -39,14 +39,14 @@ def check_output(path: Path) -> None:
 
     Called before the work starts, so that a mistyped path costs no fit.
     """
+    from mi_nerfattack import files
     from mi_nerfattack.errors import InputError
 
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: this file must end in .safetensors")
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: is not a folder; make it first")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give a file")
+    files.check_writable(path)
 
 
 def report_folder(output: Path) -> Path:

@@ -96,9 +96,10 @@ class Train:
         """Collect, train, validate and write."""
         from rich.console import Console
 
-        from mi_nerfattack import variant
+        from mi_nerfattack import files, variant
         from mi_nerfattack.commands.bars import StageBars
         from mi_nerfattack.commands.fit_report import check_output
+        from mi_nerfattack.policy.export_program import SUFFIX
         from mi_nerfattack.policy.imitate import imitate
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.policy.presets import find_preset
@@ -108,6 +109,8 @@ class Train:
         from mi_nerfattack.report.table import card_table
 
         check_output(self.output)
+        for suffix in (SUFFIX, ".json"):
+            files.check_writable(self.output.with_suffix(suffix))
         variant.ensure()
         preset = find_preset(self.preset)
         place, settings = self._place(preset), self._settings(preset)
