@@ -196,6 +196,12 @@ def test_a_training_writes_down_its_data_and_settings(tmp_path):
     assert facts["command"] == "train it" and facts["seed"] == 5
     assert facts["augmentation"]["exposure_ev"] > 0
     assert facts["data"] == record["data"]
+    # those of the collections and trainings are others: theirs are overridden
+    assert "frames" not in facts["settings"]["collecting"]
+    assert "seed" not in facts["settings"]["collecting"]
+    assert "seed" not in facts["settings"]["training"]
+    kinds = [item["kind"] for item in facts["settings"]["cloning"]["sources"]]
+    assert kinds == ["scattered", "expert"]
 
 
 def test_commands_are_written_anew_without_the_machine_s_folders():

@@ -40,7 +40,7 @@ def training_record(
     record = {
         "command": command,
         "seed": settings.seed,
-        "settings": asdict(settings),
+        "settings": _settings(settings),
         "augmentation": asdict(settings.training.augmentation),
         "data": count_frames(data, shards),
         "sites": {
@@ -54,6 +54,19 @@ def training_record(
         },
     }
     return json.loads(json.dumps(record, default=str))
+
+
+def _settings(settings: ImitationSettings) -> dict[str, Any]:
+    """Return the settings without those that others override."""
+    values = asdict(settings)
+    values["cloning"] = settings.cloning.describe()
+    for part, name in (
+        ("collecting", "frames"),
+        ("collecting", "seed"),
+        ("training", "seed"),
+    ):
+        del values[part][name]
+    return values
 
 
 def count_frames(data: Path, shards: Sequence[Path]) -> dict[str, int]:
