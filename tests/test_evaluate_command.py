@@ -30,7 +30,9 @@ from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.imitate import ImitationSettings
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.training_record import training_record
+from mi_nerfattack.policy.workers import InThisProcess, Processes
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
+from mi_nerfattack.sections import PolicySection
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -232,6 +234,14 @@ def test_a_summary_counts_all_drives():
     figures = {"n": 5, "departures": 1, "cross_track_mean_m": 0.25}
     text = summary({"mitsuba": {"left": {"clean": figures, "random_objects": figures}}})
     assert text.startswith("2 of 10 drives left the lane")
+
+
+def test_one_process_asks_a_server_that_may_keep_a_state():
+    """It starts anew where step is 0, and cannot tell the drives of two apart."""
+    here, there = PolicySection(file="mine.onnx"), PolicySection(url="http://a:1")
+    assert Evaluate()._workers(there) == InThisProcess()
+    assert Evaluate(workers=2)._workers(there) == Processes(2)
+    assert Evaluate(workers=3)._workers(here) == Processes(3)
 
 
 @pytest.mark.parametrize(

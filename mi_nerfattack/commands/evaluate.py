@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
     from mi_nerfattack.policy.evaluate_work import EvaluateWork, Evaluation
     from mi_nerfattack.policy.workers import AbstractWorkers
+    from mi_nerfattack.sections import PolicySection
     from mi_nerfattack.vehicle.route import Route
 
 
@@ -66,8 +67,8 @@ class Evaluate:
     options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
     """How the policy is called."""
     workers: int | None = None
-    """Processes that drive; one a core by default. 1 drives in this process, as carla
-    always does."""
+    """Processes that drive; one a core by default, for a URL 1: its server may keep a
+    state. 1 drives in this process, as carla always does."""
     drives: Path = Path("runs/evaluate")
     """Folder of finished drives; those of other evaluations can be in it, too."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -91,7 +92,8 @@ class Evaluate:
         if self.page is not None:
             files.make_folder(self.page)
         variant.ensure()
-        work, workers = self._work(), self._workers()
+        work = self._work()
+        workers = self._workers(work.policy)
         record = None if self.page is None else work.record()
         start = time.monotonic()
         with StageBars() as bars:
@@ -184,14 +186,16 @@ class Evaluate:
         self.where.check(self.environments)
         return parse_conditions(self.environments, self.conditions, self.spp)
 
-    def _workers(self) -> AbstractWorkers:
+    def _workers(self, policy: PolicySection) -> AbstractWorkers:
         from mi_nerfattack.policy.workers import (
             InThisProcess,
             Processes,
             available_cores,
         )
 
-        default = 1 if "carla" in self.environments else available_cores()
+        # a server that keeps a state would mix the drives of several processes
+        alone = "carla" in self.environments or policy.url is not None
+        default = 1 if alone else available_cores()
         count = default if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
 
