@@ -29,7 +29,7 @@ from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.policy import evaluate_work
 from mi_nerfattack.policy.imitate import ImitationSettings
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.training_record import training_record
+from mi_nerfattack.policy.training_record import read_record, training_record
 from mi_nerfattack.policy.workers import InThisProcess, Processes
 from mi_nerfattack.report.policy_page import policy_name, summary, training_facts
 from mi_nerfattack.sections import PolicySection
@@ -138,6 +138,15 @@ def test_a_damaged_record_is_found_before_the_first_drive(place, capsys):
     assert cli.main([*place, "--page", "out"]) == 2
     assert "net.json" in capsys.readouterr().err
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"schema": "1.0"}', '{"training": true}', '{"schema": 2, "training": [1]}', "[]"],
+)
+def test_another_program_s_file_beside_a_policy_is_no_record(tmp_path, text):
+    (tmp_path / "net.json").write_text(text)
+    assert read_record(tmp_path / "net.json") is None
 
 
 def test_conditions_are_rows_of_their_own(place, capsys):

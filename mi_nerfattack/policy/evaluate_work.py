@@ -39,6 +39,7 @@ from mi_nerfattack.policy.load import load_policy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.placement import scene_ground
 from mi_nerfattack.policy.sites import CARLA
+from mi_nerfattack.policy.training_record import read_record
 from mi_nerfattack.policy.workers import (
     AbstractWork,
     AbstractWorkers,
@@ -192,14 +193,11 @@ class EvaluateWork(AbstractWork):
         }
 
     def record(self) -> dict[str, Any] | None:
-        """Read the JSON that training writes beside a policy; None without one."""
+        """Read what training wrote beside the policy; None where it wrote nothing."""
         if self.policy.file is None or ".py:" in self.policy.file:
             return None
         path = resolve(self.policy.file, self.base).with_suffix(".json")
-        if not path.is_file():
-            return None
-        found = files.read_json(path)
-        return found if isinstance(found, dict) else None
+        return read_record(path) if path.is_file() else None
 
     def _identity(self, job: Job) -> dict[str, str]:
         shared = self.identities[job.environment.label, job.route.name]
