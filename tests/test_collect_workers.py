@@ -17,6 +17,7 @@ import pytest
 from roadside import PaintedSite, bent, small, straight
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy import workers
 from mi_nerfattack.policy.collect import CollectSettings, collect
 from mi_nerfattack.policy.sources import Scattered
 from mi_nerfattack.policy.workers import AbstractWork, InThisProcess, Processes
@@ -158,3 +159,8 @@ def test_an_error_in_a_worker_is_the_callers():
 def test_number_of_workers_is_checked(count):
     with pytest.raises(InputError, match="workers"):
         Processes(count)
+
+
+def test_a_large_machine_has_as_many_workers_as_are_allowed(monkeypatch):
+    monkeypatch.setattr(workers, "cores", lambda: 384)
+    assert Processes().count == 256

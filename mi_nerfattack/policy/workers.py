@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -13,8 +12,11 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from mi_nerfattack.cores import cores
 from mi_nerfattack.errors import InputError
 
+#: Most processes.
+MOST = 256
 #: Called with units of work that were just done.
 OnUnits = Callable[[int], None]
 
@@ -83,14 +85,14 @@ class Processes(AbstractWorkers):
     process, however it ends; when one of them ends early, so do the others.
 
     Args:
-        count: at least 1.
+        count: 1 to `MOST`.
     """
 
     count: int = field(default_factory=lambda: available_cores())
 
     def __post_init__(self) -> None:
-        if not isinstance(self.count, int) or not 1 <= self.count <= 256:
-            raise InputError(f"workers: {self.count!r}; 1 to 256")
+        if not isinstance(self.count, int) or not 1 <= self.count <= MOST:
+            raise InputError(f"workers: {self.count!r}; 1 to {MOST}")
 
     def run(self, work: AbstractWork, pieces: Sequence[int], report: OnUnits) -> None:
         """Do all pieces."""
@@ -169,10 +171,8 @@ class _Member:
 
 
 def available_cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):  # not everywhere
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return the number of cores that this process may use, at most `MOST`."""
+    return min(cores(), MOST)
 
 
 @contextmanager
