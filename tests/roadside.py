@@ -150,8 +150,8 @@ class PaintedSite(AbstractSite):
         self.opened[-1].name = self.name
         return self.opened[-1]
 
-    def load_objects(self):
-        return [small_grid()] if self.objects else []
+    def load_objects(self, least=1):
+        return [small_grid() for _ in range(max(1, least))] if self.objects else []
 
     def load_ground(self):
         return flat_ground

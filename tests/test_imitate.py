@@ -24,7 +24,7 @@ from mi_nerfattack.policy.dataset import FrameDataset, write_shard
 from mi_nerfattack.policy.evaluate import EvaluateSettings
 from mi_nerfattack.policy.export_program import export_program
 from mi_nerfattack.policy.exported import load_exported
-from mi_nerfattack.policy.imitate import _check, _load_objects, imitate
+from mi_nerfattack.policy.imitate import _check, imitate
 from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.presets import PRESETS, find_preset
@@ -256,14 +256,6 @@ def test_sites_without_frames_need_not_be_there(change):
     settings = dataclasses.replace(SETTINGS, **change)
     assert settings.sites == ("mitsuba",)
     _check([SITE], ROUTES, settings, [])
-
-
-def test_there_are_as_many_objects_as_stand_beside_the_road():
-    assert len(SITE.load_objects()) == 1
-    objects = _load_objects(SITE, 3)
-    assert len({id(item) for item in objects}) == 3
-    assert len(_load_objects(SITE, 0)) == 1
-    assert _load_objects(PaintedSite(objects=False), 2) == []
 
 
 def test_goals_cameras_and_weights_must_fit(tmp_path):

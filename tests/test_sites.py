@@ -87,3 +87,12 @@ def test_the_server_counts_for_carla_alone(tmp_path):
     for name, is_equal in (("carla", False), ("mitsuba", True)):
         one, two = (PlaceSite(name, item).describe() for item in (place, other))
         assert (one == two) is is_equal
+
+
+def test_there_are_as_many_objects_as_stand_beside_the_road(tmp_path):
+    site = PlaceSite("mitsuba", write_place(tmp_path))
+    objects = site.load_objects(3)
+    assert len({id(item) for item in objects}) == 3  # fields of their own
+    assert len(site.load_objects(0)) == len(site.load_objects()) == 1
+    bare = replace(site, place=replace(site.place, objects=()))
+    assert bare.load_objects(2) == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +16,6 @@ from mi_nerfattack import files
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.registry import Place, make_environment
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.adapter import AbstractPolicy, TorchPolicy
 from mi_nerfattack.policy.evaluate import (
     CLEAN,
@@ -37,8 +35,7 @@ from mi_nerfattack.policy.evaluate_identity import (
 )
 from mi_nerfattack.policy.load import load_policy
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.placement import scene_ground
-from mi_nerfattack.policy.sites import CARLA
+from mi_nerfattack.policy.sites import CARLA, PlaceSite
 from mi_nerfattack.policy.training_record import read_record
 from mi_nerfattack.policy.workers import (
     AbstractWork,
@@ -47,7 +44,6 @@ from mi_nerfattack.policy.workers import (
     OnUnits,
 )
 from mi_nerfattack.render.camera import from_fov
-from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.report.metrics import Drive
 from mi_nerfattack.resumable import read_kept, write_kept
 from mi_nerfattack.scenario import resolve
@@ -210,11 +206,9 @@ class Opened:
     def __init__(self, work: EvaluateWork) -> None:
         self._work = work
         self._policy = load_policy(work.policy, work.base)
-        paths = work.place.objects
-        count = max(len(paths), work.settings.objects) if paths else 0
-        # each is a field of its own, with a texture of its own
-        self._objects = [load_grid(p) for p in itertools.islice(_endless(paths), count)]
-        self._ground = scene_ground(load_scene(work.place.scene))
+        site = PlaceSite(work.environments[0].name, work.place)
+        self._objects = site.load_objects(work.settings.objects)
+        self._ground = site.load_ground()
         self._key: tuple[str, bool] | None = None
         self._environment: AbstractEnvironment | None = None
 
@@ -363,7 +357,3 @@ def check_policy(policy: AbstractPolicy, place: Place, routes: Sequence[Route]) 
 def _relative(name: str) -> str:
     """Drop the folder of an absolute path: it tells about the machine alone."""
     return Path(name).name if Path(name).is_absolute() else name
-
-
-def _endless(paths: Sequence[Path]) -> itertools.cycle[Path]:
-    return itertools.cycle(paths)

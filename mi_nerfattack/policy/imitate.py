@@ -12,7 +12,6 @@ import torch
 
 from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.folders import exclusive, remove_partial
 from mi_nerfattack.policy.collect import OnFrames, collect
 from mi_nerfattack.policy.dataset import FrameDataset, divide_shards
@@ -145,7 +144,7 @@ class _Imitation:
         self._loop = ClosedLoop(
             [site.open(site.typical()) for site in self._validated()],
             self.routes,
-            _load_objects(site, wanted),
+            site.load_objects(wanted),
             site.load_ground(),
             self.settings.validation,
             self.settings.validate_every,
@@ -286,7 +285,7 @@ def _check(
             "is held out, or give validation_frames"
         )
     measured = (settings.validation, settings.final)
-    found = len(_load_objects(sites[0], max(drives.objects for drives in measured)))
+    found = len(sites[0].load_objects(max(drives.objects for drives in measured)))
     for drives in measured:
         departure_limits(routes, drives.car_width_m)
         if drives.objects and found:
@@ -305,17 +304,6 @@ def check_camera(site: AbstractSite) -> None:
             f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
             f"takes {width} x {height}"
         )
-
-
-def _load_objects(site: AbstractSite, count: int) -> list[GridField]:
-    """Load a site's objects, if there are any, so often that they are enough.
-
-    Each is a field of its own, with a texture of its own.
-    """
-    objects = site.load_objects()
-    while 0 < len(objects) < count:
-        objects += site.load_objects()
-    return objects
 
 
 def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:

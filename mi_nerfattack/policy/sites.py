@@ -7,6 +7,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -106,8 +107,13 @@ class AbstractSite(ABC):
         """Make the environment under conditions."""
 
     @abstractmethod
-    def load_objects(self) -> list[GridField]:
-        """Load the fields that stand beside the road; may be empty."""
+    def load_objects(self, least: int = 1) -> list[GridField]:
+        """Load the fields that stand beside the road; may be empty.
+
+        Args:
+            least: number of fields, each with a texture of its own; where the site has
+                fewer objects, some come several times.
+        """
 
     @abstractmethod
     def load_ground(self) -> Ground:
@@ -172,9 +178,11 @@ class PlaceSite(AbstractSite):
         """Make the environment by its name."""
         return make_environment(self.name, self.place, conditions)
 
-    def load_objects(self) -> list[GridField]:
-        """Load the place's objects."""
-        return [load_grid(path) for path in self.place.objects]
+    def load_objects(self, least: int = 1) -> list[GridField]:
+        """Load the place's objects, in turns."""
+        paths = self.place.objects
+        count = max(len(paths), least) if paths else 0
+        return [load_grid(path) for path in islice(cycle(paths), count)]
 
     def load_ground(self) -> Ground:
         """Load the place's scene."""
