@@ -222,7 +222,11 @@ def test_an_environment_has_any_name():
 @pytest.mark.parametrize(
     ("objects", "change", "message"),
     [
-        (0, {"car_width_m": 4.0}, "route 'straight': car_width_m, .* 4.0, 3.5"),
+        (
+            0,
+            {"car_width_m": 4.0},
+            "route 'straight': its lane is 3.5 m wide, the vehicle 4.0",
+        ),
         (1, {"ahead_m": (40.0, 2.0)}, "'left' of 12.0 m.*objects 0"),
         (1, {"objects": 2}, "objects 2 of 1"),
     ],

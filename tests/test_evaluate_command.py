@@ -287,7 +287,7 @@ def test_routes_that_cannot_be_measured_are_told_before_the_first_drive(
     narrow = {"straight": {**ROUTES["straight"], "lane_width_m": 1.7}}
     files.write_json("routes.json", narrow)
     assert cli.main(place) == 2
-    assert "route 'straight': car_width_m, lane_width_m: 1.8" in capsys.readouterr().err
+    assert "route 'straight': its lane is 1.7 m wide" in capsys.readouterr().err
     short = {"straight": {**ROUTES["straight"], "points_m": [[0, 0], [9, 0]]}}
     files.write_json("routes.json", short)
     save_field("box.safetensors", small_grid())

@@ -230,7 +230,7 @@ def test_presets_have_the_figures_of_the_paper():
         # a lane of 3.5 m, a route of 40 m
         (
             {"final": dataclasses.replace(DRIVE, car_width_m=4.0)},
-            "route 'straight': car_width_m, lane_width_m: 4.0, 3.5",
+            "route 'straight': its lane is 3.5 m wide, the vehicle 4.0 m",
         ),
         (
             {"final": dataclasses.replace(DRIVE, objects=1, ahead_m=(37.0, 2.0))},

@@ -18,7 +18,7 @@ from mi_nerfattack.deploy.registry import (
     make_environment,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.metrics import departure_limit
+from mi_nerfattack.report.metrics import departure_limits
 from mi_nerfattack.vehicle.route import Route
 
 #: Depth that observations have where there is nothing, and the largest, metres.
@@ -78,7 +78,7 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             raise InputError(f"max_steps: {max_steps}; at least 1")
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode: {render_mode!r}; 'rgb_array' or None")
-        self._limits = {r.name: _departure_limit(r, width) for r in routes}
+        self._limits = departure_limits(routes, width)
         self.environment, self.routes = environment, {r.name: r for r in routes}
         self.width, self.max_steps, self.margin_m = width, max_steps, margin_m
         self.render_mode = render_mode
@@ -160,17 +160,6 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             "camera_to_world": np.asarray(frame.camera_to_world, np.float64),
             "goal": np.int64(self._route.goal),
         }
-
-
-def _departure_limit(route: Route, width: float) -> float:
-    try:
-        return departure_limit(route.lane_width_m, width)
-    except InputError as error:
-        raise InputError(
-            f"route {route.name!r}: its lane is {route.lane_width_m} m wide, the "
-            f"vehicle {width} m; give the vehicle's width in metres "
-            "(DrivingEnv(..., width=0.3)), or take a wider lane"
-        ) from error
 
 
 def _observations(

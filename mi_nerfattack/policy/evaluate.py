@@ -19,7 +19,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.adapter import AbstractPolicy, Memory, one_thread
 from mi_nerfattack.policy.placement import Ground, Roadside, Scatter
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.report.metrics import Drive, card_figures, departure_limit
+from mi_nerfattack.report.metrics import Drive, card_figures, departure_limits
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route import Route
 
@@ -283,21 +283,6 @@ def card(
     for item in drives:
         groups.setdefault((item.environment, item.route, item.case), []).append(item)
     return make_card(groups, departure_limits(routes, car_width_m))
-
-
-def departure_limits(routes: Sequence[Route], car_width_m: float) -> dict[str, float]:
-    """Return the departure limit of each route by its name, metres.
-
-    Raises:
-        InputError: a lane is narrower than the car.
-    """
-    limits = {}
-    for route in routes:
-        try:
-            limits[route.name] = departure_limit(route.lane_width_m, car_width_m)
-        except InputError as error:
-            raise InputError(f"route {route.name!r}: {error}") from error
-    return limits
 
 
 def make_card(

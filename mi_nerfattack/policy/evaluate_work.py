@@ -24,7 +24,6 @@ from mi_nerfattack.policy.evaluate import (
     EvaluateSettings,
     ExpertPolicy,
     check_roadside,
-    departure_limits,
     evaluate_run,
     make_card,
 )
@@ -44,7 +43,7 @@ from mi_nerfattack.policy.workers import (
     OnUnits,
 )
 from mi_nerfattack.render.camera import from_fov
-from mi_nerfattack.report.metrics import Drive
+from mi_nerfattack.report.metrics import Drive, departure_limits
 from mi_nerfattack.resumable import read_kept, write_kept
 from mi_nerfattack.scenario import resolve
 from mi_nerfattack.sections import PolicySection

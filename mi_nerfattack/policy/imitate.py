@@ -15,7 +15,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.folders import exclusive, remove_partial
 from mi_nerfattack.policy.collect import OnFrames, collect
 from mi_nerfattack.policy.dataset import FrameDataset, divide_shards
-from mi_nerfattack.policy.evaluate import check_roadside, departure_limits
+from mi_nerfattack.policy.evaluate import check_roadside
 from mi_nerfattack.policy.imitate_settings import ImitationSettings
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.sites import AbstractSite
@@ -23,6 +23,7 @@ from mi_nerfattack.policy.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.policy.train import Progress, check_labels, fit_policy
 from mi_nerfattack.policy.validation import ClosedLoop, rank
 from mi_nerfattack.policy.workers import AbstractWorkers
+from mi_nerfattack.report.metrics import departure_limits
 from mi_nerfattack.vehicle.route import Route
 
 #: Called with the name of the stage, units done and wanted, and what to show.

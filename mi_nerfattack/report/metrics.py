@@ -15,6 +15,8 @@ import numpy as np
 import pydantic
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.report.intervals import mean_interval, share_interval
+from mi_nerfattack.vehicle.route import Route
 
 SCHEMA = 1
 #: In the order of documents and plots; others follow, by name. `metrics.json` has the
@@ -29,7 +31,6 @@ ENVIRONMENTS = (
     "carla",
 )
 CASES = ("unperturbed", "random", "gradient", "clean", "random_objects")
-BOOTSTRAP_RESAMPLES = 9999
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +127,25 @@ def departure_limit(lane_width_m: float, car_width_m: float) -> float:
     return (lane_width_m - car_width_m) / 2
 
 
+def departure_limits(routes: Iterable[Route], car_width_m: float) -> dict[str, float]:
+    """Return the departure limit of each route by its name, metres.
+
+    Raises:
+        InputError: a lane is no wider than the car, or a width is not positive.
+    """
+    limits = {}
+    for route in routes:
+        try:
+            limits[route.name] = departure_limit(route.lane_width_m, car_width_m)
+        except InputError as error:
+            raise InputError(
+                f"route {route.name!r}: its lane is {route.lane_width_m} m wide, the "
+                f"vehicle {car_width_m} m; give the vehicle's width in metres, or take "
+                "a wider lane"
+            ) from error
+    return limits
+
+
 def summarise(
     drives: Iterable[Drive], limits: Mapping[str, float], seed: int = 0
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
@@ -199,8 +219,8 @@ def card_figures(
         "cross_track_mean_m": float(distances.mean()),
         "cross_track_max_m": float(distances.max()),
         "departures": left,
-        "cross_track_mean_ci95_m": _mean_interval(means, seed),
-        "departure_rate_ci95": _share_interval(left, len(ordered)),
+        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        "departure_rate_ci95": share_interval(left, len(ordered)),
         "departure_limit_m": limit,
         "per_run": [_card_run(drive, limit) for drive in ordered],
     }
@@ -327,7 +347,7 @@ def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any
     return {
         "n": len(drives),
         "cross_track_mean_m": float(distances.mean()),
-        "cross_track_mean_ci95_m": _mean_interval(means, seed),
+        "cross_track_mean_ci95_m": mean_interval(means, seed),
         "cross_track_mean_worst_run_m": float(means.max()),
         "cross_track_max_m": float(distances.max()),
         "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
@@ -364,30 +384,6 @@ def _card_run(drive: Drive, limit: float) -> dict[str, Any]:
         "departed": bool(len(out)),
         "departed_time_s": float(drive.time_s[out[0]]) if len(out) else None,
     }
-
-
-def _share_interval(count: int, total: int) -> list[float]:
-    import scipy.stats  # it takes a second
-
-    interval = scipy.stats.binomtest(count, total).proportion_ci(method="wilson")
-    return [float(interval.low), float(interval.high)]
-
-
-def _mean_interval(means: np.ndarray, seed: int) -> list[float] | None:
-    if len(means) < 2:
-        return None
-    import scipy.stats  # it takes a second
-
-    # Percentile: the bias-corrected interval is undefined for equal runs.
-    interval = scipy.stats.bootstrap(
-        (means,),
-        np.mean,
-        confidence_level=0.95,
-        n_resamples=BOOTSTRAP_RESAMPLES,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return [float(interval.low), float(interval.high)]
 
 
 def environment_order(name: str) -> tuple[int, str]:
