@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import importlib.resources
 import json
@@ -233,6 +232,4 @@ def _bundled_files() -> Iterator[Finding]:
 
 def _matches(scenes: Path, name: str, entry: dict[str, str]) -> bool:
     path = scenes / name
-    if not path.is_file():
-        return False
-    return hashlib.sha256(path.read_bytes()).hexdigest() == entry["sha256"]
+    return path.is_file() and files.sha256(path) == entry["sha256"]

@@ -9,6 +9,7 @@ raises InputError with the path in its message.
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import json
 import os
@@ -66,6 +67,11 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     if len(raw) > limit:
         raise InputError(f"{path}: more than {limit} bytes; it grows while it is read")
     return raw
+
+
+def sha256(path: str | Path) -> str:
+    """Return the SHA-256 of a file's content as hexadecimal digits."""
+    return hashlib.sha256(read_bytes(path, MAX_TENSOR_BYTES)).hexdigest()
 
 
 def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -243,9 +242,8 @@ def _checksums(paths: Sequence[Path]) -> dict[str, str]:
     sums: dict[str, str] = {}
     for path in paths:
         key = f"{path.resolve().parent.name}/{path.name}"
-        raw = files.read_bytes(path, files.MAX_TENSOR_BYTES)
         # where folders, too, have equal names, one checksum follows the other
-        sums[key] = sums.get(key, "") + hashlib.sha256(raw).hexdigest()
+        sums[key] = sums.get(key, "") + files.sha256(path)
     return sums
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -151,10 +150,9 @@ class PolicyDrives(AbstractSource):
 
     def describe(self) -> dict[str, Any]:
         """Return numbers and the weights' checksum."""
-        raw = files.read_bytes(self.weights, files.MAX_TENSOR_BYTES)
         return {
             "kind": self.kind,
-            "weights": hashlib.sha256(raw).hexdigest(),
+            "weights": files.sha256(self.weights),
             "horizon": self.horizon,
             "expert_share": self.expert_share,
         }

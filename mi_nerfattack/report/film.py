@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -108,7 +107,7 @@ class FrameRenderer:
             "software": f"mi-nerfattack {mi_nerfattack.__version__}",
             "variant": mi.variant(),
             "scene": self.path.name,
-            "scene_sha256": _sha256(self.path),
+            "scene_sha256": files.sha256(self.path),
             "scene_parameters": json.dumps(dict(sorted((parameters or {}).items()))),
             "sensor": f"{sensor} {self.sensor.id()}".strip(),
             "camera": _describe_camera(self.sensor),
@@ -277,10 +276,6 @@ def _pick_sensor(path: str | Path, scene: Any, index: int) -> Any:
         known = ", ".join(f"{i} ({s.id()})" for i, s in enumerate(sensors))
         raise InputError(f"{path}: no sensor {index}; it has {known}")
     return sensors[index]
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(files.read_bytes(path, files.MAX_TEXT_BYTES)).hexdigest()
 
 
 def _describe_camera(sensor: Any) -> str:
