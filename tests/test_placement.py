@@ -35,6 +35,21 @@ def test_close_states_deviate_a_fifth(rng):
     assert np.abs(states[:, 2]).max() <= 0.08
 
 
+def test_a_scatter_of_nothing_is_the_lane_centre(rng):
+    """As for drives that start on it exactly."""
+    states = Scatter(0.0, 0.0, 0.0, 0.0).states(straight(), np.full(3, 7.0), rng)
+    np.testing.assert_array_equal(states, [[7.0, 0.0, 0.0]] * 3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"lateral_sd_m": -0.1}, {"heading_max": float("nan")}, {"close_share": 2.0}],
+)
+def test_a_scatter_out_of_range_is_refused(change):
+    with pytest.raises(InputError, match=f"Scatter.{next(iter(change))}: "):
+        Scatter(**change)
+
+
 @pytest.mark.parametrize("route", [straight(), bent()], ids=lambda r: r.name)
 def test_objects_keep_clear_of_the_lane(grid, rng, route):
     sides = []

@@ -27,8 +27,8 @@ class Scatter:
     """Deviations of vehicles from the lane centre, normal and cut.
 
     Args:
-        lateral_sd_m, lateral_max_m: offset to the left, metres.
-        heading_sd, heading_max: angle to the route, radians.
+        lateral_sd_m, lateral_max_m: offset to the left, metres; 0 for none.
+        heading_sd, heading_max: angle to the route, radians; 0 for none.
         close_share: share of the vehicles whose deviations are a fifth of the drawn.
     """
 
@@ -37,6 +37,15 @@ class Scatter:
     heading_sd: float = 0.12
     heading_max: float = 0.4
     close_share: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name in ("lateral_sd_m", "lateral_max_m", "heading_sd", "heading_max"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(
+                    f"Scatter.{name}: {getattr(self, name)!r}; at least 0, finite"
+                )
+        if not 0 <= self.close_share <= 1:
+            raise InputError(f"Scatter.close_share: {self.close_share!r}; in [0, 1]")
 
     def states(
         self, route: Route, arc: np.ndarray, rng: np.random.Generator
@@ -141,5 +150,7 @@ def cut_normal(
     sd: float, largest: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw (count,) normal numbers of standard deviation `sd` within +-largest."""
+    if sd == 0 or largest == 0:
+        return np.zeros(count)
     cut = largest / sd
     return sd * np.asarray(truncnorm.rvs(-cut, cut, size=count, random_state=rng))
