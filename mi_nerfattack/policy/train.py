@@ -328,7 +328,8 @@ def check_labels(module: PilotNet, data: FrameDataset) -> None:
     if low < 0 or high >= module.goals:
         raise InputError(f"goals: {low} to {high}; at least 0 and below {module.goals}")
     largest: Any = np.abs(data.controls).max()
-    if largest > module.max_control:
+    # rounded alike: NumPy 1 compares in double precision
+    if largest > np.float32(module.max_control):
         raise InputError(
             f"controls: up to {largest:.3g} rad/s; at most {module.max_control}"
         )
