@@ -82,5 +82,8 @@ def _checked(count: int) -> int:
 
 def _in_range(goals: torch.Tensor, count: int) -> torch.Tensor:
     if ((goals < 0) | (goals >= count)).any():
-        raise InputError(f"goal: {goals.tolist()}; at least 0 and below {count}")
+        raise InputError(
+            f"goal: {goals.tolist()}; at least 0 and below {count}, the number of the "
+            "policy's goals: give the route one of these"
+        )
     return goals
