@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from recorded_drives import (
@@ -187,6 +188,26 @@ def test_video_poses_with_times_go_to_the_nearest_frame(tmp_path):
     )
     recording = open_recording(path, CAMERA, MOUNT)
     np.testing.assert_allclose(recording.track.camera_to_world, POSES, atol=1e-12)
+
+
+def test_frames_that_a_cut_keeps_but_hides_do_not_count(tmp_path):
+    whole, path = write_drive_video(tmp_path, table=False), tmp_path / "cut.mp4"
+    with av.open(str(whole)) as source, av.open(str(path), "w") as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        start = int(0.2 / stream.time_base)  # from here on, as `ffmpeg -ss 0.2 -c copy`
+        for packet in source.demux(stream):
+            if packet.dts is not None:
+                packet.pts, packet.dts = packet.pts - start, packet.dts - start
+                packet.stream = copy
+                target.mux(packet)
+    rows = [f"{x},{y},{t}" for x, y, t in STATES[2:]]
+    files.write_text(tmp_path / "cut.csv", "\n".join(["x_m,y_m,heading_rad", *rows]))
+    recording = open_recording(path, CAMERA, MOUNT)
+    np.testing.assert_allclose(recording.track.times, 0.1 * np.arange(COUNT - 2))
+    for index in range(COUNT - 2):
+        wanted = image_of(index + 2)[:, 1].astype(int)
+        assert abs(recording.image(index)[:, 1] - wanted).max() <= 6
 
 
 def test_nearest_pose_of_one_pose():

@@ -95,13 +95,16 @@ class VideoRecording(AbstractRecording):
                         f"{self._path}: {width} x {height} px; at most "
                         f"{files.MAX_IMAGE_PIXELS} pixels are read"
                     )
-                stamps = [p.pts for p in container.demux(stream) if p.pts is not None]
+                # what a cut keeps before its first frame is decoded, but not shown
+                packets = [(p.pts, p.is_discard) for p in container.demux(stream)]
                 announced, base = stream.frames, stream.time_base
         except FFmpegError as error:
             raise self._damaged(error) from error
-        if not stamps or base is None or announced > len(stamps):
+        found = [(stamp, hidden) for stamp, hidden in packets if stamp is not None]
+        stamps = [stamp for stamp, hidden in found if not hidden]
+        if not stamps or base is None or announced > len(found):
             raise InputError(
-                f"{self._path}: {len(stamps)} of {announced} frames are there; "
+                f"{self._path}: {len(found)} of {announced} frames are there; "
                 "truncated: copy it again"
             )
         times = np.sort(np.array([float(stamp * base) for stamp in stamps]))
