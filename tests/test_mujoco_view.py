@@ -351,11 +351,34 @@ def test_what_cannot_be_drawn_is_named():
     pane = {"type": "rectangle", "id": "pane", "bsdf": {"type": "thindielectric"}}
     with pytest.raises(InputError, match="'pane'.*transparent"):
         read_meshes(scene(pane))
+    colours = {"type": "mesh_attribute", "name": "vertex_color"}
+    painted = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colours}}
+    with pytest.raises(InputError, match="'painted'.*MeshAttribute.*bake them"):
+        read_meshes(scene({"type": "rectangle", "id": "painted", "bsdf": painted}))
+
+
+def test_uniform_materials_have_one_colour():
+    colour = {"type": "rgb", "value": [0.6, 0.2, 0.1]}
+    dents = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((4, 2, 3), np.float32))}
+    under = {"type": "diffuse", "reflectance": colour}
+    for material in (
+        {"type": "principled", "base_color": colour},
+        {"type": "normalmap", "normalmap": dents | {"raw": True}, "bsdf": under},
+    ):
+        (mesh,) = read_meshes(scene({"type": "rectangle", "bsdf": material}))
+        expected = np.broadcast_to([0.6, 0.2, 0.1], mesh.texture.shape)
+        np.testing.assert_allclose(mesh.texture, expected, atol=1e-6)
 
 
 def test_distorted_camera_is_refused():
     with pytest.raises(InputError, match="distortion"):
         MujocoView(scene(ground()), replace(CAMERA, k1=0.1))
+
+
+def test_images_larger_than_opengl_draws_are_refused(gl):
+    camera = from_fov(40_000, 1, 60.0)
+    with pytest.raises(InputError, match="camera: 40000 x 1 px.*smaller image"):
+        MujocoView(scene(ground()), camera)
 
 
 def test_machine_without_opengl(monkeypatch):

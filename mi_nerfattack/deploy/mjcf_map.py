@@ -22,6 +22,7 @@ from mi_nerfattack.errors import InputError
 
 _PROCEDURAL = 512  # texels along an edge of a texture that is no image
 _BORDER = 8  # texels
+_NOT_FLAT = ("MeshAttribute", "VolumeAdapter")
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +185,12 @@ def _read_shape(shape: Any) -> DrawnMesh:
             f"shape {name!r}: MuJoCo cannot draw its transparent {bsdf.class_name()}; "
             "take an opaque material"
         )
+    for node in mi.traverse(bsdf).hierarchy:
+        if node.class_name() in _NOT_FLAT:
+            raise InputError(
+                f"shape {name!r}: MuJoCo cannot draw its {node.class_name()}, colours "
+                "of vertices or of a volume; bake them into an image"
+            )
     uv, albedo = _bake(bsdf, uv)
     two_sided = "TwoSided" in bsdf.class_name()
     return DrawnMesh(name, vertices, faces, normals, uv, albedo, two_sided)
@@ -244,7 +251,9 @@ def _bake(bsdf: Any, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     si = dr.zeros(mi.SurfaceInteraction3f, grid.shape[1])
     si.uv = mi.Point2f(grid[:2].astype(np.float32))
     si.wi = mi.Vector3f(0, 0, 1)
-    albedo = rgb_rows(bsdf.eval_diffuse_reflectance(si)).reshape(height, width, 3)
+    # a uniform material answers with one value for all texels
+    found = bsdf.eval_diffuse_reflectance(si) + dr.zeros(mi.Float, grid.shape[1])
+    albedo = rgb_rows(found).reshape(height, width, 3)
     moved = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ to_uv.T
     return moved[:, :2], np.clip(albedo, 0, 1)
 
