@@ -90,9 +90,7 @@ class _Window:
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
         self._model, self._camera = model, camera
         self._gl = make_context(camera.width, camera.height)
-        self._context: Any = mujoco.MjrContext(
-            model, mujoco.mjtFontScale.mjFONTSCALE_100.value
-        )
+        self._context = self._make_context()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._coarse = mujoco.MjrRect(0, 0, camera.width, camera.height)
@@ -141,6 +139,18 @@ class _Window:
     def __del__(self) -> None:
         if getattr(self, "_at_exit", None) is not None:
             self.close()
+
+    def _make_context(self) -> Any:
+        try:
+            scale = mujoco.mjtFontScale.mjFONTSCALE_100.value
+            return mujoco.MjrContext(self._model, scale)
+        except mujoco.FatalError as error:
+            self._gl.free()
+            raise InputError(
+                f"camera: {self._camera.width} x {self._camera.height} px, of "
+                f"{_ACROSS} x {_DOWN} samples each, are more than OpenGL draws here "
+                f"({error}); take a smaller image, or the environment 'mujoco'"
+            ) from error
 
     def _make_scene(self) -> mujoco.MjvScene:
         data = mujoco.MjData(self._model)
