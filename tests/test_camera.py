@@ -203,6 +203,8 @@ def test_undistort_inverts_distort(x, y, k):
     ("change", "name"),
     [
         ({"width": 0}, "camera.width"),
+        ({"width": 5.0}, "camera.width: 5.0; must be an int"),
+        ({"height": 2.5}, "camera.height: 2.5; must be an int"),
         ({"fx": -1.0}, "camera.fx"),
         ({"cx": float("nan")}, "camera.cx"),
         ({"k1": -5.0}, "camera.k1"),
@@ -212,6 +214,15 @@ def test_impossible_cameras(change, name):
     values = {"width": 10, "height": 10, "fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 5.0}
     with pytest.raises(InputError, match=name):
         cam.Camera(**{**values, **change})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("height_m", np.nan), ("forward_m", np.inf), ("pitch_deg", -np.inf)],
+)
+def test_impossible_mounts(name, value):
+    with pytest.raises(InputError, match=f"mount.{name}: -?(nan|inf); must be finite"):
+        cam.CameraMount(**{name: value})
 
 
 def test_srgb_known_values():

@@ -34,8 +34,9 @@ class Camera:
         k1, k2, p1, p2: distortion as in `cv2.projectPoints`, without unit.
 
     Raises:
-        InputError: a size or focal length is not positive, a value is not finite, or
-            the distortion cannot be inverted everywhere in the image.
+        InputError: a size or focal length is not positive, a size is no integer, a
+            value is not finite, or the distortion cannot be inverted everywhere in the
+            image.
     """
 
     width: int
@@ -57,6 +58,12 @@ class Camera:
                 raise InputError(f"camera.{name}: {value}; must be finite")
             if name in ("width", "height", "fx", "fy") and value <= 0:
                 raise InputError(f"camera.{name}: {value}; must be positive")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer):
+                raise InputError(
+                    f"camera.{name}: {value!r}; must be an int, a whole number of px"
+                )
         if self.is_distorted:
             self._check_distortion()
 
@@ -165,11 +172,20 @@ class CameraMount:
         height_m: above the ground plane z = 0.
         forward_m: ahead of the state's reference point.
         pitch_deg: rotation of the optical axis, positive looks down.
+
+    Raises:
+        InputError: a value is not finite.
     """
 
     height_m: float = 1.4
     forward_m: float = 0.5
     pitch_deg: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Check that all are finite."""
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise InputError(f"mount.{name}: {value}; must be finite")
 
 
 def mount_pose(
