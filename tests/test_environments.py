@@ -184,6 +184,15 @@ def test_surrogate_shows_what_the_sensor_of_attacks_sees():
     assert frame.image.std() > 5
 
 
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_only_posed_fields_are_shown(name, tmp_path):
+    environment = make_environment(name, write_place(tmp_path), Conditions(spp=1))
+    field = blob(np.random.default_rng(0))
+    with pytest.raises(InputError, match="objects: GridField; only posed fields can"):
+        environment.show([field])
+    assert environment.reset(a_route()).image.any()  # shows what it showed before
+
+
 def test_surrogate_at_a_rolled_pose_is_upside_down():
     view = FieldView(PosedField(small_ngp()), CAMERA)
     pose = look_at((-3.0, 0.5, 0.8), (0.0, 0.0, 0.0))

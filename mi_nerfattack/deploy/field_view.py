@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_nerfattack.colour import linear_to_uint8
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.paste import OPAQUE
+from mi_nerfattack.deploy.paste import OPAQUE, require_fields
 from mi_nerfattack.deploy.rays import PixelRays
 from mi_nerfattack.deploy.view import AbstractView
 from mi_nerfattack.frozen import freeze_method
@@ -66,6 +66,7 @@ class FieldView(AbstractView):
 
     def show(self, objects: Sequence[PosedField]) -> None:
         """Compose other fields with the scene's."""
+        require_fields(objects)
         layers = [self.scene, *objects]
         self.composite.check(layers)
         self._picture = _Picture(layers, self.composite, self.stop)

@@ -39,11 +39,7 @@ class Paster:
     """
 
     def __init__(self, camera: Camera, objects: Sequence[PosedField]) -> None:
-        for item in objects:
-            if not isinstance(item, PosedField):
-                raise InputError(
-                    f"objects: {type(item).__name__}; only posed fields can be shown"
-                )
+        require_fields(objects)
         self.camera, self.objects = camera, list(objects)
         self._rays = PixelRays(camera)
         self._frozen = freeze_method(self._record, self._state)
@@ -79,6 +75,15 @@ class Paster:
     def _state(self, rays: Rays) -> list[Any]:
         states = [posed.state() for posed in self.objects]
         return [self, dr.width(rays.direction), states]
+
+
+def require_fields(objects: Sequence[Any]) -> None:
+    """Raise `InputError` unless all objects to show are posed fields."""
+    for item in objects:
+        if not isinstance(item, PosedField):
+            raise InputError(
+                f"objects: {type(item).__name__}; only posed fields can be shown"
+            )
 
 
 def paste_objects(
