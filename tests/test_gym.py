@@ -26,6 +26,7 @@ from mi_nerfattack.deploy.registry import (
     Place,
     kinematic_vehicle,
 )
+from mi_nerfattack.deploy.vehicle import checked_pose
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import CameraMount, from_fov
 from mi_nerfattack.vehicle.route import Route
@@ -47,7 +48,7 @@ class Blind(AbstractEnvironment):
         self.controls: list[float] = []
 
     def reset(self, route, pose=None, seed=0):
-        start = route.pose_at(0.0) if pose is None else np.asarray(pose)
+        start = checked_pose(route.pose_at(0.0) if pose is None else pose)
         self.vehicle.reset(start, route.speed_ms)
         return self._frame()
 
@@ -199,6 +200,16 @@ def test_images_of_a_recording_are_not_resized(tmp_path):
     with pytest.raises(InputError, match="size_px: 5 x 4 px; environment 'replay' has"):
         make_gym("replay", place, size_px=(5, 4))
     make_gym("replay", place, size_px=(camera.width, camera.height)).close()
+
+
+def test_a_refused_reset_leaves_the_episode_as_it_was():
+    ahead, aside = (Route(str(i), i, LINE + [0, 9 * i]) for i in range(2))
+    driving = DrivingEnv(Blind(), [ahead, aside])
+    driving.reset(seed=0, options={"route": "0"})
+    with pytest.raises(InputError, match="pose: .*three finite numbers"):
+        driving.reset(options={"route": "1", "pose": (0.0, np.nan, 0.0)})
+    observation, reward, *_ = driving.step(np.zeros(1))
+    assert (observation["goal"], reward) == (0, 0)
 
 
 def test_bad_input(tmp_path):

@@ -106,10 +106,9 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         if name not in self.routes:
             known = ", ".join(map(repr, self.routes))
             raise InputError(f"options.route: {name!r}; one of {known}")
-        self._route = self.routes[name]
-        image_seed = int(self.np_random.integers(2**31))
-        frame = self.environment.reset(self._route, options.get("pose"), image_seed)
-        self._frame, self._steps = frame, 0
+        route, image_seed = self.routes[name], int(self.np_random.integers(2**31))
+        frame = self.environment.reset(route, options.get("pose"), image_seed)
+        self._route, self._frame, self._steps = route, frame, 0
         return self._observe(frame), {**self._info(), "route": name}
 
     def step(
