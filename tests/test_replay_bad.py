@@ -135,6 +135,7 @@ def edit(folder: Path, change) -> Path:
         (lambda t: t["frames"].insert(1, 5), r"frames\[1\]: 5; needs an object"),
         (lambda t: t["frames"][2].update(fl_x=9.0), "2 cameras; a drive is recorded"),
         (lambda t: t["frames"][2].update(time_s=0.5), "row 0: time_s: None"),
+        (lambda t: t.update(units="arbitrary"), "units: 'arbitrary'; .*metres-per-uni"),
         (lambda t: t.update(depth_file=7), "depth_file: 7; needs a path"),
         (lambda t: t["frames"].pop(), r"shape \(6, 8, 16\); needs \(5, 8, 16\)"),
     ],

@@ -82,6 +82,11 @@ def read_poses(
 
 def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
     table, frames = read_table(path)
+    if table.get("units") == "arbitrary":
+        raise InputError(
+            f"{path}: units: 'arbitrary'; a drive is replayed in metres: measure a "
+            "length in it and run 'mi-nerfattack poses' with --metres-per-unit"
+        )
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise InputError(f"{path}: frames[{index}]: {frame!r}; needs an object")
