@@ -53,6 +53,29 @@ def test_parameters_and_size_are_those_of_a_file_that_has_them(tmp_path):
         assert mi.traverse(sensor)["x_fov"][0] == pytest.approx(x_fov, rel=1e-5)
 
 
+def test_a_roof_of_the_grounds_material_keeps_the_sky_out(tmp_path):
+    slab = """<shape type="rectangle"><ref id="matt"/><transform name="to_world">
+        <scale value="20"/><translate z="{}"/></transform></shape>"""
+    path = write(
+        tmp_path,
+        """<integrator type="path"><integer name="max_depth" value="2"/></integrator>
+        <emitter type="constant"/><bsdf type="twosided" id="matt"><bsdf type="diffuse">
+        <rgb name="reflectance" value="0.4"/></bsdf></bsdf>"""
+        + slab.format(0)
+        + slab.format(6),
+    )
+    scene = load_scene(path)
+    assert list(scene.bbox().max) == [20, 20, 6]
+    down = mi.RayDifferential3f(mi.Point3f(0, 0, 1), mi.Vector3f(0, 0, -1))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1 << 15)
+    radiance = scene.integrator().sample(scene, sampler, down)[0].numpy().mean()
+    half = 20 / 6  # of the roof's edge, in heights
+    reach = np.hypot(1, half)
+    roof = 4 / np.pi * half / reach * np.arctan(half / reach)  # share of the sky
+    assert radiance == pytest.approx(0.4 * (1 - roof), rel=0.05)
+
+
 def test_files_are_found_beside_the_scene_and_the_resolver_is_put_back(tmp_path):
     (tmp_path / "quad.ply").write_text(QUAD)
     shape = '<shape type="ply"><string name="filename" value="quad.ply"/></shape>'

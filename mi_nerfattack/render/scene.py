@@ -45,6 +45,7 @@ def load_scene(
             state = mi.parser.parse_file(config, str(path), **(parameters or {}))
             if size_px is not None:
                 _resize_films(path, state, size_px)
+            config.merge_meshes = not _has_rectangles(state)
             for name, shape in (shapes or {}).items():
                 state.nodes[0].props[name] = shape
             mi.parser.transform_all(config, state)
@@ -95,6 +96,15 @@ def _config() -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # Python plugins
     return config
+
+
+def _has_rectangles(state: Any) -> bool:
+    """Return whether meshes of equal materials must stay apart.
+
+    Mitsuba 3.9.1 leaves rectangles that it merges out of the scene's bounding box, on
+    whose size the light of sky, sun and other far emitters depends.
+    """
+    return any(node.props.plugin_name() == "rectangle" for node in state.nodes)
 
 
 def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> None:
