@@ -19,7 +19,6 @@ from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.deploy.mjcf import world_spec, write_mjcf
 from mi_nerfattack.deploy.mjcf_light import read_lighting
-from mi_nerfattack.deploy.mjcf_map import read_meshes
 from mi_nerfattack.deploy.mujoco_view import MujocoView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import CameraMount, from_fov, look_at, mount_matrix
@@ -316,6 +315,14 @@ def test_sun_is_told_from_the_sky():
     assert lighting.sky[2] > lighting.sky[0]  # blue
 
 
+def test_lamps_without_extent_light_a_room():
+    mast = {"type": "cube", "to_world": placed(0, 0, 1, scale=0.1)}
+    lamp = {"type": "point", "position": [0, 0, 100], "intensity": 1e4}
+    black = ground((0, 0, 0))
+    lighting = read_lighting(scene(black, mast | {"bsdf": diffuse([0.1] * 3)}, l=lamp))
+    np.testing.assert_allclose(lighting.sun + lighting.sky, 1.0, rtol=0.05)  # I / r^2
+
+
 def test_map_and_car_in_one_model():
     spec = world_spec(scene(ground()), SMALL_CAR)
     model = spec.compile()
@@ -342,32 +349,6 @@ def test_written_model_is_read_by_mujoco(tmp_path, rng):
             getattr(found, key), getattr(expected, key), rtol=1e-4, atol=1e-6
         )
     assert spec.textures[0].file == ""
-
-
-def test_what_cannot_be_drawn_is_named():
-    ball = {"type": "sphere", "id": "ball"}
-    with pytest.raises(InputError, match="'ball'.*Sphere"):
-        read_meshes(scene(ball))
-    pane = {"type": "rectangle", "id": "pane", "bsdf": {"type": "thindielectric"}}
-    with pytest.raises(InputError, match="'pane'.*transparent"):
-        read_meshes(scene(pane))
-    colours = {"type": "mesh_attribute", "name": "vertex_color"}
-    painted = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colours}}
-    with pytest.raises(InputError, match="'painted'.*MeshAttribute.*bake them"):
-        read_meshes(scene({"type": "rectangle", "id": "painted", "bsdf": painted}))
-
-
-def test_uniform_materials_have_one_colour():
-    colour = {"type": "rgb", "value": [0.6, 0.2, 0.1]}
-    dents = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((4, 2, 3), np.float32))}
-    under = {"type": "diffuse", "reflectance": colour}
-    for material in (
-        {"type": "principled", "base_color": colour},
-        {"type": "normalmap", "normalmap": dents | {"raw": True}, "bsdf": under},
-    ):
-        (mesh,) = read_meshes(scene({"type": "rectangle", "bsdf": material}))
-        expected = np.broadcast_to([0.6, 0.2, 0.1], mesh.texture.shape)
-        np.testing.assert_allclose(mesh.texture, expected, atol=1e-6)
 
 
 def test_distorted_camera_is_refused():

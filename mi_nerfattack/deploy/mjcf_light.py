@@ -169,7 +169,7 @@ def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean irradiance (3,) of level and of vertical surfaces.
 
     The scene's integrator tells it at random points between a twentieth and a half of
-    the scene's height.
+    the scene's height; lamps that are points, which no ray meets, are added.
     """
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _SAMPLES)
@@ -184,11 +184,28 @@ def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
         upward.z * cos - upward.x * sin, upward.z * sin + upward.x * cos, upward.y
     )
     result = []
-    for direction in (upward, sideways):
+    for normal, direction in (
+        (mi.Vector3f(0, 0, 1), upward),
+        (mi.Vector3f(cos, sin, 0), sideways),
+    ):
         ray = mi.RayDifferential3f(mi.Ray3f(origin, direction))
         radiance, *_ = scene.integrator().sample(scene, sampler, ray)
-        result.append(math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64))
+        found = math.pi * rgb_rows(radiance).mean(axis=0).astype(np.float64)
+        result.append(found + _from_points(scene, sampler, origin, normal))
     return result[0], result[1]
+
+
+def _from_points(scene: Any, sampler: Any, origin: Any, normal: Any) -> np.ndarray:
+    """Return the mean irradiance (3,) of surfaces by emitters without extent."""
+    si = dr.zeros(mi.SurfaceInteraction3f, _SAMPLES)
+    si.p, total = origin, np.zeros(3)
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            sample, weight = emitter.sample_direction(si, sampler.next_2d())
+            seen = ~scene.ray_test(si.spawn_ray_to(sample.p))
+            slant = dr.select(seen, dr.maximum(dr.dot(sample.d, normal), 0), 0)
+            total += rgb_rows(weight * slant).mean(axis=0)
+    return total
 
 
 def _sky_faces(emitters: list[Any]) -> np.ndarray:
