@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -226,6 +227,9 @@ def test_bad_input_is_refused():
         MujocoVehicle(CAR, period=0.0)
     with pytest.raises(InputError, match="timestep: 0.01"):
         MujocoVehicle(CAR, timestep=0.01)
+    # 2.7 m / tan(u) is half the track of 1.55 m at 1.291 rad
+    with pytest.raises(InputError, match="car.max_steer: 1.25 rad; .* than 1.241 rad"):
+        MujocoVehicle(replace(CAR, max_steer=1.25))
     with pytest.raises(InputError, match="handling.friction"):
         Handling(friction=0.0)
     with pytest.raises(InputError, match="max_control"):

@@ -34,6 +34,7 @@ _WHEEL_MASS = 0.0125  # of the car's mass, each
 _HEIGHT = 0.2  # of the wheelbase: centre of gravity above the ground
 _SERVO_RATE = 250.0  # rad/s, of the steering column's undamped oscillation
 _STIFF = (0.006, 1.0)  # time constant (s) and damping ratio of linkage and tyres
+_SPARE_STEER = 0.05  # rad, beyond the largest steering angle
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,17 @@ def add_ground(spec: mujoco.MjSpec) -> None:
 
 
 def add_car(spec: mujoco.MjSpec, car: Car, handling: Handling) -> None:
-    """Add a car, its linkage and its actuators; its rear axle stands at the origin."""
+    """Add a car, its linkage and its actuators; its rear axle stands at the origin.
+
+    Raises:
+        InputError: it would steer about a point between its rear wheels.
+    """
+    largest = math.atan(2 * car.wheelbase / car.track) - _SPARE_STEER
+    if car.max_steer >= largest:
+        raise InputError(
+            f"car.max_steer: {car.max_steer!r} rad; MuJoCo's car steers by less than "
+            f"{largest:.3f} rad, where its inner front wheel stands across"
+        )
     _set_options(spec)
     body = spec.worldbody.add_body(name=BODY)
     body.add_freejoint(name=BODY)
@@ -175,7 +186,7 @@ def _add_wheel(chassis: Any, name: str, car: Car, handling: Handling) -> None:
 
 def _add_linkage(spec: mujoco.MjSpec, car: Car) -> None:
     """Tie both front wheels to the column by polynomials of its angle."""
-    reach = car.max_steer + 0.05
+    reach = car.max_steer + _SPARE_STEER
     grid = reach * np.cos(np.linspace(0, np.pi, 100))
     for name, angles in zip(WHEELS[:2], ackermann_angles(car, grid), strict=True):
         powers = np.stack([grid**k for k in range(4)], axis=1)

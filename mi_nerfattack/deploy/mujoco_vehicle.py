@@ -116,8 +116,8 @@ class MujocoVehicle(AbstractVehicle):
         timestep: of the physics, seconds, at most 0.002.
 
     Raises:
-        InputError: a period that is no multiple of the timestep, or a timestep out of
-            range.
+        InputError: a period that is no multiple of the timestep, a timestep out of
+            range, or a car that steers about a point between its rear wheels.
     """
 
     def __init__(
