@@ -372,6 +372,12 @@ def test_machine_without_opengl(monkeypatch):
     assert opengl.backend() == "osmesa"
 
 
+def test_a_forked_process_is_told_to_spawn(gl, monkeypatch):
+    monkeypatch.setattr(opengl.os, "getpid", lambda: -1)
+    with pytest.raises(InputError, match="forked.*vector_kwargs={'context': 'spawn'}"):
+        opengl.make_context(8, 8)
+
+
 def test_the_users_choice_of_opengl_stays(monkeypatch):
     monkeypatch.setenv(opengl.VARIABLE, "off")
     with pytest.raises(InputError, match="MUJOCO_GL=off does not work"):

@@ -12,6 +12,7 @@ from mi_nerfattack.errors import InputError
 
 VARIABLE = "MUJOCO_GL"
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+_began_in: list[int] = []  # the process that used OpenGL first
 _REMEDY = (
     "install one of Debian's packages libegl1 with libgl1-mesa-dri (EGL) or libosmesa6 "
     f"(OSMesa, {VARIABLE}=osmesa), or take the environment 'mujoco', whose images are "
@@ -49,9 +50,17 @@ def make_context(width: int, height: int) -> Any:
         an object with `make_current()` and `free()`.
 
     Raises:
-        InputError: there is no OpenGL, or it cannot draw without a window.
+        InputError: there is no OpenGL, it cannot draw without a window, or this process
+            was forked from one that had used it, where it would wait for ever.
     """
     name = backend()
+    if _began_in and _began_in[0] != os.getpid():
+        raise InputError(
+            "OpenGL: this process was forked from one that had used it; start it with "
+            "the method 'spawn' (of Gymnasium's vector environments: "
+            "vector_kwargs={'context': 'spawn'})"
+        )
+    _began_in[:] = [os.getpid()]
     try:
         context = _context_class(name)(width, height)
         context.make_current()
