@@ -148,6 +148,8 @@ def test_reward_is_the_distance_from_the_lanes_centre():
     assert (observation["depth"] == FAR_M).all()
     assert observation["goal"] == 1
     assert driving.observation_space.contains(observation)
+    observation["camera_to_world"][:2, 3] = 5e5, 5.4e6  # as on a map
+    assert driving.observation_space.contains(observation)
 
 
 def test_action_is_a_share_of_the_largest_control():

@@ -118,6 +118,13 @@ def test_no_kernel_is_compiled_after_the_first_frame():
     assert second.image[6, 8].max() < first.image[6, 8].min() - 20
 
 
+def test_cameras_too_far_for_single_precision_are_refused():
+    pose = look_at((5e5, 5.4e6, 0.0), (5e5 + 1, 5.4e6, 0.0))
+    paste_objects(frame_at(pose, np.inf), CAMERA, [])
+    with pytest.raises(InputError, match=r"camera at \[500000.0, 5400000.0, 0.0\] m:"):
+        paste_objects(frame_at(pose, np.inf), CAMERA, [PosedField(homogeneous())])
+
+
 def test_bad_input():
     pose = look_at((-4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     frame = frame_at(pose, np.inf)

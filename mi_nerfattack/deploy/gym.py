@@ -24,7 +24,7 @@ from mi_nerfattack.vehicle.route import Route
 #: Depth that observations have where there is nothing, and the largest, metres.
 FAR_M = 1000.0
 
-_WORLD_M = 1e6  # coordinates are below this
+_WORLD_M = 1e8  # coordinates are below this, those of maps (UTM) too
 
 
 class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):

@@ -89,7 +89,7 @@ class _Window:
 
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
         self._model, self._camera = model, camera
-        self._gl = make_context(camera.width, camera.height)
+        self._gl: Any = make_context(camera.width, camera.height)
         self._context = self._make_context()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR

@@ -20,6 +20,8 @@ from mi_nerfattack.render.posed import PosedField
 
 #: Opacity from which on a field's pixel counts as solid.
 OPAQUE = 0.5
+#: Largest coordinate of a camera, metres, where 32 bits are 8 mm apart.
+FARTHEST_M = 1e5
 
 
 class Paster:
@@ -45,7 +47,19 @@ class Paster:
         self._frozen = freeze_method(self._record, self._state)
 
     def march(self, camera_to_world: np.ndarray) -> March:
-        """March all objects along the rays of one image; there must be an object."""
+        """March all objects along the rays of one image; there must be an object.
+
+        Raises:
+            InputError: the camera is so far away that single precision cannot tell
+                where an object ends.
+        """
+        place = np.asarray(camera_to_world)[:3, 3]
+        if not np.abs(place).max() <= FARTHEST_M:
+            raise InputError(
+                f"camera at {place.round(1).tolist()} m: objects are pasted in single "
+                f"precision, within {FARTHEST_M:g} m of the origin; put the origin of "
+                "poses and objects near the drive"
+            )
         with dr.suspend_grad():
             return self._frozen(self._rays.at(camera_to_world))
 
@@ -53,7 +67,7 @@ class Paster:
         """Return the frame with the objects in it.
 
         Raises:
-            InputError: the frame's size is not the camera's.
+            InputError: the frame's size is not the camera's, or it is too far away.
         """
         size = (self.camera.height, self.camera.width)
         if frame.depth.shape != size or frame.image.shape != (*size, 3):
