@@ -41,6 +41,8 @@ def test_a_route_to_an_end():
         ({"distance_m": 300.0}, "the lane ends after 90 of 300 m"),
         ({"distance_m": 0.0}, "distance_m 0.0; more than 0"),
         ({"distance_m": 9.0, "turns": ["up"]}, "turn: 'up'; one of straight"),
+        ({"distance_m": 9.0, "turns": ["left"]}, "turns: left; .* no fork for it with"),
+        ({"end": (60.0, -30.0), "turns": ["left"]}, "turns: left; those of a route by"),
         ({"end": (1.0, 0.0)}, r"no way from \[10.0, 0.0\] to \[1.0, 0.0\]"),
         ({"end": (math.nan, 0.0)}, "finite numbers"),
         ({"distance_m": 9.0, "spacing_m": 0.0}, "spacing_m 0.0; 0.1 to 10 m"),

@@ -57,10 +57,15 @@ def route_from_town(
 
     Raises:
         InputError: both or none of end and distance, no way to the end, a road that
-            ends before the distance, or an unknown turn.
+            ends before the distance, an unknown turn, or one without a fork.
     """
     if (end is None) == (distance_m is None):
         raise InputError("route_from_town: give either end or distance_m")
+    if end is not None and turns:
+        raise InputError(
+            f"turns: {', '.join(turns)}; those of a route by distance_m: leave them out "
+            "of one to an end"
+        )
     if not 0.1 <= spacing_m <= 10:
         raise InputError(f"route_from_town: spacing_m {spacing_m}; 0.1 to 10 m")
     first = _nearest(town_map, api, start)
@@ -114,6 +119,11 @@ def _by_distance(
             found.append(_branch(found[-1], choices, TURNS[turn]))
         else:
             found.append(choices[0])
+    if rest:
+        raise InputError(
+            f"turns: {', '.join(rest)}; the route has no fork for it within "
+            f"{distance_m:g} m: take a longer distance, or start elsewhere"
+        )
     return found
 
 
