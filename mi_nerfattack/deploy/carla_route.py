@@ -63,8 +63,8 @@ def route_from_town(
         raise InputError("route_from_town: give either end or distance_m")
     if end is not None and turns:
         raise InputError(
-            f"turns: {', '.join(turns)}; those of a route by distance_m: leave them out "
-            "of one to an end"
+            f"turns: {', '.join(turns)}; those of a route by distance_m: leave them "
+            "out of one to an end"
         )
     if not 0.1 <= spacing_m <= 10:
         raise InputError(f"route_from_town: spacing_m {spacing_m}; 0.1 to 10 m")
