@@ -40,3 +40,21 @@ def test_uniform_materials_have_one_colour():
         (mesh,) = read_meshes(scene({"type": "rectangle", "bsdf": material}))
         expected = np.broadcast_to([0.6, 0.2, 0.1], mesh.texture.shape)
         np.testing.assert_allclose(mesh.texture, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.01, 3.0])
+@pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
+def test_images_that_do_not_repeat_end_where_their_coordinates_do(wrap, scale, rng):
+    texels = rng.uniform(0.1, 0.9, (8, 8, 3)).astype(np.float32)
+    image = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    image |= {"wrap_mode": wrap, "to_uv": mi.ScalarTransform4f().scale(scale)}
+    shape = {"type": "rectangle", "id": "sheet"}
+    shape["bsdf"] = {"type": "diffuse", "reflectance": image}
+    if scale < 2 or wrap == "repeat":  # 1.01: less than a texel
+        (mesh,) = read_meshes(scene(shape))
+        np.testing.assert_allclose(mesh.uv.max(), scale, rtol=1e-6)
+        np.testing.assert_allclose(mesh.texture, texels, atol=1e-3)
+    else:
+        message = "'sheet': coordinates reach 16.0 texels beyond .* set wrap_mode to"
+        with pytest.raises(InputError, match=message):
+            read_meshes(scene(shape))

@@ -22,6 +22,7 @@ from mi_nerfattack.errors import InputError
 
 _PROCEDURAL = 512  # texels along an edge of a texture that is no image
 _BORDER = 8  # texels
+_SAME = 0.01  # mean difference of albedos that counts as none
 _NOT_FLAT = ("MeshAttribute", "VolumeAdapter")
 
 
@@ -191,7 +192,10 @@ def _read_shape(shape: Any) -> DrawnMesh:
                 f"shape {name!r}: MuJoCo cannot draw its {node.class_name()}, colours "
                 "of vertices or of a volume; bake them into an image"
             )
-    uv, albedo = _bake(bsdf, uv)
+    try:
+        uv, albedo = _bake(bsdf, uv)
+    except InputError as error:
+        raise InputError(f"shape {name!r}: {error}") from error
     two_sided = "TwoSided" in bsdf.class_name()
     return DrawnMesh(name, vertices, faces, normals, uv, albedo, two_sided)
 
@@ -247,15 +251,28 @@ def _bake(bsdf: Any, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         height = width = _PROCEDURAL if varies else 1
     v, u = np.mgrid[:height, :width] + 0.5
     grid = np.stack([u.ravel() / width, v.ravel() / height, np.ones(u.size)])
-    grid = np.linalg.solve(to_uv, grid)
-    si = dr.zeros(mi.SurfaceInteraction3f, grid.shape[1])
-    si.uv = mi.Point2f(grid[:2].astype(np.float32))
+    albedo = _albedo(bsdf, np.linalg.solve(to_uv, grid)).reshape(height, width, 3)
+    moved = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ to_uv.T
+    beyond = max(-moved[:, :2].min(), moved[:, :2].max() - 1) * max(height, width)
+    if beyond > 1:
+        grid[:2] += 1
+        other = _albedo(bsdf, np.linalg.solve(to_uv, grid)).reshape(albedo.shape)
+        if np.abs(albedo - other).mean() > _SAME:
+            raise InputError(
+                f"coordinates reach {beyond:.1f} texels beyond an image that does not "
+                "repeat, but in MuJoCo all do; set wrap_mode to repeat, or bake it"
+            )
+    return moved[:, :2], np.clip(albedo, 0, 1)
+
+
+def _albedo(bsdf: Any, uv: np.ndarray) -> np.ndarray:
+    """Return a material's albedo (n, 3) at coordinates (3, n), homogeneous."""
+    si = dr.zeros(mi.SurfaceInteraction3f, uv.shape[1])
+    si.uv = mi.Point2f(uv[:2].astype(np.float32))
     si.wi = mi.Vector3f(0, 0, 1)
     # a uniform material answers with one value for all texels
-    found = bsdf.eval_diffuse_reflectance(si) + dr.zeros(mi.Float, grid.shape[1])
-    albedo = rgb_rows(found).reshape(height, width, 3)
-    moved = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ to_uv.T
-    return moved[:, :2], np.clip(albedo, 0, 1)
+    found = bsdf.eval_diffuse_reflectance(si) + dr.zeros(mi.Float, uv.shape[1])
+    return rgb_rows(found)
 
 
 def _common_transform(parameters: Any) -> np.ndarray:
