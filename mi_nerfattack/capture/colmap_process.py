@@ -36,6 +36,7 @@ def main() -> int:
         return 2
     database, folder = Path(task["work"]) / "database.db", Path(task["folder"])
     names = task["names"]
+    pycolmap.logging.logtostderr = True  # no file among the temporary ones
     pycolmap.set_random_seed(task["seed"])
     _say(stage="features", total=len(names))
     pycolmap.extract_features(
