@@ -17,6 +17,7 @@ from pathlib import Path
 from packaging.requirements import InvalidRequirement, Requirement
 
 from mi_nerfattack import files, llvm, variant
+from mi_nerfattack.children import module_command
 from mi_nerfattack.cores import cores
 from mi_nerfattack.errors import NerfAttackError
 
@@ -155,7 +156,7 @@ def _llvm() -> Finding:
 
 def _variants() -> Iterator[Finding]:
     """Try the variants in a process of their own; it may be aborted."""
-    command = [sys.executable, "-m", "mi_nerfattack.probe"]
+    command = module_command("mi_nerfattack.probe")
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False

@@ -227,13 +227,17 @@ class TestUnusable:
         files.write_image(folder / "1.jpg", np.zeros((80, 60, 3), np.uint8))
         self.refused(folder, "1.jpg: 60 x 80 px, but .*0.jpg has 80 x 60")
 
-    def test_nothing_placed(self, tmp_path):
+    def test_nothing_placed(self, tmp_path, monkeypatch):
         pytest.importorskip("pycolmap")
+        temporary = tmp_path / "temporary"
+        temporary.mkdir()
+        monkeypatch.setenv("TMPDIR", str(temporary))
         self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
+        assert not list(temporary.iterdir())  # nor the log of COLMAP
 
     def test_without_pycolmap(self, tmp_path, monkeypatch):
         (tmp_path / "pycolmap.py").write_text("raise ImportError('gone')")
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        monkeypatch.syspath_prepend(str(tmp_path))
         folder = self.photographs(tmp_path / "p", 3)
         self.refused(folder, "pycolmap: gone; .*pip install pycolmap")
 
@@ -270,12 +274,13 @@ class TestProcess:
             lines = [
                 "import os, pathlib, signal, sys, time",
                 "class CameraMode: SINGLE = 0",
+                "class logging: logtostderr = False",
                 "def set_random_seed(seed): pass",
                 "def extract_features(database, *_):",
                 *(f"    {line}" for line in code.splitlines()),
             ]
             (tmp_path / "pycolmap.py").write_text("\n".join(lines) + "\n")
-            monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+            monkeypatch.syspath_prepend(str(tmp_path))
             estimate_poses(folder, tmp_path / "out", progress=progress)
 
         return call

@@ -7,7 +7,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mi_nerfattack.capture.colmap_process import LEAST_IMAGES, MARK, RESULT
+from mi_nerfattack.children import module_command
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera import Camera
 from mi_nerfattack.render.conventions import from_colmap
@@ -91,7 +91,7 @@ def reconstruct(
         "seed": seed,
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", _CHILD],
+        module_command(_CHILD),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -12,6 +12,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from mi_nerfattack.children import safe_path
 from mi_nerfattack.cores import cores
 from mi_nerfattack.errors import InputError
 
@@ -127,7 +128,7 @@ class _Member:
         self.connection, theirs = context.Pipe()
         self.piece: int | None = None
         self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-        with _blocked_interrupts():
+        with _blocked_interrupts(), safe_path():
             self._process.start()
         theirs.close()  # so that its end is noticed
 
