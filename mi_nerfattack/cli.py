@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -25,6 +26,7 @@ PROG = "mi-nerfattack"
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _DESCRIPTION = (
     "Find, measure and repair failures of image-based driving policies.\n\n"
@@ -44,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _terminate_as_interrupt():
             code = _run(arguments)
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed before we started
+                sys.stdout.flush()
             return code
     except NerfAttackError as err:
         return _fail(f"error: {err}", EXIT_INPUT, debug)
@@ -55,10 +58,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not is_interrupt(err):
             raise
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
+    except MemoryError as err:
+        advice = "give fewer or smaller images, cells or views"
+        return _fail(f"error: not enough memory: {err}; {advice}", EXIT_INPUT, debug)
     except BrokenPipeError:
-        # the interpreter flushes once more at its end; let that go nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return EXIT_BROKEN_PIPE
+    except OSError as err:
+        if err.errno not in _NO_ROOM:  # `files` tells all others
+            raise
+        _drop_output()
+        return _fail(
+            f"error: standard output: {err.strerror}; write it to another disk",
+            EXIT_INPUT,
+            debug,
+        )
 
 
 def _run(arguments: list[str]) -> int:
@@ -75,7 +89,18 @@ def _run(arguments: list[str]) -> int:
         )
     except SystemExit as stop:  # help printed, or wrong usage reported
         return stop.code if isinstance(stop.code, int) else EXIT_INPUT
-    return command.run()
+    try:
+        return command.run()
+    except SystemExit as stop:
+        if not isinstance(stop.__context__, BrokenPipeError):
+            raise
+        raise stop.__context__ from None  # rich ends the process by itself
+
+
+def _drop_output() -> None:
+    """Let nowhere take what the interpreter flushes once more at its end."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int, debug: bool) -> int:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -36,6 +37,13 @@ class Try:
             raise KeyboardInterrupt
         if self.what == "pipe":
             raise BrokenPipeError
+        if self.what == "rich":
+            try:
+                raise BrokenPipeError
+            except BrokenPipeError:
+                raise SystemExit(1)  # noqa: B904, as rich does
+        if self.what == "memory":
+            raise MemoryError("249 TiB")
         if self.what == "bug":
             raise ZeroDivisionError("ours")
         if self.what == "terminate":
@@ -110,6 +118,11 @@ def test_a_mistake_of_ours_keeps_its_traceback(run):
         run("try", "--what", "bug")
 
 
+def test_too_little_memory_is_a_message(run):
+    code, _, err = run("try", "--what", "memory")
+    assert code == 2 and "not enough memory: 249 TiB; give fewer or smaller" in err
+
+
 def test_other_threads_may_call(run):
     codes: list[int] = []
     thread = threading.Thread(target=lambda: codes.append(cli.main(["try"])))
@@ -165,6 +178,23 @@ def test_closed_pipe_is_quiet():
     process.stderr.close()
     assert process.wait(60) == cli.EXIT_BROKEN_PIPE
     assert err == b""
+
+
+def test_a_pipe_that_rich_finds_closed_is_a_closed_pipe(run, monkeypatch):
+    monkeypatch.setattr(cli, "_drop_output", lambda: None)
+    assert run("try", "--what", "rich") == (cli.EXIT_BROKEN_PIPE, "", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a device of Linux")
+@pytest.mark.parametrize(
+    ("where", "code", "message"),
+    [(">&-", 0, ""), (">/dev/full", 2, "standard output: No space left on device")],
+)
+def test_standard_output_that_takes_nothing(where, code, message):
+    command = f"{shlex.join(COMMAND)} --version {where}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
+    assert done.returncode == code and "Traceback" not in done.stderr
+    assert message in done.stderr and done.stderr.count("\n") == bool(message)
 
 
 def test_ctrl_c_in_a_real_process():

@@ -161,6 +161,14 @@ class Fit:
                 resume=self.resume,
             )
         provenance = self._provenance(images)
-        finish(result, images, self.output, provenance, self.json, depth, self.against)
-        checkpoint.unlink(missing_ok=True)
+        finish(
+            result,
+            images,
+            self.output,
+            provenance,
+            self.json,
+            checkpoint,
+            depth,
+            self.against,
+        )
         return 0

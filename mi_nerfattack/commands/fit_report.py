@@ -60,6 +60,7 @@ def finish(
     output: Path,
     provenance: Mapping[str, str],
     as_json: bool,
+    checkpoint: Path,
     depth: np.ndarray | None = None,
     against: CompareArguments | None = None,
 ) -> None:
@@ -71,6 +72,7 @@ def finish(
         output: field file; the report lies beside it, see `report_folder`.
         provenance: source and settings, for the file's header.
         as_json: print one line of JSON in place of the table.
+        checkpoint: of the fit; removed when all is written.
         depth: (n, height, width), metres along the ray, or None.
         against: the scene to compare with; None, or one without a scene, compares
             with nothing.
@@ -96,6 +98,7 @@ def finish(
     page = write_fit_report(report_folder(output), result, images, depth, title)
     write_cameras(report_folder(output) / "cameras.json", result, images)
     comparison = None if against is None else against.run(result.field, output)
+    checkpoint.unlink(missing_ok=True)  # before a closed pipe can end this
     if as_json:
         more = {} if comparison is None else {"compare": document(comparison)}
         print(json.dumps(summary(result) | more))
