@@ -290,6 +290,8 @@ class TestDrivePoses:
         np.testing.assert_array_equal(first, second)
         with pytest.raises(InputError, match="0 routes"):
             views.drive_poses([], 5, seed=3)
+        with pytest.raises(InputError, match="seed: -1; at least 0"):
+            views.drive_poses([route], 5, seed=-1)
 
 
 def test_capture_scene(tmp_path):
@@ -324,6 +326,15 @@ def test_capture_scene(tmp_path):
     # the ray through the bottom row hits the ground, z = 0
     bottom = np.isfinite(depth[:, -1, 8])
     np.testing.assert_array_less(height[bottom], depth[bottom, -1, 8])
+
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # other views replace the first ones
+        views.capture_scene(
+            scene, tmp_path / "routes.json", out, 3, read.camera, 4, 1, interrupt
+        )
+    assert not path.exists()
 
 
 class TestCameras:

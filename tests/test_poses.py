@@ -246,6 +246,11 @@ class TestUnusable:
         with pytest.raises(InputError, match="metres_per_unit: .*positive"):
             PoseOptions(metres_per_unit=scale)
 
+    @pytest.mark.parametrize("seed", [-1, 1 << 31])
+    def test_seed(self, seed):
+        with pytest.raises(InputError, match=f"seed: {seed}; must be in"):
+            PoseOptions(seed=seed)
+
     def test_output_that_is_a_file(self, tmp_path):
         folder = self.photographs(tmp_path / "p", 3)
         (tmp_path / "file").write_text("x")

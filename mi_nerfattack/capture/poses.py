@@ -26,6 +26,7 @@ from mi_nerfattack.render.camera import Camera
 
 _LEAST = 3
 _LEAST_UP = 0.2  # length of the mean of unit vectors
+_MAX_SEED = 1 << 31  # of COLMAP's generator
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class PoseOptions:
         scale = self.metres_per_unit
         if scale is not None and not (np.isfinite(scale) and scale > 0):
             raise InputError(f"metres_per_unit: {scale}; must be positive")
+        if not 0 <= self.seed < _MAX_SEED:
+            raise InputError(f"seed: {self.seed}; must be in [0, 2^31)")
 
 
 @dataclass(frozen=True)
@@ -247,7 +250,10 @@ def _write(
     names: Sequence[str],
     options: PoseOptions,
 ) -> PoseEstimate:
+    path = output / "transforms.json"
     files.make_folder(output / "images")
+    files.check_writable(path)
+    path.unlink(missing_ok=True)  # of the images replaced below
     for name in found.names:
         raw = files.read_bytes(staged / name, files.MAX_IMAGE_BYTES)
         files.write_bytes(output / "images" / name, raw)
@@ -262,7 +268,6 @@ def _write(
         "reprojection_error_px": found.error_px,
         "left_out": list(left_out),
     }
-    path = output / "transforms.json"
     stored = [f"images/{name}" for name in found.names]
     write_poses(path, stored, found.camera, found.camera_to_world, extra)
     eyes = found.camera_to_world[:, :3, 3]

@@ -181,6 +181,8 @@ def drive_poses(
         raise InputError(
             f"drive_poses: {len(routes)} routes, n {n}; at least 1 of both"
         )
+    if seed < 0:
+        raise InputError(f"seed: {seed}; at least 0")
     mount = CameraMount() if mount is None else mount
     rng = np.random.default_rng(seed)
     along = rng.uniform(0, 1, n)
@@ -241,6 +243,8 @@ def capture_scene(
     poses = drive_poses(routes, n, seed)
     scene = load_scene(scene_path)
     root = files.make_folder(out_folder)
+    files.check_writable(root / "transforms.json")
+    (root / "transforms.json").unlink(missing_ok=True)  # of the images replaced below
     files.make_folder(root / "images")
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
