@@ -7,6 +7,7 @@ import mi_nerfattack  # noqa: F401  before drjit
 # isort: split
 import dataclasses
 import json
+import os
 from pathlib import Path
 
 import drjit as dr
@@ -240,9 +241,17 @@ def test_folder_of_other_settings_is_refused(site, weights, tmp_path):
         again(site=PaintedSite(size_px=(4, 4)))
     with pytest.raises(InputError, match="differ in source"):
         again(source=PolicyDrives(weights))
+    for done in tmp_path.rglob("shard.json"):
+        os.replace(done, done.with_name("kept"))
+    again(seed=6)  # the manifest of an attempt without a frame binds nothing
     (tmp_path / "painted" / "manifest.json").unlink()
     with pytest.raises(InputError, match=r"frames without manifest.json"):
         again()
+
+
+def test_exposures_of_the_weather_are_checked():
+    with pytest.raises(InputError, match="exposure_ev: nan; must be finite"):
+        Weather(("day",), (0.0, float("nan")))
 
 
 @pytest.mark.parametrize("change", [{"frames": 0}, {"object_share": 1.5}])

@@ -326,24 +326,24 @@ def _is_done(shard: Path) -> bool:
 
 
 def _claim(root: Path, about: dict[str, Any]) -> None:
-    """Write the manifest, or compare it with the one that is there."""
+    """Write the manifest, or compare it with that of the frames that are there."""
     path, about = root / _MANIFEST, as_json(about)
-    if path.is_file():
-        found = files.read_json(path)
-        if found != about:
-            keys = sorted(set(found) | set(about))
-            wrong = [key for key in keys if found.get(key) != about.get(key)]
-            raise InputError(
-                f"{path}: the frames there differ in {', '.join(wrong)}; "
-                "choose another folder or remove this one"
-            )
+    if not any(_is_done(shard) for shard in root.glob("shard_*")):
+        files.write_json(path, about)
         return
-    if any(_is_done(shard) for shard in root.glob("shard_*")):
+    if not path.is_file():
         raise InputError(
             f"{root}: holds frames without {_MANIFEST}; choose another folder or "
             "remove this one"
         )
-    files.write_json(path, about)
+    found = files.read_json(path)
+    if found != about:
+        keys = sorted(set(found) | set(about))
+        wrong = [key for key in keys if found.get(key) != about.get(key)]
+        raise InputError(
+            f"{path}: the frames there differ in {', '.join(wrong)}; "
+            "choose another folder or remove this one"
+        )
 
 
 def _digest(routes: Sequence[Route]) -> str:

@@ -56,7 +56,8 @@ class Weather:
         if not self.skies or not self.exposures_ev:
             raise InputError("Weather: no skies or no exposures; at least one of each")
         for sky in self.skies:
-            Conditions(sky, 0.0, self.spp)
+            for exposure in self.exposures_ev:
+                Conditions(sky, exposure, self.spp)
 
     def draw(self, rng: np.random.Generator) -> Conditions:
         """Draw conditions."""
