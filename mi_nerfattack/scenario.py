@@ -243,8 +243,11 @@ def _content(value: str, base: str | Path) -> dict[str, str]:
 
 
 def _describe(path: str | Path, text: str, err: ValidationError) -> str:
-    problems = []
-    for error in err.errors():
+    problems, found = [], err.errors()
+    lists = {error["loc"][:1] for error in found if len(error["loc"]) > 1}
+    for error in found:
+        if error["type"] == "too_short" and error["loc"] in lists:
+            continue  # its only item is wrong, and told
         location = [part for part in error["loc"]]
         if error["type"] == "keys":  # of a section: two keys that do not go together
             location.append(error.get("ctx", {})["key"])

@@ -135,6 +135,15 @@ def test_errors_name_key_and_line(write, old, new, line, words):
         assert f"{path}:{line}" in message
 
 
+def test_a_wrong_object_is_one_problem(write):
+    text = MINIMAL.replace("position_m = [1.0, 2.0, 0.0]\nscale", "scale")
+    first = MINIMAL.index("[[objects]]")
+    text = text[:first] + text[text.index("[[objects]]", first + 1) :]
+    with pytest.raises(InputError, match=r"objects.0.position_m: [^\n]*$") as caught:
+        load_scenario(write(text))
+    assert "\n" not in str(caught.value)
+
+
 def test_missing_file(tmp_path):
     with pytest.raises(InputError, match="absent.toml"):
         load_scenario(tmp_path / "absent.toml")
