@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -237,3 +240,19 @@ def test_demo_renders_the_mesh_that_it_is_given(tmp_path, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.capture.object_views.render_views", reached)
     with pytest.raises(RuntimeError, match=r"box\.glb, 0\.90 m"):
         Demo(tmp_path / "run", path, height_m=0.9).run()
+
+
+def test_what_cannot_work_is_refused_before_anything_is_rendered(tmp_path):
+    from mi_nerfattack.commands.asset import Asset
+
+    path = tmp_path / "box.glb"
+    trimesh.creation.box((1, 2, 1)).export(path)
+    refuse = lambda name: pytest.raises(InputError, match=name)  # noqa: E731
+    with refuse("steps: 0"):
+        Asset(str(path), tmp_path / "a.safetensors", steps=0).run()
+    with refuse("seed.*-1"):
+        Asset(str(path), tmp_path / "a.safetensors", seed=-1).run()
+    if sys.platform == "linux":  # where nobody can write
+        with refuse("/proc/a.safetensors: "):
+            Asset(str(path), Path("/proc/a.safetensors")).run()
+    assert not list(tmp_path.glob("a.*"))

@@ -173,6 +173,14 @@ def test_bounds_around_the_points_that_depth_shows():
     np.testing.assert_allclose(upper - lower, 2 * (RADIUS + 0.05), atol=0.02)
 
 
+def test_bounds_where_depth_gives_no_point_are_those_without_depth():
+    images, depth = sphere_views(12)
+    alone = np.full_like(depth, np.nan)
+    alone[:, -1, -1] = 1.0  # points lie between a pixel and the next
+    lower, upper = find_bounds(images, alone)
+    assert [lower.tolist(), upper.tolist()] == [b.tolist() for b in find_bounds(images)]
+
+
 def test_bounds_of_parallel_cameras_are_asked_for():
     camera = from_fov(4, 4, 90.0)
     poses = np.stack([look_at(np.array([x, 0.0, 1.0]), [x + 1, 0, 1]) for x in (0, 1)])

@@ -227,6 +227,7 @@ def test_changed_scene_and_damaged_frame_are_not_continued(run):
         ("scene.xml -o a.exr --spp 0", r"spp: 0; at least 1"),
         ("scene.xml -o a.exr --seed -1", r"seed: -1"),
         ("scene.xml -o a.exr --size 0 6", r"at least 1 x 1"),
+        ("scene.xml -o a.exr --size 90000 90000", r"at most 134217728 pixels"),
         ("scene.xml -o a.exr --set width=3", r"width=3.*no <default>"),
         ("scene.xml -o a.exr --set spp", r"--set spp: needs NAME=VALUE"),
         ("scene.xml -o a.exr --set spp=x", r"could not parse integer"),

@@ -147,7 +147,7 @@ def test_what_the_parser_refuses_is_one_line_with_the_file(tmp_path, body, messa
 def test_what_is_no_scene_or_fits_no_scene_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"none.xml: does not exist"):
         load_scene(tmp_path / "none.xml")
-    with pytest.raises(InputError, match="folder|does not exist"):
+    with pytest.raises(InputError, match="is a folder; give a Mitsuba scene"):
         load_scene(tmp_path)
     path = tmp_path / "scene.xml"
     path.write_text('<bsdf version="3.0.0" type="diffuse"/>')

@@ -98,6 +98,8 @@ def sphere_poses(
     above = 1 - share / (1 - _SHARE_BELOW)
     below = _LOWEST * (share - 1 + _SHARE_BELOW) / _SHARE_BELOW
     z = np.where(share < 1 - _SHARE_BELOW, above, below)
+    if seed < 0:
+        raise InputError(f"seed: {seed}; at least 0")
     turn = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     phi = turn + np.arange(n) * np.pi * (3 - math.sqrt(5))
     radius = np.sqrt(1 - z**2)

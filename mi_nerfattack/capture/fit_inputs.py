@@ -156,8 +156,9 @@ def find_bounds(
                 f"bounds: {list(given)}; must be x0 y0 z0 x1 y1 z1 with x0 < x1, ..."
             )
         return lower, upper
-    if depth is not None and np.isfinite(depth).any():
-        return _box_of_points(images, depth)
+    seen = None if depth is None else _box_of_points(images, depth)
+    if seen is not None:
+        return seen
     if images.points is not None and len(images.points) > 0:
         return _box_of_sparse(images.points, images.camera_to_world[:, :3, 3])
     focus = _focus(images.camera_to_world)
@@ -167,12 +168,15 @@ def find_bounds(
 
 def _box_of_points(
     images: PosedImages, depth: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the box of the points of depth maps, None where there are none."""
     corners = [
         (block.min(0), block.max(0))
         for block in depth_points(images, depth, range(len(images)))
         if len(block)
     ]
+    if not corners:
+        return None
     lower = np.min([low for low, _ in corners], axis=0)
     upper = np.max([high for _, high in corners], axis=0)
     margin = max(_MIN_MARGIN_M, _MARGIN * float((upper - lower).max()))

@@ -86,6 +86,7 @@ class Asset:
         check_output(self.output)
         checkpoint = self.output.with_suffix(".checkpoint.safetensors")
         check_unfinished(checkpoint, self.resume)
+        self._options(has_depth=True)  # checks them before views are rendered
         variant.ensure()
         with StageBars() as bars:
             found = self._views(bars)
@@ -113,8 +114,15 @@ class Asset:
             "source_unit": found.images.unit,
             "seed": str(self.seed),
         }
-        finish(result, found.images, self.output, provenance, self.json, found.depth)
-        checkpoint.unlink(missing_ok=True)
+        finish(
+            result,
+            found.images,
+            self.output,
+            provenance,
+            self.json,
+            checkpoint,
+            found.depth,
+        )
         return 0
 
     def _options(self, has_depth: bool) -> FitOptions:

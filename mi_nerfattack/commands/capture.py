@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -59,5 +60,6 @@ class Capture:
                 partial(show_views, bars),
             )
         print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
-        print(f"  mi-nerfattack fit {path.parent} -o FIELD.safetensors")
+        folder = shlex.quote(str(path.parent))
+        print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors")
         return 0

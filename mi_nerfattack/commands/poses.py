@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -69,5 +70,6 @@ class Poses:
                 f"quotient by {result.distance:.4g} as --metres-per-unit."
             )
         print("Fit a field to them with")
-        print(f"  mi-nerfattack fit {result.path.parent} -o FIELD.safetensors")
+        folder = shlex.quote(str(result.path.parent))
+        print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors")
         return 0

@@ -128,7 +128,7 @@ class _Member:
         self.connection, theirs = context.Pipe()
         self.piece: int | None = None
         self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-        with _blocked_interrupts(), safe_path():
+        with safe_path(), _blocked_interrupts():
             self._process.start()
         theirs.close()  # so that its end is noticed
 

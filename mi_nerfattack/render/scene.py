@@ -110,6 +110,11 @@ def _has_rectangles(state: Any) -> bool:
 def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> None:
     if min(size_px) < 1:
         raise InputError(f"size: {size_px[0]} x {size_px[1]} px; at least 1 x 1")
+    if size_px[0] * size_px[1] > files.MAX_IMAGE_PIXELS:
+        raise InputError(
+            f"size: {size_px[0]} x {size_px[1]} px; at most {files.MAX_IMAGE_PIXELS} "
+            "pixels in all"
+        )
     for node in state.nodes:
         if node.type != mi.ObjectType.Film:
             continue
@@ -125,6 +130,8 @@ def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> Non
 def _resolved_from(path: str | Path) -> Iterator[None]:
     """Let Mitsuba look for files beside a scene's first, as its own loader does."""
     source = Path(path)
+    if source.is_dir():
+        raise InputError(f"{path}: is a folder; give a Mitsuba scene (XML)")
     if not source.is_file():
         raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
     before = mi.file_resolver()
