@@ -130,7 +130,8 @@ class CheckpointFile:
             else "there is no checkpoint yet"
         )
         return (
-            f"iteration {attack.iteration} is not saved, {kept}; continue with --resume"
+            f"iteration {attack.iteration} is not saved, {kept}; continue "
+            "with 'mi-nerfattack attack --resume'"
         )
 
     def _check_shapes(

@@ -55,7 +55,7 @@ class RunFolder:
             if not self.path.is_dir() or any(self.path.iterdir()):
                 raise InputError(
                     f"{self.path}: exists and is not an empty folder; choose another, "
-                    "or continue with --resume"
+                    "or continue the run in it with 'mi-nerfattack attack --resume'"
                 )
 
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
