@@ -6,6 +6,7 @@ import mi_nerfattack  # noqa: F401  before drjit
 
 # isort: split
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -121,6 +122,13 @@ def test_an_interrupted_evaluation_continues(place, capsys, monkeypatch):
     assert cli.main([*place, "--json", "--drives", "kept"]) == 0
     assert steps == 100 + 3 * 76
     capsys.readouterr()
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_the_first_drive(place, capsys):
+    Path("file").write_text("")
+    assert cli.main([*place, "--drives", "file"]) == 2
+    err = capsys.readouterr().err
+    assert "file: " in err and "driving" not in err
 
 
 def test_drives_without_objects_are_announced(place, capsys):
@@ -385,4 +393,4 @@ def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
     Path("mine.toml").write_text(text + "width = 0\n")
     capsys.readouterr()
     assert cli.main([*place, "--horizon", "2"]) == 2
-    assert "mine.toml: camera.width: " in capsys.readouterr().err
+    assert re.search(r"mine.toml: camera.width: .*\(is .*\)", capsys.readouterr().err)

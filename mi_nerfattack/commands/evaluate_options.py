@@ -206,4 +206,9 @@ def _checked(name: str, model: type[_Section], values: object) -> _Section:
         location = [str(part) for part in first["loc"]]
         if first["type"] == "keys":
             location.append(str(first.get("ctx", {})["key"]))
-        raise InputError(f"{'.'.join([name, *location])}: {first['msg']}") from err
+        where, problem = ".".join([name, *location]), first["msg"]
+        if first["type"] == "extra_forbidden":
+            problem = "unknown key; remove or correct it"
+        elif first["type"] not in ("missing", "keys"):
+            problem += f" (is {first['input']!r})"
+        raise InputError(f"{where}: {problem}") from err

@@ -289,8 +289,8 @@ def run_evaluation(
     Raises:
         InputError: before the first drive, a lane narrower than the car, a route too
             short for objects, an environment that cannot be made, several processes
-            for CARLA, or drives of another evaluation in the folder; later, a policy
-            that does not take the images.
+            for CARLA, drives of another evaluation in the folder, or one that cannot
+            be made; later, a policy that does not take the images.
     """
     limits = departure_limits(work.routes, work.settings.car_width_m)
     if RANDOM_OBJECTS in work.cases:
@@ -304,6 +304,7 @@ def run_evaluation(
     # what cannot be made is told now, not after the hours of those before it
     for under in dict.fromkeys(jobs[index].environment for index in left):
         make_environment(under.name, work.place, under.conditions).close()
+    files.make_folder(work.folder)
 
     def count(units: int) -> None:
         nonlocal done
