@@ -262,13 +262,16 @@ def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
     result = FitResult(field, psnr, ssim, scores, (), 1.0, 25)
     against = CompareArguments(*place, (24, 16), 30.0, compare_spp=2)
     output = tmp_path / "wall.safetensors"
-    finish(result, images, output, {"source": "x"}, True, against=against)
+    kept = tmp_path / "wall.checkpoint.safetensors"
+    kept.write_bytes(b"")
+    finish(result, images, output, {"source": "x"}, True, kept, against=against)
+    assert not kept.exists()
     table = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert table["psnr_heldout_db"] == psnr and table["steps"] == 25
     assert table["compare"]["routes"]["ahead"]["frames"] == 5
     saved = load_field(output)
     assert isinstance(saved, GridField) and saved.info["fit.source"] == "x"
-    finish(result, images, output, {}, False)
+    finish(result, images, output, {}, False, kept)
     assert "good enough as an object to attack" in capsys.readouterr().out
     assert (tmp_path / "wall.report" / "report.html").is_file()
 
