@@ -80,7 +80,7 @@ class BenchDagger:
     """Compare DAgger with plain cloning on as many frames and gradient steps.
 
     Both start from the same frames and weights of three seeds; mean cross-track errors
-    of drives from random starts at the bundled intersection. Takes a quarter of an hour
+    of drives from random starts at the bundled intersection. Takes half an hour
     on two cores; stopped, the same command continues from DATA.
     """
 
