@@ -90,6 +90,22 @@ def reconstruct(
         "long_edge_px": long_edge_px,
         "seed": seed,
     }
+    stages = _Stages(progress)
+    code = _run(task, stages)
+    if stages.missing is not None:
+        raise InputError(
+            f"pycolmap: {stages.missing}; poses are estimated with it: pip install "
+            "pycolmap, or reconstruct with COLMAP elsewhere and give the model to 'fit'"
+        )
+    if code:
+        raise SetupError(stages.failure(code))
+    stages.end()
+    found = json.loads((work / RESULT).read_text(encoding="utf-8"))
+    return _structure(found, len(names))
+
+
+def _run(task: dict[str, Any], stages: _Stages) -> int:
+    """Return the exit code of the process that does a task."""
     process = subprocess.Popen(
         module_command(_CHILD),
         stdin=subprocess.PIPE,
@@ -106,22 +122,11 @@ def reconstruct(
             with contextlib.suppress(BrokenPipeError):  # its last lines say why
                 process.stdin.write(json.dumps(task) + "\n")
                 process.stdin.flush()
-            stages = _Stages(progress)
             stages.follow(process.stdout)
-            code = process.wait()
+            return process.wait()
         except BaseException:
             process.kill()
             raise
-    if stages.missing is not None:
-        raise InputError(
-            f"pycolmap: {stages.missing}; poses are estimated with it: pip install "
-            "pycolmap, or reconstruct with COLMAP elsewhere and give the model to 'fit'"
-        )
-    if code:
-        raise SetupError(stages.failure(code))
-    stages.end()
-    found = json.loads((work / RESULT).read_text(encoding="utf-8"))
-    return _structure(found, len(names))
 
 
 class _Stages:
