@@ -62,6 +62,13 @@ class TestTransforms:
         assert back.camera == CAMERA
         assert json.loads((tmp_path / "transforms.json").read_text())["seed"] == 7
 
+    def test_an_unfinished_folder_has_no_poses(self, folder, monkeypatch):
+        images, poses = some_frames()
+        monkeypatch.setattr(files, "write_image", lambda path, image: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            write_transforms(folder, images, CAMERA, poses)
+        assert not (folder / "transforms.json").exists()
+
     def test_file_is_opengl(self, tmp_path):
         images, _ = some_frames(1)
         write_transforms(tmp_path, images, CAMERA, look_at([4, 0, 0], [0, 0, 0])[None])

@@ -188,12 +188,27 @@ def write_transforms(
     """
     names = tuple(f"images/{i:04d}.png" for i in range(len(images)))
     posed = PosedImages(images, np.asarray(camera_to_world, float), camera, names)
-    root = files.make_folder(folder)
-    files.make_folder(root / "images")
+    path = begin_posed(folder)
     for name, image in zip(names, posed.images, strict=True):
-        files.write_image(root / name, image)
-    path = root / "transforms.json"
+        files.write_image(path.parent / name, image)
     write_poses(path, names, camera, posed.camera_to_world, extra)
+    return path
+
+
+def begin_posed(folder: str | Path) -> Path:
+    """Make a folder and its `images` ready for posed images.
+
+    An earlier `transforms.json` is removed: its poses are not those of the images that
+    replace its own.
+
+    Returns:
+        Path of `transforms.json`, to be written last.
+    """
+    root = files.make_folder(folder)
+    path = root / "transforms.json"
+    files.check_writable(path)
+    path.unlink(missing_ok=True)
+    files.make_folder(root / "images")
     return path
 
 

@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack import files
-from mi_nerfattack.capture.frames import write_poses
+from mi_nerfattack.capture.frames import begin_posed, write_poses
 from mi_nerfattack.capture.structure import (
     Lens,
     Matching,
@@ -250,10 +250,7 @@ def _write(
     names: Sequence[str],
     options: PoseOptions,
 ) -> PoseEstimate:
-    path = output / "transforms.json"
-    files.make_folder(output / "images")
-    files.check_writable(path)
-    path.unlink(missing_ok=True)  # of the images replaced below
+    path = begin_posed(output)
     for name in found.names:
         raw = files.read_bytes(staged / name, files.MAX_IMAGE_BYTES)
         files.write_bytes(output / "images" / name, raw)

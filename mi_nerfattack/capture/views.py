@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack import files
-from mi_nerfattack.capture.frames import write_poses
+from mi_nerfattack.capture.frames import begin_posed, write_poses
 from mi_nerfattack.colour import linear_to_uint8
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera import (
@@ -242,10 +242,8 @@ def capture_scene(
     routes = [Route.from_file(routes_path, name) for name in table]
     poses = drive_poses(routes, n, seed)
     scene = load_scene(scene_path)
-    root = files.make_folder(out_folder)
-    files.check_writable(root / "transforms.json")
-    (root / "transforms.json").unlink(missing_ok=True)  # of the images replaced below
-    files.make_folder(root / "images")
+    path = begin_posed(out_folder)
+    root = path.parent
     names = [f"images/{i:04d}.png" for i in range(n)]
     depth = np.empty((n, camera.height, camera.width), np.float32)
     for i, view in enumerate(iterate_views(scene, camera, poses, spp, seed)):
@@ -259,5 +257,5 @@ def capture_scene(
         "spp": spp,
         "seed": seed,
     }
-    write_poses(root / "transforms.json", names, camera, poses, extra)
-    return root / "transforms.json"
+    write_poses(path, names, camera, poses, extra)
+    return path
