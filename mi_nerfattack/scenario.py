@@ -32,6 +32,7 @@ from mi_nerfattack.sections import (
     Section,
     TermSection,
     VehicleSection,
+    explain,
 )
 from mi_nerfattack.user_code import module_file, split_reference
 
@@ -248,19 +249,14 @@ def _describe(path: str | Path, text: str, err: ValidationError) -> str:
     for error in found:
         if error["type"] == "too_short" and error["loc"] in lists:
             continue  # its only item is wrong, and told
-        location = [part for part in error["loc"]]
-        if error["type"] == "keys":  # of a section: two keys that do not go together
-            location.append(error.get("ctx", {})["key"])
+        location, message = explain(error)
         key = ".".join(str(part) for part in location) or "(file)"
         line = _line_of(text, location)
         where = f"{path}:{line}" if line else f"{path}"
-        told = error["type"] in ("missing", "keys")
-        value = "" if told else f" (is {error['input']!r})"
-        message = error["msg"][0].lower() + error["msg"][1:]
+        message = message[0].lower() + message[1:]
         if error["type"] == "extra_forbidden":
             message = f"unknown key; allowed: {', '.join(_allowed(location))}"
-            value = ""
-        problems.append(f"{where}: {key}: {message}{value}")
+        problems.append(f"{where}: {key}: {message}")
     return "\n".join(problems)
 
 

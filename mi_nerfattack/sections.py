@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 
 def _not_zero(value: float) -> float:
@@ -343,6 +343,16 @@ _TERM_KEYS = (
     ("listed_weights", "weights", ("listed",)),
 )
 _OPTIONAL = ("limit_m",)
+
+
+def explain(error: ErrorDetails) -> tuple[list[str | int], str]:
+    """Return the keys that lead to a section's error, and what is wrong."""
+    location = list(error["loc"])
+    if error["type"] == "keys":  # of a section: two keys that do not go together
+        location.append(error.get("ctx", {})["key"])
+    told = error["type"] in ("missing", "keys", "extra_forbidden")
+    value = "" if told else f" (is {error['input']!r})"
+    return location, error["msg"] + value
 
 
 def _check_pair(term: Section, key: str, other: str, values: tuple[str, ...]) -> None:

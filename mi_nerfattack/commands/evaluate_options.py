@@ -199,16 +199,14 @@ def _checked(name: str, model: type[_Section], values: object) -> _Section:
     """Return a section of a scenario; `name` is its file's and its own."""
     from pydantic import ValidationError
 
+    from mi_nerfattack.sections import explain
+
     try:
         return model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as err:
         first = err.errors()[0]
-        location = [str(part) for part in first["loc"]]
-        if first["type"] == "keys":
-            location.append(str(first.get("ctx", {})["key"]))
-        where, problem = ".".join([name, *location]), first["msg"]
+        location, problem = explain(first)
+        where = ".".join([name, *map(str, location)])
         if first["type"] == "extra_forbidden":
             problem = "unknown key; remove or correct it"
-        elif first["type"] not in ("missing", "keys"):
-            problem += f" (is {first['input']!r})"
         raise InputError(f"{where}: {problem}") from err
