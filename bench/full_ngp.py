@@ -17,14 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack import files
-from mi_nerfattack.fields.ngp import (
-    GEOMETRY_FEATURES,
-    SH_ORDER,
-    NGPField,
-    NGPLayout,
-)
+from mi_nerfattack.fields.ngp import GEOMETRY_FEATURES, SH_ORDER, NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.io import files
 
 FULL = NGPLayout()
 PRIMES = (1, 2654435761, 805459861)

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mi_nerfattack import files, llvm
-from mi_nerfattack.cores import cores
+from mi_nerfattack.backend import llvm
+from mi_nerfattack.io import files
+from mi_nerfattack.system.cores import cores
 
 PACKAGES = ("mi-nerfattack", "mitsuba", "drjit", "torch", "numpy")
 

@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bench.attack.sides import AbstractAttack
+from bench.full_ngp import NGPData
+from bench.render.sides import AbstractSide, AbstractTrainer
 from mi_nerfattack import variant
-from mi_nerfattack.bench.attack_sides import AbstractAttack
-from mi_nerfattack.bench.full_ngp import NGPData
-from mi_nerfattack.bench.sides import AbstractSide, AbstractTrainer
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -48,13 +48,13 @@ def main(arguments: Sequence[str]) -> None:
 def make_side(role: str, width: int, height: int, rest: list[str]) -> AbstractSide:
     """Make a side; imports only what it needs."""
     if role in ("plain", "tuned"):
-        from mi_nerfattack.bench.peer import CHUNKS, TorchSide
+        from bench.render.peer import CHUNKS, TorchSide
 
         chunks = tuple(int(size) for size in rest[1:]) or CHUNKS
         data = NGPData.read(Path(rest[0]))
         return TorchSide(role, data, width, height, chunks)
     variant.ensure()
-    from mi_nerfattack.bench import ours
+    from bench.render import ours
 
     if role == "object":
         return ours.object_side(width, height)
@@ -73,14 +73,14 @@ def make_trainer(role: str, start: str, *rest: str) -> AbstractTrainer:
             else, the rays of a chunk.
     """
     if role in ("plain", "tuned"):
-        from mi_nerfattack.bench.fit_peer import TorchTrainer
+        from bench.fit.peer import TorchTrainer
 
         pictures, rays, *chunk = rest
         return TorchTrainer(
             role, Path(start), Path(pictures), int(rays), *map(int, chunk)
         )
     variant.ensure()
-    from mi_nerfattack.bench.fit_ours import OurTrainer
+    from bench.fit.ours import OurTrainer
 
     return OurTrainer(Path(start))
 
@@ -94,19 +94,19 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
             background and of the object, and, to try nothing else, the rays of a
             chunk and the object's lookup.
     """
-    from mi_nerfattack.bench.attack_drive import Job
+    from bench.attack.drive import Job
 
     job, others = Job(*map(int, rest[:4])), rest[4:]
     if role in ("plain", "tuned"):
-        from mi_nerfattack.bench.attack_peer import LOOKUPS, TorchAttack
-        from mi_nerfattack.bench.peer import CHUNKS
+        from bench.attack.peer import LOOKUPS, TorchAttack
+        from bench.render.peer import CHUNKS
 
         scene, item, *choices = others
         chunks = (int(choices[0]),) if choices else CHUNKS
         lookups = (choices[1],) if choices else tuple(LOOKUPS)
         return TorchAttack(role, Path(scene), Path(item), job, chunks, lookups)
     variant.ensure()
-    from mi_nerfattack.bench.attack_ours import OurAttack
+    from bench.attack.ours import OurAttack
 
     return OurAttack(job)
 

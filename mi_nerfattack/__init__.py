@@ -6,11 +6,11 @@ plugins for the active variant and for every later one.
 
 from __future__ import annotations
 
-from mi_nerfattack import llvm as _llvm
+from mi_nerfattack.backend import llvm as _llvm
 
 _llvm.setup()  # before anything imports drjit
 
-from mi_nerfattack import variant  # noqa: E402
+from mi_nerfattack.backend import variant  # noqa: E402
 from mi_nerfattack.errors import InputError, NerfAttackError, SetupError  # noqa: E402
 
 __version__ = "0.1.0"

@@ -12,14 +12,14 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
 import tyro
 
 import mi_nerfattack
-from mi_nerfattack.commands import COMMANDS
+from mi_nerfattack.commands import COMMANDS, Command
 from mi_nerfattack.errors import NerfAttackError, is_interrupt
 
 PROG = "mi-nerfattack"
@@ -34,18 +34,24 @@ _DESCRIPTION = (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(
+    argv: Sequence[str] | None = None,
+    commands: Mapping[str, type[Command]] = COMMANDS,
+    prog: str = PROG,
+) -> int:
     """Run one sub-command and return the exit code.
 
     Args:
         argv: the arguments without the program's name; None takes the process's.
+        commands: what can be run, by name.
+        prog: the program's name, for its help.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     arguments = [item for item in arguments if item != "--debug"]
     try:
         with _terminate_as_interrupt():
-            code = _run(arguments)
+            code = _run(arguments, commands, prog)
             if sys.stdout is not None:  # closed before we started
                 sys.stdout.flush()
             return code
@@ -75,14 +81,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
 
 
-def _run(arguments: list[str]) -> int:
+def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str) -> int:
     if arguments == ["--version"]:
-        print(f"{PROG} {mi_nerfattack.__version__}")
+        print(f"{prog} {mi_nerfattack.__version__}")
         return 0
     try:
         command = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog=PROG,
+            dict(commands),
+            prog=prog,
             description=_DESCRIPTION,
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),

@@ -7,13 +7,17 @@ from typing import Any, NoReturn
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import field_volume as shared
-from mi_nerfattack.render import spectrum
-from mi_nerfattack.render.attached import attached
-from mi_nerfattack.render.composite import AbstractComposite
-from mi_nerfattack.render.interleaved import COMPOSITES
-from mi_nerfattack.render.march import STOP, Rays
+from mi_nerfattack.plugins.properties import (
+    background,
+    read_composite,
+    read_nested,
+    read_stop,
+    refuse_nested,
+)
+from mi_nerfattack.render.lighting import spectrum
+from mi_nerfattack.render.lighting.attached import attached
+from mi_nerfattack.render.march import Rays
 
 
 class FieldEmitter(mi.Emitter):
@@ -147,56 +151,6 @@ class FieldEmitter(mi.Emitter):
         """Describe the checked parameters."""
         names = ", ".join(volume.id() for volume in self.volumes)
         return f"FieldEmitter[fields=({names}), stop={self.stop}]"
-
-
-def read_stop(props: mi.Properties) -> float:
-    """Read `stop`, a transmittance."""
-    stop = float(props.get("stop", STOP))
-    if not 0 <= stop < 1:
-        raise InputError(f"stop: {stop}; allowed is 0 <= stop < 1")
-    return stop
-
-
-def read_composite(props: mi.Properties) -> AbstractComposite:
-    """Read `composite`, the rule by which fields become one colour."""
-    name = props.get("composite", "interleaved")
-    if name not in COMPOSITES:
-        raise InputError(f"composite: {name!r}; allowed: {', '.join(COMPOSITES)}")
-    return COMPOSITES[name]()
-
-
-def read_nested(
-    props: mi.Properties, plugin: str, kinds: tuple[type, ...]
-) -> tuple[list[Any], list[Any]]:
-    """Split nested objects into volumes of some kinds, at least one, and the others."""
-    volumes, others = [], []
-    for _, item in props.objects():
-        (volumes if isinstance(item, kinds) else others).append(item)
-    if not volumes:
-        raise InputError(
-            f"{plugin}: no nested grid_field or ngp_field; give one or more"
-        )
-    return volumes, others
-
-
-def refuse_nested(others: list[Any], plugin: str, also: str = "") -> None:
-    """Raise InputError if a nested object is left over."""
-    if others:
-        raise InputError(
-            f"{plugin}: cannot use the nested {type(others[0]).__name__} "
-            f"{others[0].id()!r}; allowed: grid_field, ngp_field{also}"
-        )
-
-
-def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
-    """Return what lies behind the first NGP among the volumes; black without one.
-
-    The sky turns with the field.
-    """
-    for volume in volumes:
-        if volume.field.kind == "ngp_field":
-            return volume.posed.background(direction)
-    return mi.Color3f(0)
 
 
 mi.register_emitter("field_emitter", lambda props: FieldEmitter(props))

@@ -10,20 +10,20 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.plugins.field_emitter import (
+from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
+from mi_nerfattack.plugins.properties import (
     background,
     read_composite,
     read_nested,
     read_stop,
     refuse_nested,
 )
-from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
-from mi_nerfattack.render import spectrum
 from mi_nerfattack.render.backdrop import only_fields
 from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.lighting import spectrum
+from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.march import March, Rays
-from mi_nerfattack.render.relight import LIGHT_SAMPLES, Relighting
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):

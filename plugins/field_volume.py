@@ -11,8 +11,10 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, load_field
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.render import spectrum
-from mi_nerfattack.render.posed import Pose, PosedField
+from mi_nerfattack.plugins.properties import read_pose
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.lighting import spectrum
+from mi_nerfattack.render.posed import PosedField
 
 QUANTITIES = ("density", "radiance")
 
@@ -26,17 +28,6 @@ def read_field(props: mi.Properties, kind: str) -> AbstractField:
             f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'
         )
     return field
-
-
-def read_pose(props: mi.Properties) -> Pose:
-    """Read `to_world`: rotation, translation and uniform scale."""
-    transform = props.get("to_world", mi.ScalarTransform4f())
-    try:
-        return Pose.from_matrix(np.array(transform.matrix, np.float64))
-    except ValueError as err:
-        raise InputError(
-            f"to_world: {err}; fields take rotation, translation and uniform scale"
-        ) from err
 
 
 def place_unit_cube(

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera
-from mi_nerfattack.render.distortion import distort, jacobian, undistort
+from mi_nerfattack.render.camera.distortion import distort, jacobian, undistort
+from mi_nerfattack.render.camera.intrinsics import Camera
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 

@@ -8,8 +8,8 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.splats import read_splats
-from mi_nerfattack.plugins.field_volume import read_pose
-from mi_nerfattack.render import spectrum
+from mi_nerfattack.plugins.properties import read_pose
+from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.splats import SplatBackground
 
 

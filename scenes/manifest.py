@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError, NerfAttackError
-from mi_nerfattack.files import read_json, write_json
+from mi_nerfattack.io.files import read_json, write_json
 
 from .listing import MANIFEST, ROOT, data_files
 

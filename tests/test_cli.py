@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import pytest
 
 import mi_nerfattack
-from mi_nerfattack import cli, doctor, llvm
+from mi_nerfattack import cli
+from mi_nerfattack.backend import llvm
 from mi_nerfattack.commands import COMMANDS
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.system import doctor
 
 COMMAND = [sys.executable, "-m", "mi_nerfattack.cli"]
 HEAVY = {"torch", "matplotlib", "trimesh", "skimage", "scipy", "cv2", "OpenEXR"}

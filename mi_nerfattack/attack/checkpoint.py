@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.determinism import random_states, restore_random_states
+from mi_nerfattack.backend.determinism import random_states, restore_random_states
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.resumable import Kept, read_kept, write_kept
+from mi_nerfattack.io.resumable import Kept, read_kept, write_kept
 
 FORMAT = "mi_nerfattack attack checkpoint 3"
 REMEDY = (

@@ -11,13 +11,13 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from mi_nerfattack.attack.parameters import Freedom
+from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
-from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.vehicle.route.route import Route
 
 OFFSETS = "offsets"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import Camera
-from mi_nerfattack.render.conventions import COLMAP_MODELS
+from mi_nerfattack.render.camera.conventions import COLMAP_MODELS
+from mi_nerfattack.render.camera.intrinsics import Camera
 
 _NUMBERS = "w h fl_x fl_y cx cy camera_angle_x camera_angle_y k1 k2 p1 p2 k3 k4".split()
 _KEYS = (*_NUMBERS, "camera_model", "is_fisheye", "distortion_params")

@@ -8,12 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack import files
-from mi_nerfattack.capture.asset import Lighting, render_asset
-from mi_nerfattack.capture.fit_inputs import find_bounds
-from mi_nerfattack.capture.frames import PosedImages, read_images
-from mi_nerfattack.capture.hull import check_alpha, place, silhouette_bounds
-from mi_nerfattack.capture.mesh import (
+from mi_nerfattack.capture.inputs import find_bounds
+from mi_nerfattack.capture.mesh.mesh import (
     CUBE_FACES,
     TexturedMesh,
     cube_mesh,
@@ -21,8 +17,13 @@ from mi_nerfattack.capture.mesh import (
     normalise,
     turn_matrix,
 )
-from mi_nerfattack.capture.mesh_files import load_mesh, up_matrix
+from mi_nerfattack.capture.mesh.read import load_mesh, up_matrix
+from mi_nerfattack.capture.object_renders import Lighting, render_asset
+from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.capture.silhouettes import check_alpha, place, silhouette_bounds
+from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.attack import Attack
-from mi_nerfattack.commands.bench import Bench
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
@@ -43,7 +42,6 @@ COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "evaluate": Evaluate,
     "attack": Attack,
-    "bench": Bench,
 }
 
 __all__ = ["COMMANDS", "Command"]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mi_nerfattack.commands.bars import StageBars
+from mi_nerfattack.commands.shared.progress import StageBars
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from mi_nerfattack.capture.fit_options import FitOptions
     from mi_nerfattack.capture.object_views import ObjectViews
+    from mi_nerfattack.fit.options import FitOptions
 
 _SSIM_PX = 11
 
@@ -78,10 +78,14 @@ class Asset:
     def run(self) -> int:
         """Render or read the views, fit, score and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.fit import fit_grid
-        from mi_nerfattack.capture.fit_checkpoint import check_unfinished
-        from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
+        from mi_nerfattack.commands.shared.fit_report import (
+            check_output,
+            finish,
+            show_fit,
+        )
         from mi_nerfattack.fields.grid import GridLayout
+        from mi_nerfattack.fit.checkpoint import check_unfinished
+        from mi_nerfattack.fit.fit import fit_grid
 
         check_output(self.output)
         checkpoint = self.output.with_suffix(".checkpoint.safetensors")
@@ -126,7 +130,7 @@ class Asset:
         return 0
 
     def _options(self, has_depth: bool) -> FitOptions:
-        from mi_nerfattack.capture.fit_options import FitOptions
+        from mi_nerfattack.fit.options import FitOptions
 
         return FitOptions(
             steps=(600 if has_depth else 1000) if self.steps is None else self.steps,
@@ -137,13 +141,13 @@ class Asset:
         )
 
     def _views(self, bars: StageBars) -> ObjectViews:
-        from mi_nerfattack.capture.asset import Lighting
+        from mi_nerfattack.capture.object_renders import Lighting
         from mi_nerfattack.capture.object_views import (
             Placement,
             read_views,
             render_views,
         )
-        from mi_nerfattack.commands.fit_report import show_views
+        from mi_nerfattack.commands.shared.fit_report import show_views
 
         placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
         is_cube, is_folder = self.source == "cube", Path(self.source).is_dir()

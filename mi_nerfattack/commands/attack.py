@@ -32,7 +32,7 @@ class Attack:
 
     def run(self) -> int:
         """Run the job and print the table."""
-        from mi_nerfattack.commands.attack_progress import run_scenario
+        from mi_nerfattack.commands.shared.run_scenario import run_scenario
         from mi_nerfattack.errors import InputError
 
         if self.force and not self.resume:

@@ -37,11 +37,11 @@ class Capture:
     def run(self) -> int:
         """Render and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.views import capture_scene
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.commands.fit_report import show_views
+        from mi_nerfattack.capture.scene import capture_scene
+        from mi_nerfattack.commands.shared.fit_report import show_views
+        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.render.camera import from_fov
+        from mi_nerfattack.render.camera.intrinsics import from_fov
 
         variant.ensure()
         for name in ("views", "width", "height", "spp"):

@@ -31,7 +31,7 @@ class Demo:
 
     def run(self) -> int:
         """Run the bundled scenario."""
-        from mi_nerfattack.commands.attack_progress import run_scenario
+        from mi_nerfattack.commands.shared.run_scenario import run_scenario
         from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -43,7 +43,7 @@ class Demo:
         """Return the field file of the object, fitting a mesh beside the run folder."""
         if self.object is None or self.object.suffix == ".safetensors":
             return self.object
-        from mi_nerfattack import files
+        from mi_nerfattack.io import files
 
         files.make_folder(output.parent)
         field = output.parent / f"{output.name}-object.safetensors"

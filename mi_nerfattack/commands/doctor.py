@@ -17,7 +17,7 @@ class Doctor:
 
     def run(self) -> int:
         """Print the findings."""
-        from mi_nerfattack import doctor
+        from mi_nerfattack.system import doctor
 
         findings = doctor.examine()
         if self.json:

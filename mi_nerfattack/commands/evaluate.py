@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from mi_nerfattack.commands.evaluate_options import (
+from mi_nerfattack.commands.shared.evaluate_options import (
     PlaceOptions,
     PolicyOptions,
     parse_conditions,
     policy_camera,
 )
-from mi_nerfattack.commands.words import command_line
+from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.commands.bars import StageBars
-    from mi_nerfattack.policy.evaluate import EvaluateSettings
-    from mi_nerfattack.policy.evaluate_identity import EnvironmentUnder
-    from mi_nerfattack.policy.evaluate_work import EvaluateWork, Evaluation
-    from mi_nerfattack.policy.workers import AbstractWorkers
-    from mi_nerfattack.sections import PolicySection
-    from mi_nerfattack.vehicle.route import Route
+    from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+    from mi_nerfattack.evaluation.identity import EnvironmentUnder
+    from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
+    from mi_nerfattack.scenario.sections import PolicySection
+    from mi_nerfattack.system.workers import AbstractWorkers
+    from mi_nerfattack.vehicle.route.route import Route
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,10 @@ class Evaluate:
         """Drive, summarise, print and write."""
         from rich.console import Console
 
-        from mi_nerfattack import files, variant
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.policy.evaluate_work import run_evaluation
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.evaluation.work import run_evaluation
+        from mi_nerfattack.io import files
         from mi_nerfattack.report.table import card_table
 
         if self.output is not None:
@@ -94,7 +95,7 @@ class Evaluate:
         variant.ensure()
         work = self._work()
         workers = self._workers(work.policy)
-        record = None if self.page is None else work.record()
+        record = None if self.page is None else _training_record(work)
         start = time.monotonic()
         with StageBars() as bars:
             bars.say(f"drives are kept in {work.folder}")
@@ -120,7 +121,7 @@ class Evaluate:
         found: Evaluation,
         wall_s: float,
     ) -> None:
-        from mi_nerfattack.report.policy_page import write_policy_page
+        from mi_nerfattack.report.pages.policy import write_policy_page
 
         about = {
             **work.describe(),
@@ -136,9 +137,9 @@ class Evaluate:
 
     def _work(self) -> EvaluateWork:
         """Check everything that can be checked before the first drive."""
-        from mi_nerfattack.policy.evaluate_identity import identify
-        from mi_nerfattack.policy.evaluate_work import EvaluateWork, check_policy
-        from mi_nerfattack.policy.load import load_policy
+        from mi_nerfattack.evaluation.identity import identify
+        from mi_nerfattack.evaluation.work import EvaluateWork, check_policy
+        from mi_nerfattack.scenario.build.policy import load_policy
 
         section, base = self.options.section(self.policy)
         under = self._environments()
@@ -153,7 +154,7 @@ class Evaluate:
         )
 
     def _settings(self) -> EvaluateSettings:
-        from mi_nerfattack.policy.presets import EVALUATIONS
+        from mi_nerfattack.training.presets import EVALUATIONS
 
         return replace(
             EVALUATIONS[self.where.place],
@@ -164,8 +165,7 @@ class Evaluate:
         )
 
     def _routes(self, path: Path) -> tuple[Route, ...]:
-        from mi_nerfattack.policy.sites import load_routes
-        from mi_nerfattack.vehicle.route import Route
+        from mi_nerfattack.vehicle.route.route import Route, load_routes
 
         if not self.routes:
             return tuple(load_routes(path))
@@ -187,7 +187,7 @@ class Evaluate:
         return parse_conditions(self.environments, self.conditions, self.spp)
 
     def _workers(self, policy: PolicySection) -> AbstractWorkers:
-        from mi_nerfattack.policy.workers import (
+        from mi_nerfattack.system.workers import (
             InThisProcess,
             Processes,
             available_cores,
@@ -220,3 +220,14 @@ class _Progress:
 def _check_different(option: str, names: tuple[str, ...]) -> None:
     if not names or len(set(names)) < len(names):
         raise InputError(f"{option}: {' '.join(names)!r}; at least one, each once")
+
+
+def _training_record(work: EvaluateWork) -> dict[str, Any] | None:
+    """Read what training wrote beside the policy; None where it wrote nothing."""
+    from mi_nerfattack.commands.shared.training_record import read_record
+    from mi_nerfattack.scenario.scenario import resolve
+
+    if work.policy.file is None or ".py:" in work.policy.file:
+        return None
+    path = resolve(work.policy.file, work.base).with_suffix(".json")
+    return read_record(path) if path.is_file() else None

@@ -40,9 +40,10 @@ class Export:
 
     def run(self) -> int:
         """Read, sample the surface or look at the sides, and write."""
-        from mi_nerfattack import files, variant
+        from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.fields.io import load_grid
+        from mi_nerfattack.io import files
 
         suffix = self.output.suffix.lower()
         if suffix not in (".glb", ""):
@@ -56,9 +57,9 @@ class Export:
         return self._write_mesh(grid)
 
     def _write_mesh(self, grid: GridField) -> int:
-        from mi_nerfattack.capture.gltf_writer import write_glb
+        from mi_nerfattack.capture.mesh.gltf_writer import write_glb
+        from mi_nerfattack.capture.mesh.surface import field_surface, painted_mesh
         from mi_nerfattack.capture.object_views import Placement
-        from mi_nerfattack.capture.surface_mesh import field_surface, painted_mesh
 
         if self.mesh is None:
             mesh = field_surface(grid)
@@ -73,7 +74,7 @@ class Export:
         return 0
 
     def _write_faces(self, grid: GridField) -> int:
-        from mi_nerfattack.capture.cube_faces import render_faces, write_faces
+        from mi_nerfattack.capture.mesh.cube_faces import render_faces, write_faces
         from mi_nerfattack.errors import InputError
 
         if self.output.is_file():

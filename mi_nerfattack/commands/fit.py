@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mi_nerfattack.commands.compare_report import CompareArguments
+from mi_nerfattack.commands.shared.compare_report import CompareArguments
 
 if TYPE_CHECKING:
-    from mi_nerfattack.capture.fit_options import FitOptions
-    from mi_nerfattack.capture.posed import PosedImages
+    from mi_nerfattack.capture.posed_images import PosedImages
     from mi_nerfattack.fields.ngp import NGPLayout
+    from mi_nerfattack.fit.options import FitOptions
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class Fit:
         return replace(base, **{k: v for k, v in given.items() if v is not None})
 
     def _options(self, has_depth: bool) -> FitOptions:
-        from mi_nerfattack.capture.fit_loss import LossWeights
-        from mi_nerfattack.capture.fit_options import FitOptions
+        from mi_nerfattack.fit.loss import LossWeights
+        from mi_nerfattack.fit.options import FitOptions
 
         cells = 256 if has_depth else 128
         return FitOptions(
@@ -120,14 +120,18 @@ class Fit:
     def run(self) -> int:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.fit import fit_ngp
-        from mi_nerfattack.capture.fit_checkpoint import check_unfinished
-        from mi_nerfattack.capture.fit_inputs import find_bounds, read_depth
-        from mi_nerfattack.capture.frames import read_images
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.commands.compare_report import compare_file
-        from mi_nerfattack.commands.fit_report import check_output, finish, show_fit
+        from mi_nerfattack.capture.inputs import find_bounds, read_depth
+        from mi_nerfattack.capture.transforms import read_images
+        from mi_nerfattack.commands.shared.compare_report import compare_file
+        from mi_nerfattack.commands.shared.fit_report import (
+            check_output,
+            finish,
+            show_fit,
+        )
+        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.fit.checkpoint import check_unfinished
+        from mi_nerfattack.fit.fit import fit_ngp
 
         variant.ensure()
         self.against.check()

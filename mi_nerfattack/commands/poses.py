@@ -39,8 +39,8 @@ class Poses:
 
     def run(self) -> int:
         """Estimate and write."""
-        from mi_nerfattack.capture.poses import PoseOptions, estimate_poses
-        from mi_nerfattack.commands.bars import StageBars
+        from mi_nerfattack.capture.photographs import PoseOptions, estimate_poses
+        from mi_nerfattack.commands.shared.progress import StageBars
 
         options = PoseOptions(
             self.matching, self.lens, self.long_edge, self.metres_per_unit, self.seed

@@ -14,9 +14,9 @@ import tyro
 if TYPE_CHECKING:
     import numpy as np
 
-    from mi_nerfattack.commands.bars import StageBars
-    from mi_nerfattack.report.film import FrameRenderer
-    from mi_nerfattack.report.sequence import Shot
+    from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.render.pathtrace.frames import FrameRenderer
+    from mi_nerfattack.render.pathtrace.sequence import Shot
 
 
 class _Pace:
@@ -98,9 +98,9 @@ class Render:
     def run(self) -> int:
         """Render and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.report.film import FrameRenderer
-        from mi_nerfattack.report.sequence import Shot
-        from mi_nerfattack.scenario import resolve
+        from mi_nerfattack.render.pathtrace.frames import FrameRenderer
+        from mi_nerfattack.render.pathtrace.sequence import Shot
+        from mi_nerfattack.scenario.scenario import resolve
 
         is_path = self.path is not None or self.route is not None
         self._check_output(is_path)
@@ -119,8 +119,8 @@ class Render:
         return self._run_path(shot)
 
     def _check_output(self, is_path: bool) -> None:
-        from mi_nerfattack import files
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io import files
 
         suffix = self.output.suffix.lower()
         if self.path is not None and self.route is not None:
@@ -160,10 +160,10 @@ class Render:
         return result
 
     def _poses(self) -> np.ndarray:
-        from mi_nerfattack.render.camera import CameraMount
-        from mi_nerfattack.report.camera_path import read_path, route_path
-        from mi_nerfattack.scenario import resolve
-        from mi_nerfattack.vehicle.route import Route
+        from mi_nerfattack.capture.camera_path import read_path, route_path
+        from mi_nerfattack.render.camera.intrinsics import CameraMount
+        from mi_nerfattack.scenario.scenario import resolve
+        from mi_nerfattack.vehicle.route.route import Route
 
         if self.path is not None:
             return read_path(self.path)
@@ -172,7 +172,7 @@ class Render:
         return route_path(route, CameraMount(*self.mount), self.fps)
 
     def _run_frame(self, renderer: FrameRenderer) -> int:
-        from mi_nerfattack.report.film import write_frame
+        from mi_nerfattack.render.pathtrace.frames import write_frame
 
         start = time.monotonic()
         frame = renderer.render(seed=self.seed)
@@ -187,8 +187,8 @@ class Render:
         return 0
 
     def _run_path(self, shot: Shot) -> int:
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.report.sequence import (
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.render.pathtrace.sequence import (
             render_folder,
             render_video,
             working_folder,

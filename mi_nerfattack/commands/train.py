@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from mi_nerfattack.commands.words import command_line
+from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.deploy.registry import Place
-    from mi_nerfattack.policy.imitate import Imitated
-    from mi_nerfattack.policy.imitate_settings import ImitationSettings
-    from mi_nerfattack.policy.presets import Preset
-    from mi_nerfattack.policy.sites import AbstractSite
+    from mi_nerfattack.deploy.place import Place
+    from mi_nerfattack.deploy.sites import AbstractSite
+    from mi_nerfattack.training.imitate import Imitated
+    from mi_nerfattack.training.presets import Preset
+    from mi_nerfattack.training.settings import ImitationSettings
 
 #: Environments that cannot train, and what to do.
 _REFUSED = {
@@ -96,17 +96,18 @@ class Train:
         """Collect, train, validate and write."""
         from rich.console import Console
 
-        from mi_nerfattack import files, variant
-        from mi_nerfattack.commands.bars import StageBars
-        from mi_nerfattack.commands.fit_report import check_output
-        from mi_nerfattack.policy.export_program import SUFFIX
-        from mi_nerfattack.policy.imitate import imitate
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.fit_report import check_output
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.io import files
+        from mi_nerfattack.policy.exported.program import SUFFIX
         from mi_nerfattack.policy.pilotnet import PilotNet
-        from mi_nerfattack.policy.presets import find_preset
-        from mi_nerfattack.policy.sites import load_routes
-        from mi_nerfattack.policy.training_record import training_record
-        from mi_nerfattack.policy.workers import Processes, available_cores
         from mi_nerfattack.report.table import card_table
+        from mi_nerfattack.system.workers import Processes, available_cores
+        from mi_nerfattack.training.imitate import imitate
+        from mi_nerfattack.training.presets import find_preset
+        from mi_nerfattack.training.record import training_record
+        from mi_nerfattack.vehicle.route.route import load_routes
 
         check_output(self.output)
         for suffix in (SUFFIX, ".json"):
@@ -138,7 +139,7 @@ class Train:
     def _place(self, preset: Preset) -> Place:
         from dataclasses import replace
 
-        from mi_nerfattack.deploy.registry import bundled_place
+        from mi_nerfattack.deploy.place import bundled_place
 
         place = bundled_place(preset.place)
         if self.scene is not None:  # the bundled field is not of this scene
@@ -155,7 +156,7 @@ class Train:
     def _sites(
         self, preset: Preset, place: Place, settings: ImitationSettings
     ) -> list[AbstractSite]:
-        from mi_nerfattack.policy.sites import PlaceSite, Weather
+        from mi_nerfattack.deploy.sites import PlaceSite, Weather
 
         # a scene without a sunsky emitter has no times of day
         skies = preset.weather.skies if self.scene is None else ("day",)
@@ -172,9 +173,9 @@ class Train:
     def _settings(self, preset: Preset) -> ImitationSettings:
         from dataclasses import replace
 
-        from mi_nerfattack.policy.imitate_settings import ImitationSettings
-        from mi_nerfattack.policy.presets import EVALUATIONS
-        from mi_nerfattack.policy.train import TrainSettings
+        from mi_nerfattack.training.presets import EVALUATIONS
+        from mi_nerfattack.training.settings import ImitationSettings
+        from mi_nerfattack.training.train import TrainSettings
 
         def given(mine: object, its: object) -> object:
             return its if mine is None else mine
@@ -206,13 +207,13 @@ class Train:
         )
 
     def _more(self) -> list[Path]:
-        from mi_nerfattack.policy.collect import find_shards
+        from mi_nerfattack.training.collect import find_shards
 
         return [shard for folder in self.more for shard in find_shards(folder)]
 
     def _write(self, result: Imitated, record: dict[str, Any]) -> None:
-        from mi_nerfattack import files
-        from mi_nerfattack.policy.export_program import SUFFIX, export_program
+        from mi_nerfattack.io import files
+        from mi_nerfattack.policy.exported.program import SUFFIX, export_program
 
         result.module.save(self.output)
         export_program(result.module, self.output.with_suffix(SUFFIX))

@@ -1,8 +1,8 @@
 """Deployment environments: worlds that an attack was never optimised against."""
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.mitsuba import PathTracedSensor
-from mi_nerfattack.deploy.paste import paste_layer, paste_objects
+from mi_nerfattack.deploy.path_traced_sensor import PathTracedSensor
+from mi_nerfattack.deploy.views.paste import paste_layer, paste_objects
 
 __all__ = [
     "AbstractEnvironment",

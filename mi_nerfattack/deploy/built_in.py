@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.capture.atlas import Atlas, lay_out
-from mi_nerfattack.capture.mesh import MeshPart, TexturedMesh, mitsuba_shapes
-from mi_nerfattack.capture.object_views import Placement
-from mi_nerfattack.capture.surface_mesh import (
+from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.capture.mesh.atlas import Atlas, lay_out
+from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
+from mi_nerfattack.capture.mesh.surface import (
     check_same_box,
     field_surface,
     inside_out,
     seen_colours,
     voxel_m,
 )
-from mi_nerfattack.colour import linear_to_uint8
+from mi_nerfattack.capture.object_views import Placement
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.render.posed import Pose
+from mi_nerfattack.render.camera.pose import Pose
 
 _INWARD = 0.1  # voxels, and of the way to a triangle's middle
 

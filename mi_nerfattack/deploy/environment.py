@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.render.camera import Camera
-from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.vehicle.route.route import Route
 
 
 @dataclass(frozen=True, eq=False)

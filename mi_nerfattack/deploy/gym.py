@@ -10,16 +10,11 @@ import gymnasium
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.registry import (
-    ENVIRONMENTS,
-    Conditions,
-    Place,
-    bundled_place,
-    make_environment,
-)
+from mi_nerfattack.deploy.place import Conditions, Place, bundled_place
+from mi_nerfattack.deploy.registry import ENVIRONMENTS, make_environment
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.metrics import departure_limits
-from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.rollout.drive import departure_limits
+from mi_nerfattack.vehicle.route.route import Route
 
 #: Depth that observations have where there is nothing, and the largest, metres.
 FAR_M = 1000.0

@@ -9,10 +9,10 @@ import numpy as np
 
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, planar_body, require_control
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.rollout.loop import to_state
-from mi_nerfattack.rollout.transition import Transition
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
+from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.transition import Transition
 
 
 class KinematicVehicle(AbstractVehicle):

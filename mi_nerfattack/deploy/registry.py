@@ -2,90 +2,27 @@
 
 from __future__ import annotations
 
-import math
+import importlib.metadata
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mi_nerfattack.deploy.built_in import BuiltInObject, built_in_shapes
-from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
-from mi_nerfattack.deploy.daylight import DAYLIGHT, set_daylight
+from mi_nerfattack.deploy.built_in import built_in_shapes
+from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.field_view import FieldView
 from mi_nerfattack.deploy.kinematic import KinematicVehicle
-from mi_nerfattack.deploy.mitsuba_view import MitsubaView
+from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.simulated import SimulatedEnvironment
 from mi_nerfattack.deploy.vehicle import AbstractVehicle
-from mi_nerfattack.deploy.view import AbstractView
+from mi_nerfattack.deploy.views.base import AbstractView
+from mi_nerfattack.deploy.views.field import FieldView
+from mi_nerfattack.deploy.views.mitsuba import MitsubaView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field
-from mi_nerfattack.render.camera import Camera, CameraMount, from_fov
+from mi_nerfattack.render.pathtrace.daylight import set_daylight
+from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.scene import load_scene
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
 from mi_nerfattack.vehicle.integrators import RK4
-
-
-@dataclass(frozen=True)
-class Place:
-    """Files of a scene in its forms, and what drives there.
-
-    Args:
-        scene: Mitsuba XML.
-        field: the scene's field, of the surrogate; None where there is none.
-        routes: JSON.
-        objects: grid fields that may stand beside the road.
-        camera: of the vehicle.
-        mount: the camera's place on it.
-        period: seconds between two images.
-        car: what drives.
-        recording: of `replay`: a folder, a video or a log.
-        server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
-    """
-
-    scene: Path
-    field: Path | None
-    routes: Path
-    objects: tuple[Path, ...]
-    camera: Camera
-    mount: CameraMount
-    period: float = 0.1
-    car: Car = CAR
-    recording: Path | None = None
-    server: str = "127.0.0.1:2000"
-
-    def __post_init__(self) -> None:
-        """Check the period."""
-        if not 0 < self.period < float("inf"):
-            raise InputError(f"place.period: {self.period!r}; a positive time, seconds")
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What changes between drives at one place.
-
-    Args:
-        sky: time of day, key of `DAYLIGHT`: "day" (the file's), "morning", "noon",
-            "evening", "overcast".
-        exposure_ev: of the camera, in powers of two.
-        spp: samples per pixel of path-traced images.
-        built_in: objects with geometry, lit and shadowed by the environment.
-    """
-
-    sky: str = "day"
-    exposure_ev: float = 0.0
-    spp: int = 16
-    built_in: tuple[BuiltInObject, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.sky not in DAYLIGHT:
-            raise InputError(f"sky: {self.sky!r}; one of {', '.join(DAYLIGHT)}")
-        if not math.isfinite(self.exposure_ev):
-            raise InputError(f"exposure_ev: {self.exposure_ev}; must be finite")
-        if not isinstance(self.spp, int) or self.spp < 1:
-            raise InputError(f"spp: {self.spp!r}; at least 1 sample per pixel, whole")
 
 
 def kinematic_vehicle(car: Car, period: float) -> KinematicVehicle:
@@ -122,15 +59,15 @@ def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _mujoco(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
+    from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle
 
     vehicle = MujocoVehicle(place.car, period=place.period)
     return _pair("mujoco", vehicle, mitsuba_view(place, conditions), place)
 
 
 def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    from mi_nerfattack.deploy.mujoco_vehicle import MujocoVehicle
-    from mi_nerfattack.deploy.mujoco_view import MujocoView
+    from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle
+    from mi_nerfattack.deploy.mujoco.view import MujocoView
 
     scene = load_scene(place.scene)
     set_daylight(scene, conditions.sky)
@@ -140,9 +77,9 @@ def _mujoco_gl(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    from mi_nerfattack.deploy.carla_drivers import KinematicDriver
-    from mi_nerfattack.deploy.carla_environment import CarlaEnvironment
-    from mi_nerfattack.deploy.carla_session import CarlaServer
+    from mi_nerfattack.deploy.carla.drivers import KinematicDriver
+    from mi_nerfattack.deploy.carla.environment import CarlaEnvironment
+    from mi_nerfattack.deploy.carla.session import CarlaServer
 
     _refuse_built_in("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
@@ -159,7 +96,10 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
 
 def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    from mi_nerfattack.deploy.replay import ReplayEnvironment, open_recording
+    from mi_nerfattack.deploy.replay.environment import (
+        ReplayEnvironment,
+        open_recording,
+    )
 
     if place.recording is None:
         raise InputError(
@@ -228,32 +168,19 @@ def make_environment(
     return ENVIRONMENTS[name](place, conditions or Conditions())
 
 
-def bundled_place(name: str = "intersection") -> Place:
-    """Return a bundled scene with its routes, objects and car.
+def environment_versions(name: str) -> dict[str, str]:
+    """Return the versions of packages that one deployment environment needs.
 
     Args:
-        name: "intersection", with the full-size car; or "room", with the small car on
-            its square track, which has no field.
+        name: key of `deploy.registry.ENVIRONMENTS`.
     """
-    from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
-
-    if name not in _CARS:
-        raise InputError(f"place: {name!r}; one of {', '.join(_CARS)}")
-    car, mount = _CARS[name]
-    field = "intersection/field.safetensors"
-    return Place(
-        scene=bundled(f"{name}/scene.xml"),
-        field=bundled(field) if name == "intersection" else None,
-        routes=bundled(f"{name}/routes.json"),
-        objects=(bundled("hydrant/field.safetensors"),),
-        camera=from_fov(200, 66, 90.0),
-        mount=mount,
-        car=car,
-    )
+    found = {}
+    for package in _NEEDED.get(name, ()):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"  # making the environment says so
+    return found
 
 
-#: Cars of the bundled places, and where their cameras are.
-_CARS = {
-    "intersection": (CAR, CameraMount()),
-    "room": (SMALL_CAR, CameraMount(height_m=0.2, forward_m=0.3, pitch_deg=10.0)),
-}
+_NEEDED = {"mujoco": ("mujoco",), "mujoco_gl": ("mujoco",), "carla": ("carla",)}

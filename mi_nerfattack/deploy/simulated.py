@@ -9,10 +9,10 @@ import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
-from mi_nerfattack.deploy.view import AbstractView
+from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera import CameraMount, mount_matrix
-from mi_nerfattack.vehicle.route import Route
+from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix
+from mi_nerfattack.vehicle.route.route import Route
 
 
 class SimulatedEnvironment(AbstractEnvironment):

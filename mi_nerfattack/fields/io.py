@@ -8,12 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.io import files
 
 T = TypeVar("T", int, float)
 

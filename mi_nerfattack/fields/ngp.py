@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
-from mi_nerfattack.colour import srgb_to_linear
+from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.cpu.points import NGPPoints
 from mi_nerfattack.fields.grid import (
     box_metadata,
     check_box,
@@ -21,7 +22,6 @@ from mi_nerfattack.fields.grid import (
     flat_parameter,
     level_growth,
 )
-from mi_nerfattack.fields.ngp_points import NGPPoints
 from mi_nerfattack.fields.occupancy import Occupancy
 
 GEOMETRY_FEATURES = 16

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 
 MAX_BYTES = 1 << 31
 MAX_HEADER_BYTES = 1 << 16

@@ -9,11 +9,11 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 import torch
 
+from mi_nerfattack.backend.torch_arrays import to_row, to_torch
 from mi_nerfattack.errors import InputError, is_interrupt
-from mi_nerfattack.policy.adapter import AbstractPolicy, Memory
+from mi_nerfattack.policy.base import AbstractPolicy, Memory
 from mi_nerfattack.policy.checks import check_images, expand_goals, steering
 from mi_nerfattack.policy.preprocess import Preprocess
-from mi_nerfattack.policy.tensors import to_row, to_torch
 
 DIFFERENTIABLE_KINDS = "pilotnet, module, exported, torchscript, onnx, drjit"
 

@@ -8,8 +8,8 @@ from typing import Any
 import drjit as dr
 import torch
 
+from mi_nerfattack.backend.torch_arrays import to_torch
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.tensors import to_torch
 
 
 def check_hidden(shapes: Sequence[Sequence[int]]) -> tuple[tuple[int, ...], ...]:

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
+from mi_nerfattack.backend.torch_arrays import to_torch
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.tensors import to_torch
 
 
 class DrJitNetwork(torch.nn.Module):

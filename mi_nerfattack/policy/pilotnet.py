@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from mi_nerfattack import files
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 
 #: Height and width of the images, pixels.
 IMAGE_SHAPE = (66, 200)

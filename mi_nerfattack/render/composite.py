@@ -12,13 +12,7 @@ import mitsuba as mi
 
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
 from mi_nerfattack.render.batched import march_gradient
-from mi_nerfattack.render.march import (
-    March,
-    Rays,
-    march,
-    march_derivative,
-    pick_rays,
-)
+from mi_nerfattack.render.march import March, Rays, march, march_derivative, pick_rays
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 

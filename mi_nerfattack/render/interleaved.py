@@ -27,13 +27,7 @@ from mi_nerfattack.render.composite import (
     Task,
     select,
 )
-from mi_nerfattack.render.march import (
-    March,
-    Rays,
-    absorption,
-    march,
-    private_gradients,
-)
+from mi_nerfattack.render.march import March, Rays, absorption, march, private_gradients
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.segments import (
     Cursor,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -11,63 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.fields.base import AbstractField
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Rigid pose and uniform scale of a field in the world.
-
-    Attributes:
-        rotation: (3, 3) proper rotation, field to world.
-        translation: (3,) of the field's origin, metres in the world.
-        scale: world metres per metre of the field's frame.
-    """
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        rotation = np.asarray(self.rotation, np.float64)
-        good = rotation.shape == (3, 3) and np.isfinite(rotation).all()
-        good = good and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-        if not (good and np.linalg.det(rotation) > 0):
-            raise ValueError(f"rotation: {rotation.tolist()}; expected a 3x3 rotation")
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale: {self.scale}; must be positive and finite")
-        if not np.isfinite(self.translation).all():
-            raise ValueError(f"translation: {self.translation}; must be finite")
-
-    @staticmethod
-    def identity() -> Pose:
-        """Return the pose that leaves a field where it is."""
-        return Pose(np.eye(3), np.zeros(3))
-
-    @staticmethod
-    def from_matrix(matrix: np.ndarray) -> Pose:
-        """Split a 4x4 matrix into rotation, translation and uniform scale.
-
-        Raises:
-            ValueError: the matrix shears, reflects or scales unequally, or its last
-                row is not 0 0 0 1, as when it is transposed.
-        """
-        matrix = np.asarray(matrix, np.float64)
-        volume = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
-        scale = float(np.cbrt(abs(volume)))
-        if not scale > 0:
-            raise ValueError(f"{matrix.tolist()} is singular or not finite")
-        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-            raise ValueError(f"last row {matrix[3].tolist()}; must be 0 0 0 1")
-        return Pose(matrix[:3, :3] / scale, matrix[:3, 3].copy(), scale)
-
-    @staticmethod
-    def upright(
-        position: tuple[float, float, float], yaw: float, scale: float = 1.0
-    ) -> Pose:
-        """Return a pose that turns about the z axis by `yaw` radians."""
-        c, s = np.cos(yaw), np.sin(yaw)
-        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return Pose(rotation, np.asarray(position, float), scale)
+from mi_nerfattack.render.camera.pose import Pose
 
 
 class PosedField:

@@ -8,9 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.fields.cpu.ngp import PackedNGP
 from mi_nerfattack.fields.ngp import NGPField
-from mi_nerfattack.fields.packed_ngp import PackedNGP
-from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.render.march import March, Rays, integrate, march
 from mi_nerfattack.render.posed import PosedField
 

@@ -29,11 +29,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.colour import srgb_to_linear
+from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.backdrop import AbstractBackdrop
+from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import March, Rays
-from mi_nerfattack.render.posed import Pose
 
 REACH = 3.0  # standard deviations at which a splat ends
 MAX_OPACITY = 0.9999

@@ -11,8 +11,9 @@ from typing import Any
 import rich.box
 import rich.table
 
-from mi_nerfattack import files
-from mi_nerfattack.report.metrics import Drive, limit_of
+from mi_nerfattack.evaluation.metrics import limit_of
+from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import Drive
 
 STEP_COLUMNS = (
     "environment",

@@ -8,11 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.colour import linear_to_srgb
+from mi_nerfattack.backend.colour import linear_to_srgb
+from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.frozen import freeze_method
 from mi_nerfattack.render.backdrop import Layer
-from mi_nerfattack.render.camera import Camera, CameraMount, generate_rays, mount_pose
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    generate_rays,
+    mount_pose,
+)
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
@@ -22,14 +27,14 @@ from mi_nerfattack.render.composite import (
     depth_composite,
 )
 from mi_nerfattack.render.march import STOP, March, Rays
-from mi_nerfattack.render.offset import (
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.taped import taped_march
+from mi_nerfattack.rollout.offset import (
     offset_gradient,
     offset_on_tape,
     offset_pose,
     wrench_of,
 )
-from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.taped import taped_march
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
 

@@ -11,13 +11,7 @@ import numpy as np
 
 from mi_nerfattack.rollout.adjoint import AbstractAdjoint, Replay
 from mi_nerfattack.rollout.cost import Cost
-from mi_nerfattack.rollout.loop import (
-    ClosedLoop,
-    OnStep,
-    Step,
-    Trajectory,
-    simulate,
-)
+from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory, simulate
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.reduction import AbstractReduction, Mean
 from mi_nerfattack.rollout.sweep import (

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
-from mi_nerfattack.rollout.transition import Transition
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
+from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.transition import Transition
 
 OnStep = Callable[[int], None]
 
@@ -115,30 +114,6 @@ class Trajectory:
         states = self.states_numpy()[:, 1:]
         rows = to_state(states.reshape(-1, states.shape[2]))
         return StateHistory(rows, self.count, self.horizon, self.dt)
-
-
-def state_type(size: int = 3) -> Any:
-    """Type of a batch of states of `size` rows, of the active variant, double."""
-    if size == 3:
-        return dr.float64_array_t(mi.Vector3f)
-    return sys.modules[mi.Float.__module__].ArrayXf64
-
-
-def to_state(states: np.ndarray) -> Any:
-    """Upload states (n, m), metres and radians first, as an opaque (m, n) array.
-
-    Raises:
-        ValueError: another shape, less than three columns, or not finite.
-    """
-    states = np.atleast_2d(np.asarray(states, np.float64))
-    if states.ndim != 2 or states.shape[1] < 3 or not np.isfinite(states).all():
-        raise ValueError(f"states: shape {states.shape}; expected finite (n, 3)")
-    kind = state_type(states.shape[1])
-    # lists: memory from NumPy has an alignment of its own, and so its own kernels
-    row = dr.value_t(kind)
-    result = kind(*[row(column) for column in states.T.tolist()])
-    dr.make_opaque(result)
-    return result
 
 
 def simulate(

@@ -9,8 +9,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory, to_state
+from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
+from mi_nerfattack.vehicle.state import to_state
 
 
 @dataclass(frozen=True)

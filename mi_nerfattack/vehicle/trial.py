@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
-from mi_nerfattack.vehicle.function import require_finite
+from mi_nerfattack.vehicle.user_model import require_finite
 
 #: Step of the central differences, relative to one plus the magnitude.
 STEP = 1e-6

@@ -1,0 +1,31 @@
+"""``python -m bench``, in the checkout: figures beside the peers they compare to."""
+
+from __future__ import annotations
+
+import sys
+
+from bench.commands.circle import BenchCircle
+from bench.commands.experts import BenchExperts
+from bench.commands.speed import BenchAttack, BenchComposite, BenchFit, BenchRender
+from bench.commands.training import BenchCollect, BenchDagger
+from mi_nerfattack import cli
+
+COMMANDS = {
+    "render": BenchRender,
+    "fit": BenchFit,
+    "attack": BenchAttack,
+    "composite": BenchComposite,
+    "experts": BenchExperts,
+    "circle": BenchCircle,
+    "collect": BenchCollect,
+    "dagger": BenchDagger,
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one benchmark and return the exit code."""
+    return cli.main(argv, COMMANDS, "python -m bench")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""An attack iteration beside PyTorch with autograd through time."""

@@ -1,0 +1,1 @@
+"""Figures of vehicles, experts, collecting and DAgger."""

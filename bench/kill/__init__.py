@@ -1,0 +1,1 @@
+"""Kill attacks at random moments and resume them."""

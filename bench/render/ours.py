@@ -1,0 +1,186 @@
+"""Our side: the exact composite of one field, as every part of the project renders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from bench.full_ngp import NGPData
+from bench.render.sides import STOP, AbstractSide, pinhole_rays, route_rays
+from mi_nerfattack.fields import GridField, GridLayout, load_grid
+from mi_nerfattack.render.camera.intrinsics import look_at
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.march import MAX_INTERVALS, March, Rays, seek
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenes import bundled
+
+NGP_PARAMETERS = ("table", "density_weights", "colour_weights")
+Leaf = tuple[Callable[[], Any], Callable[[Any], None]]
+
+
+class OurSide(AbstractSide):
+    """Our renderer with a field.
+
+    Args:
+        posed: the field.
+        leaves: how to read and how to replace each array to differentiate by.
+        rays: origins and directions, each (n, 3).
+        seed: of the image's cotangent.
+    """
+
+    def __init__(
+        self,
+        posed: PosedField,
+        leaves: list[Leaf],
+        rays: tuple[np.ndarray, np.ndarray],
+        seed: int = 0,
+    ) -> None:
+        self.posed, self.leaves = posed, leaves
+        self.composite = InterleavedComposite()
+        self.rays = self._rays(*rays)
+        cotangent = np.random.default_rng(seed).normal(size=(3, len(rays[0])))
+        self.cotangent = mi.Color3f(cotangent.astype(np.float32).tolist())
+        self.seen: Any = None
+        self.behind: Any = None
+        dr.eval(self.cotangent)
+
+    def _rays(self, origin: np.ndarray, direction: np.ndarray) -> Rays:
+        # lists: memory from NumPy has an alignment of its own, and so its own kernels
+        rays = Rays(
+            mi.Point3f(origin.T.tolist()),
+            mi.Vector3f(direction.T.tolist()),
+            dr.opaque(mi.Float, dr.inf),
+            dr.opaque(mi.Float, 0.5),
+        )
+        dr.eval(rays)
+        return rays
+
+    def forward(self) -> float:
+        """See :meth:`AbstractSide.forward`."""
+        dr.sync_thread()
+        start = time.perf_counter()
+        self.seen = self.composite.render([self.posed], self.rays, STOP)
+        total = self.seen.total
+        self.behind = self.posed.field.background(self.rays.direction)
+        image = total.radiance + (1 - total.opacity) * self.behind
+        dr.eval(self.seen, self.behind, image)
+        dr.sync_thread()
+        return time.perf_counter() - start
+
+    def backward(self) -> tuple[float, float]:
+        """See :meth:`AbstractSide.backward`."""
+        forward = self.forward()
+        start = time.perf_counter()
+        for read, replace in self.leaves:
+            leaf = dr.detach(read(), preserve_type=True)
+            leaf = type(leaf)(leaf)
+            dr.enable_grad(leaf)
+            replace(leaf)
+            dr.set_grad(read(), dr.opaque(mi.Float, 0, dr.width(leaf)))
+        by_opacity = -dr.dot(self.cotangent, self.behind)
+        total = March(self.cotangent, by_opacity, dr.opaque(mi.Float, 0))
+        self.composite.backward([self.posed], self.rays, self.seen, total, STOP)
+        dr.eval([dr.grad(read()) for read, _ in self.leaves])
+        dr.sync_thread()
+        alone = time.perf_counter() - start
+        for read, replace in self.leaves:
+            replace(dr.detach(read()))
+        return alone, forward + alone
+
+    def facts(self) -> dict[str, Any]:
+        """Return samples, the share of rays that meet the field, and threads."""
+        samples = count_samples(self.posed, self.rays, STOP).numpy().astype(np.float64)
+        return {
+            "samples": int(samples.sum()),
+            "rays_met": float((samples > 0).mean()),
+            "threads": dr.thread_count(),
+        }
+
+    def memory(self) -> dict[str, float]:
+        """Add Dr.Jit's own peak during a forward and a backward pass, in MB."""
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        self.backward()
+        peak = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+        return {**super().memory(), "drjit_peak_memory_mb": peak / 1e6}
+
+    def kernels(self) -> int:
+        """Move the camera, render, differentiate, and count what is compiled."""
+        shift = dr.opaque(mi.Float, 0.01)
+        self.rays.origin = self.rays.origin + shift
+        dr.eval(self.rays)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            self.backward()
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        return sum(not entry["cache_hit"] for entry in history)
+
+
+def scene_side(data: NGPData, width: int, height: int) -> OurSide:
+    """Look along the route at a scene's field; differentiate by table and networks."""
+    field = data.field()
+
+    def leaf(name: str) -> Leaf:
+        return (
+            lambda: field.parameters()[name],
+            lambda value: field.set_parameter(name, value),
+        )
+
+    leaves = [leaf(name) for name in NGP_PARAMETERS]
+    return OurSide(PosedField(field), leaves, route_rays(width, height))
+
+
+def object_side(width: int, height: int) -> OurSide:
+    """Look at the bundled hydrant, lying, so that it fills the frame."""
+    field = load_grid(bundled("hydrant/field.safetensors"))
+    lying = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    centre = (field.lower + field.upper) / 2
+    posed = PosedField(field, Pose(lying, -lying @ centre))
+    camera = look_at([0.0, -1.3, 0.0], [0.0, 0.0, 0.0])
+    rays = pinhole_rays(width, height, 40.0, camera)
+    return OurSide(posed, [_packed(field)], rays)
+
+
+def slab_side(width: int, height: int, samples: int) -> OurSide:
+    """Look through a thin medium in which each ray takes `samples` samples."""
+    corner = np.array([0.5, 0.5, 0.5])
+    field = GridField(
+        GridLayout(), -corner, corner, density_scale=1e-3, step_m=1 / samples
+    )
+    rays = pinhole_rays(width, height, 2.0, look_at([0.0, -5.0, 0.0], [0.0, 0.0, 0.0]))
+    return OurSide(PosedField(field), [_packed(field)], rays)
+
+
+def _packed(field: GridField) -> Leaf:
+    def replace(value: Any) -> None:
+        field.packed = value
+
+    return lambda: field.packed, replace
+
+
+@dr.syntax
+def count_samples(posed: PosedField, rays: Rays, stop: float) -> mi.UInt32:
+    """Count the evaluations of a field along each ray, (n,)."""
+    o, d = posed.to_local(rays.origin, rays.direction)
+    near, far = posed.interval(o, d, rays.t_max)
+    active = mi.Bool(rays.active) & (near < far)
+    index = dr.floor(posed.lattice_index(near))
+    tau = mi.Float(0)  # optical depth so far
+    count = mi.UInt32(0)
+    while active:
+        index, t, width, active = seek(
+            posed, o, d, index, near, far, rays.jitter, active
+        )
+        count += dr.select(active, 1, 0)
+        density = posed.eval(o + t * d, mi.Vector3f(d), active)[0]
+        tau += dr.select(active, density * width, 0)
+        index += 1
+        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
+    return count

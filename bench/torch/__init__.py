@@ -1,0 +1,1 @@
+"""The peers: the same fields and loop in PyTorch."""

@@ -1,0 +1,162 @@
+"""A training step in PyTorch: the peer of a step of `capture.fit.fit_ngp`.
+
+Rays of random pixels with a random shift of their samples, the march and the field of
+:mod:`bench.torch.ngp`, Huber loss of sRGB values, autograd, Adam.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from bench.full_ngp import NGPData
+from bench.render.sides import STOP
+from bench.torch.encoding import AbstractHashGrid
+from bench.torch.ngp import BATCHES, TorchNGP
+from mi_nerfattack.io import files
+
+ALL_AT_ONCE = ((0, 1 << 30),)
+BELOW_WHITE = 1 - 1e-5  # as our loss does: the curve has no derivative above 1
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The pixels of posed images with their rays.
+
+    Attributes:
+        colour: (images, pixels, 3), uint8 sRGB.
+        origin: (images, 3), float32, metres.
+        direction: (images, pixels, 3), float32, unit vectors.
+    """
+
+    colour: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+
+    def write(self, path: Path) -> None:
+        """Write all to a safetensors file."""
+        files.write_safetensors(path, dict(vars(self)), {})
+
+    @staticmethod
+    def read(path: Path) -> Pictures:
+        """Read what :meth:`write` wrote."""
+        return Pictures(**files.read_safetensors(path)[0])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a batch is worked off; the result does not depend on it.
+
+    Attributes:
+        chunk: rays in one graph; gradients of chunks are added up.
+        batches: ranks of samples that are evaluated together; see `TorchNGP`.
+    """
+
+    chunk: int
+    batches: tuple[tuple[int, int], ...] = ALL_AT_ONCE
+
+    @staticmethod
+    def candidates(rays: int) -> list[Plan]:
+        """Return what is worth trying for a number of rays a step."""
+        chunks = sorted({max(1, rays // share) for share in (1, 4)}, reverse=True)
+        return [Plan(chunk, b) for chunk in chunks for b in (ALL_AT_ONCE, BATCHES)]
+
+
+class TorchFit:
+    """A field being fitted in PyTorch.
+
+    Args:
+        data: the field to start from; its occupancy stays as it is.
+        grid: the encoding, of the field's layout.
+        pictures: what to fit to.
+        rays: of a step.
+        huber: where the loss turns linear, sRGB values.
+        learning_rate: of Adam.
+        seed: of pixels and shifts.
+
+    Attributes:
+        leaves: all that is trained.
+        plan: how a batch is worked off.
+    """
+
+    def __init__(
+        self,
+        data: NGPData,
+        grid: AbstractHashGrid,
+        pictures: Pictures,
+        rays: int,
+        huber: float = 0.1,
+        learning_rate: float = 1e-2,
+        seed: int = 0,
+    ) -> None:
+        self.model = TorchNGP(data, grid, STOP)
+        self.leaves = [*self.model.parameters.values(), self.model.sky]
+        for leaf in self.leaves:
+            leaf.requires_grad_(True)
+        self.optimiser = torch.optim.Adam(
+            self.leaves, lr=learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+        )
+        self.colour = torch.from_numpy(pictures.colour).reshape(-1, 3)
+        self.direction = torch.from_numpy(pictures.direction).reshape(-1, 3)
+        self.origin = torch.from_numpy(pictures.origin)
+        self.pixels = pictures.colour.shape[1]
+        self.rays, self.huber = rays, huber
+        self.random = torch.Generator().manual_seed(seed)
+        self.plan = Plan(rays)
+
+    def step(self) -> float:
+        """Do one step of the optimiser and return the loss before it."""
+        loss = self.gradients(*self.draw())
+        self.optimiser.step()
+        return loss
+
+    def draw(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw pixels with replacement, and shifts of samples; each (rays,)."""
+        index = torch.randint(len(self.colour), (self.rays,), generator=self.random)
+        return index, torch.rand(self.rays, generator=self.random)
+
+    def gradients(self, index: torch.Tensor, jitter: torch.Tensor) -> float:
+        """Replace the leaves' gradients by those of the mean loss; return that."""
+        self.optimiser.zero_grad()
+        self.model.batches = self.plan.batches
+        total, chunk = 0.0, self.plan.chunk
+        for some, shift in zip(index.split(chunk), jitter.split(chunk), strict=True):
+            loss = self.loss(some, shift) * (len(some) / len(index))
+            loss.backward()
+            total += float(loss.detach())
+        return total
+
+    def loss(self, index: torch.Tensor, jitter: torch.Tensor) -> torch.Tensor:
+        """Return the mean over rays and channels of the Huber loss in sRGB.
+
+        Args:
+            index: (n,) pixels, image by image.
+            jitter: (n,) in [0, 1), position of the samples in their intervals.
+        """
+        origin = self.origin[index // self.pixels]
+        linear = self.model.render(origin, self.direction[index], jitter)
+        wanted = self.colour[index].to(linear.dtype) / 255
+        return F.smooth_l1_loss(encode(linear * BELOW_WHITE), wanted, beta=self.huber)
+
+    def count_samples(self, rays: int) -> float:
+        """Return the samples of a step in front of the end of their rays.
+
+        Args:
+            rays: of which to take the mean, at least.
+        """
+        self.model.evaluated, batches = 0, -(-rays // self.rays)
+        with torch.no_grad():
+            for _ in range(batches):
+                self.loss(*self.draw())
+        return self.model.evaluated / batches
+
+
+def encode(linear: torch.Tensor) -> torch.Tensor:
+    """Turn linear values in [0, 1] into sRGB."""
+    dark = linear <= 0.0031308
+    bright = torch.where(dark, 0.0031308, linear)
+    return torch.where(dark, 12.92 * linear, 1.055 * bright ** (1 / 2.4) - 0.055)

@@ -1,0 +1,149 @@
+"""What an attack minimises: costs of the vehicle's state, and of its whole drive.
+
+Deviations enter negatively, so that a smaller cost is a larger failure. Everything is
+written in Dr.Jit operations; derivatives follow from automatic differentiation. A cost
+of the state becomes an objective through :class:`rollout.objective.StageSum` (over the
+whole drive) or :class:`rollout.objective.Terminal` (at its end).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from mi_nerfattack.rollout.objective import AbstractObjective, StateHistory
+from mi_nerfattack.vehicle.dynamics import require_positive
+from mi_nerfattack.vehicle.route.route import Route, smooth_absolute
+
+
+@dataclass(frozen=True)
+class CrossTrackDeviation:
+    """Minus the distance from the lane centre, rounded at zero.
+
+    Minimising ``sum_t -(sqrt(e_t^2 + w^2) - w)`` drives the vehicle off its lane.
+
+    Attributes:
+        route: the lane centre.
+        rounding_m: w, radius of the rounded corner; the derivative is zero at e = 0.
+    """
+
+    route: Route
+    rounding_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_positive("CrossTrackDeviation", rounding_m=self.rounding_m)
+
+    def __call__(self, state: Any) -> Any:
+        """Evaluate at states (m, k): (k,), metres, at most 0."""
+        return -smooth_absolute(self.route.cross_track(state), self.rounding_m)
+
+
+@dataclass(frozen=True)
+class AbsoluteDeviation:
+    """Minus the distance from the lane centre, ``-|e|``.
+
+    The derivative has length 1 everywhere but at e = 0, where it is zero.
+
+    Attributes:
+        route: the lane centre.
+    """
+
+    route: Route
+
+    def __call__(self, state: Any) -> Any:
+        """Evaluate at states (m, k): (k,), metres, at most 0."""
+        return -dr.abs(self.route.cross_track(state))
+
+
+@dataclass(frozen=True)
+class HeadingDeviation:
+    """Minus the angle to the lane's direction, rounded at zero.
+
+    ``-(sqrt(psi^2 + w^2) - w)`` with psi in (-pi, pi] from the nearest segment;
+    differentiable in the heading alone, for on a polyline the direction is constant
+    beside a segment. Where psi passes pi the derivative changes its sign.
+
+    Attributes:
+        route: the lane centre.
+        rounding: w, radians.
+    """
+
+    route: Route
+    rounding: float = 0.02
+
+    def __post_init__(self) -> None:
+        require_positive("HeadingDeviation", rounding=self.rounding)
+
+    def __call__(self, state: Any) -> Any:
+        """Evaluate at states (m, k): (k,), radians, at most 0."""
+        return -smooth_absolute(self.route.heading_error(state), self.rounding)
+
+
+@dataclass(frozen=True)
+class TargetDistance:
+    """Distance to a path of the attacker's, rounded at zero.
+
+    Minimising ``sum_t sqrt(d_t^2 + w^2) - w`` steers the policy onto the path, whose
+    first and last segments are prolonged. The speed along it is left free.
+
+    Attributes:
+        path: where the vehicle shall drive.
+        rounding_m: w.
+    """
+
+    path: Route
+    rounding_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_positive("TargetDistance", rounding_m=self.rounding_m)
+
+    def __call__(self, state: Any) -> Any:
+        """Evaluate at states (m, k): (k,), metres, at least 0."""
+        return smooth_absolute(self.path.cross_track(state), self.rounding_m)
+
+
+@dataclass(frozen=True, eq=False)
+class DepartureTime(AbstractObjective):
+    """Expected time until the vehicle leaves its lane, seconds.
+
+    With ``p_t = sigmoid((limit - |e_t|) / softness)``, the chance to be in the lane
+    after t control periods, and ``S_t = p_1 ... p_t``, the chance to have been there
+    all the time, the cost is ``dt (S_1 + ... + S_T)``. As the softness goes to zero,
+    it becomes ``dt (k - 1)`` where the k-th period is the first that ends with
+    |e| > limit, i.e. the time of the last state before the departure, and ``dt T``
+    where there is none.
+
+    Far inside the lane the derivative fades as ``exp(-(limit - |e|) / softness)``,
+    and behind a departure it is that of nothing any more: take a softness of about a
+    third of the limit, or add some deviation by a weighted sum. At e = 0 the
+    derivative is zero.
+
+    Attributes:
+        route: the lane centre.
+        limit_m: the distance from it at which a vehicle has left.
+        softness_m: width of the transition.
+    """
+
+    route: Route
+    limit_m: float
+    softness_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        require_positive(
+            "DepartureTime", limit_m=self.limit_m, softness_m=self.softness_m
+        )
+
+    def evaluate(self, states: StateHistory) -> Any:
+        """See :meth:`AbstractObjective.evaluate`."""
+        distance = dr.abs(self.route.cross_track(states.rows))
+        stayed = _log_sigmoid((self.limit_m - distance) / self.softness_m)
+        return states.dt * states.total(dr.exp(states.running(stayed)))
+
+
+def _log_sigmoid(x: Any) -> Any:
+    """Compute ``-log(1 + exp(-x))`` without overflow, with its derivative at 0, too."""
+    positive = x > 0
+    size = dr.select(positive, x, -x)
+    return dr.select(positive, 0, x) - dr.log(1 + dr.exp(-size))

@@ -1,0 +1,1 @@
+"""Dr.Jit and its LLVM: variants, versions, determinism, recordings, arrays of torch."""

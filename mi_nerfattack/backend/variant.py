@@ -1,0 +1,105 @@
+"""Choose the Mitsuba variant, and register the plugins whenever it changes."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+
+import mitsuba as mi
+
+from mi_nerfattack.backend import llvm
+from mi_nerfattack.errors import NerfAttackError, SetupError
+
+VARIABLE = "MI_NERFATTACK_VARIANT"
+DEFAULT = "llvm_ad_rgb"
+_PLUGINS = "mi_nerfattack.plugins"
+
+_log = logging.getLogger("mi_nerfattack")
+
+
+def ensure() -> str:
+    """Set a variant where none is set and return the name of the active one.
+
+    The name comes from the environment variable MI_NERFATTACK_VARIANT, else it is
+    llvm_ad_rgb.
+
+    Raises:
+        SetupError: the variant is unknown, cannot differentiate, is polarised, or
+            its backend (LLVM, CUDA) is missing or too old.
+    """
+    name = mi.variant()
+    if name is None:
+        name = os.environ.get(VARIABLE, DEFAULT)
+        _check_name(name)
+        _check_backend(name)
+        mi.set_variant(name)
+    else:
+        _check_name(name)
+        _check_backend(name)
+    return name
+
+
+def usable() -> list[str]:
+    """Name the variants of this Mitsuba that the plugins run in."""
+    return [name for name in mi.variants() if _is_usable(name)]
+
+
+def install() -> None:
+    """Register the plugins now if a variant is set, and after every change."""
+    mi.detail.add_variant_callback(_on_change)
+    current = mi.variant()
+    if current is not None:
+        _on_change(None, current)
+
+
+def _check_name(name: str) -> None:
+    if name not in mi.variants():
+        raise SetupError(
+            f"{VARIABLE}: unknown variant {name!r}; allowed: {', '.join(usable())}"
+        )
+    if not _is_usable(name):
+        raise SetupError(
+            f"variant {name!r}: has no derivatives or is polarised; call "
+            f"mitsuba.set_variant('{DEFAULT}') or set {VARIABLE}={DEFAULT}"
+        )
+
+
+def _is_usable(name: str) -> bool:
+    return "_ad_" in name and not name.endswith("_polarized")
+
+
+def _check_backend(name: str) -> None:
+    import drjit as dr
+
+    if name.startswith("llvm"):
+        llvm.check_version()
+    elif not dr.has_backend(dr.JitBackend.CUDA):
+        raise SetupError(
+            f"variant {name!r}: no CUDA device or driver found; "
+            f"set {VARIABLE}={DEFAULT} or install the NVIDIA driver"
+        )
+
+
+def _on_change(old: str | None, new: str) -> None:
+    """Register the plugins, or stubs that say why not; log errors, never raise.
+
+    Mitsuba calls all callbacks in no order, and an exception in one of them keeps
+    the others from running.
+    """
+    del old
+    try:
+        if not _is_usable(new):
+            importlib.import_module(_PLUGINS).refuse(new, usable())
+            return
+        if new.startswith("llvm"):
+            llvm.check_version()
+        _register()
+    except NerfAttackError as err:
+        _log.error("plugins not registered for %s: %s", new, err)
+    except Exception:
+        _log.exception("plugins not registered for %s", new)
+
+
+def _register() -> None:
+    importlib.import_module(_PLUGINS).register()

@@ -1,0 +1,26 @@
+"""The versions that a result depends on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from typing import Any
+
+import drjit
+import mitsuba as mi
+
+import mi_nerfattack
+from mi_nerfattack.backend import llvm
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on, with the active variant."""
+    dr: Any = drjit  # its stubs lack the version
+    return {
+        "mi_nerfattack": mi_nerfattack.__version__,
+        "mitsuba": str(mi.__version__),
+        "drjit": str(dr.__version__),
+        "numpy": importlib.metadata.version("numpy"),
+        "torch": importlib.metadata.version("torch"),
+        "llvm": ".".join(map(str, llvm.version() or ())),
+        "variant": str(mi.variant()),
+    }

@@ -1,1 +1,0 @@
-"""Parts of the closed loop that are shared with PyTorch."""

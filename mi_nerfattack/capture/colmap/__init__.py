@@ -1,0 +1,1 @@
+"""COLMAP models: reading them, and making them by pycolmap."""

@@ -1,0 +1,259 @@
+"""What a fit starts from besides the images: depth maps and the field's box."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.capture.transforms import FILE_NAMES, find_transforms, read_table
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    generate_rays,
+    pose_arrays,
+    ray_lengths,
+)
+
+_CUBE = 2.0  # half edge of the cube, in distances of the farthest camera
+_MARGIN = 0.01  # around the box of all depth points, of its longest edge
+_MIN_MARGIN_M = 0.05
+_MILLIMETRE = 1e-3
+_POINTS_PERCENT = 2.0  # of the points on either side of each axis are outliers
+_POINTS_MARGIN = 0.1  # around the box of points and cameras, of its longest edge
+
+
+def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
+    """Read the depth maps that the transforms.json of a folder names.
+
+    Either ``depth_file``, our own: a safetensors file with the tensor ``depth``, a map
+    for each frame, metres along the ray; or nerfstudio's ``depth_file_path`` of each
+    frame: a PNG of 16 bits, millimetres along the optical axis, 0 where unknown. A map
+    may be larger or smaller than its image; the nearest value is taken.
+
+    Args:
+        folder: the folder of `transforms.json`, or the JSON file; any other folder has
+            no depth.
+        images: as read from there.
+
+    Returns:
+        (n, height, width), float32, metres along the ray, infinite where nothing is
+        hit and NaN where it is unknown; None if no depth is named.
+
+    Raises:
+        InputError: a file is missing or cannot be read, there is not a map for each
+            frame, or a depth is not positive.
+    """
+    path = Path(folder)
+    if path.is_dir() and not any((path / name).is_file() for name in FILE_NAMES):
+        return None
+    source = find_transforms(path)
+    table, frames = read_table(source)
+    used = _frames_of(source, frames, images)
+    if table.get("depth_file") is not None:
+        return _read_own(source, table["depth_file"], len(frames), used, images)
+    if any(frames[i].get("depth_file_path") is not None for i in used):
+        maps = [
+            _read_axial(source, i, frames[i].get("depth_file_path"), images, k)
+            for k, i in enumerate(used)
+        ]
+        return np.stack(maps)
+    return None
+
+
+def _frames_of(source: Path, frames: Sequence[Any], images: PosedImages) -> list[int]:
+    """Return the frames of the images, which leave out those that are missing."""
+    missing = set(images.missing)
+    used = [i for i, frame in enumerate(frames) if frame["file_path"] not in missing]
+    if len(used) != len(images):
+        raise InputError(
+            f"{source}: frames: {len(used)} with an image, but {len(images)} images "
+            "were given; read images and depth from one folder"
+        )
+    return used
+
+
+def _read_own(
+    source: Path, name: Any, n_frames: int, used: list[int], images: PosedImages
+) -> np.ndarray:
+    where = source.parent / _path(source, "depth_file", name)
+    depth = files.read_safetensors(where)[0].get("depth")
+    if depth is None or depth.ndim != 3 or len(depth) != n_frames:
+        shape = None if depth is None else depth.shape
+        raise InputError(
+            f"{where}: tensor 'depth' has shape {shape}; needs one map for each of "
+            f"{n_frames} frames; remove depth_file from {source} to fit without"
+        )
+    if (depth <= 0).any():
+        raise InputError(
+            f"{where}: tensor 'depth' holds a depth of 0 or less; write infinity where "
+            "nothing is hit, and NaN where it is unknown"
+        )
+    return np.stack([_at_pixels(depth[i], images.camera) for i in used])
+
+
+def _read_axial(
+    source: Path, frame: int, name: Any, images: PosedImages, index: int
+) -> np.ndarray:
+    """Read depth along the optical axis and turn it into depth along the rays."""
+    camera = images.camera_of(index)
+    if name is None:
+        return np.full((camera.height, camera.width), np.nan, np.float32)
+    where = _path(source, f"frames[{frame}].depth_file_path", name)
+    if Path(where).suffix.lower() != ".png":
+        raise InputError(
+            f"{source}: frames[{frame}].depth_file_path: {name!r}; must be a PNG of 16 "
+            "bits, millimetres"
+        )
+    axial = _at_pixels(files.read_image16(source.parent / where), camera) * _MILLIMETRE
+    depth = np.where(axial > 0, axial * ray_lengths(camera), np.nan)
+    return depth.astype(np.float32)
+
+
+def _path(source: Path, field: str, name: Any) -> str:
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{source}: {field}: {name!r}; needs a path")
+    return name.replace("\\", "/")
+
+
+def _at_pixels(values: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pick the values of a map (h, w) at the centres of a camera's pixels."""
+    height, width = values.shape
+    rows = ((np.arange(camera.height) + 0.5) * height / camera.height).astype(int)
+    columns = ((np.arange(camera.width) + 0.5) * width / camera.width).astype(int)
+    return values[rows][:, columns]
+
+
+def find_bounds(
+    images: PosedImages,
+    depth: np.ndarray | None = None,
+    given: Sequence[float] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the box of a field.
+
+    Given bounds win. With depth, the box of all points seen, and 1 % of its longest
+    edge (at least 5 cm) around it. With sparse points, the box of all cameras and of
+    the points without the outermost 2 % on either side, and 10 % around it. Otherwise
+    a cube around the point nearest to all optical axes; its half edge is twice the
+    distance of the farthest camera.
+
+    Args:
+        images: the posed images, perhaps with sparse points.
+        depth: (n, height, width), metres along the ray, NaN where unknown; or None.
+        given: x0, y0, z0, x1, y1, z1, metres, or None.
+
+    Returns:
+        lower and upper corner, (3,) each, metres.
+
+    Raises:
+        InputError: the given bounds are out of order, or the optical axes are
+            parallel, so that no point is nearest to them.
+    """
+    if given is not None:
+        lower, upper = np.array(given[:3], float), np.array(given[3:], float)
+        if not (np.isfinite(given).all() and (lower < upper).all()):
+            raise InputError(
+                f"bounds: {list(given)}; must be x0 y0 z0 x1 y1 z1 with x0 < x1, ..."
+            )
+        return lower, upper
+    seen = None if depth is None else _box_of_points(images, depth)
+    if seen is not None:
+        return seen
+    if images.points is not None and len(images.points) > 0:
+        return _box_of_sparse(images.points, images.camera_to_world[:, :3, 3])
+    focus = _focus(images.camera_to_world)
+    reach = np.linalg.norm(images.camera_to_world[:, :3, 3] - focus, axis=1).max()
+    return focus - _CUBE * reach, focus + _CUBE * reach
+
+
+def _box_of_points(
+    images: PosedImages, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the box of the points of depth maps, None where there are none."""
+    corners = [
+        (block.min(0), block.max(0))
+        for block in depth_points(images, depth, range(len(images)))
+        if len(block)
+    ]
+    if not corners:
+        return None
+    lower = np.min([low for low, _ in corners], axis=0)
+    upper = np.max([high for _, high in corners], axis=0)
+    margin = max(_MIN_MARGIN_M, _MARGIN * float((upper - lower).max()))
+    return lower - margin, upper + margin
+
+
+def _box_of_sparse(
+    points: np.ndarray, eyes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.percentile(points, [_POINTS_PERCENT, 100 - _POINTS_PERCENT], axis=0)
+    lower, upper = np.minimum(ends[0], eyes.min(0)), np.maximum(ends[1], eyes.max(0))
+    margin = _POINTS_MARGIN * float((upper - lower).max())
+    return lower - margin, upper + margin
+
+
+def _focus(camera_to_world: np.ndarray) -> np.ndarray:
+    """Return the point with the least squared distance to all optical axes, (3,)."""
+    axes, eyes = camera_to_world[:, :3, 2], camera_to_world[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix = across.mean(0)
+    if np.linalg.cond(matrix) > 1e4:
+        raise InputError(
+            "camera poses: all cameras look in one direction, so no centre can be "
+            "found; give the field's box (--bounds x0 y0 z0 x1 y1 z1)"
+        )
+    return np.linalg.solve(matrix, (across @ eyes[:, :, None]).mean(0)[:, 0])
+
+
+_UPSAMPLING = 4
+_SMOOTH_RATIO = 1.5  # neighbours with depths closer than this lie on one surface
+
+
+def depth_points(
+    images: PosedImages, depth: np.ndarray, indices: Iterable[int], reach_m: float = 0.0
+) -> Iterable[np.ndarray]:
+    """Yield points (n, 3), metres, on the surfaces that depth maps show.
+
+    Between neighbouring pixels on one surface points are interpolated, linear in
+    inverse depth, since pixels at a grazing angle lie far apart.
+
+    Args:
+        images: the posed images.
+        depth: (n, height, width), metres along the ray; infinite or unknown (NaN)
+            depths give no point.
+        indices: of the images to use.
+        reach_m: also yield the points this far before and behind the surface.
+    """
+    for index in indices:
+        origin, rotation = pose_arrays(images.camera_to_world[index])
+        camera = images.camera_of(index)
+        direction = generate_rays(camera, origin, rotation, 1)[1].numpy()
+        ray = direction.reshape(3, camera.height, camera.width).astype(np.float64)
+        inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0.0)
+        eye = images.camera_to_world[index, :3, 3]
+        for unit, t in (*_between(ray, inverse, 1), *_between(ray, inverse, 2)):
+            for offset in {0.0, -reach_m, reach_m}:
+                yield eye + ((t + offset) * unit).T
+
+
+def _between(
+    ray: np.ndarray, inverse: np.ndarray, axis: int
+) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+    """Yield directions (3, n) and depths (n,) between neighbours along an axis."""
+    first = [slice(None)] * 3
+    second = [slice(None)] * 3
+    first[axis], second[axis] = slice(None, -1), slice(1, None)
+    a, b = inverse[tuple(first[1:])], inverse[tuple(second[1:])]
+    both = (a > 0) & (b > 0)
+    joined = both & (np.maximum(a, b) < _SMOOTH_RATIO * np.minimum(a, b))
+    ray_a, ray_b = ray[tuple(first)], ray[tuple(second)]
+    for k in range(_UPSAMPLING):
+        share = k / _UPSAMPLING
+        used = joined if k else a > 0
+        mixed = (1 - share) * ray_a[:, used] + share * ray_b[:, used]
+        t = 1 / ((1 - share) * a[used] + share * b[used])
+        yield mixed / np.linalg.norm(mixed, axis=0), t

@@ -1,0 +1,1 @@
+"""Meshes with textures: glTF, OBJ, PLY, surfaces, atlases."""

@@ -1,0 +1,262 @@
+"""glTF files made ready for trimesh, and what trimesh does not read of them.
+
+trimesh takes no notice of samplers, second sets of texture coordinates,
+`KHR_texture_transform`, sparse or normalised accessors and compressed geometry. What
+changes the picture is either handed on (`BaseColour`) or refused by name here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+MAX_BYTES = 1 << 30
+#: Name under which the prepared JSON asks for the binary chunk of a .glb file.
+BINARY_CHUNK = "<binary chunk>"
+
+_GLB, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
+_WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_FLOAT, _UBYTE, _USHORT, _UINT = 5126, 5121, 5123, 5125
+_SUPPORTED = frozenset(
+    {
+        "EXT_texture_webp",
+        "KHR_materials_pbrSpecularGlossiness",
+        "KHR_texture_transform",
+        # without these gloss, light or choices are lost, but no diffuse colour
+        "KHR_lights_punctual",
+        "KHR_materials_anisotropy",
+        "KHR_materials_clearcoat",
+        "KHR_materials_dispersion",
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_iridescence",
+        "KHR_materials_sheen",
+        "KHR_materials_specular",
+        "KHR_materials_unlit",
+        "KHR_materials_variants",
+        "KHR_xmp_json_ld",
+    }
+)
+_WHITE = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
+
+
+@dataclass(frozen=True, eq=False)
+class BaseColour:
+    """How the base colour of a material is laid on.
+
+    Attributes:
+        has_texture: whether it names a texture.
+        wrap: "repeat", "mirror" or "clamp" along u and v.
+        matrix: (2, 3), applied to coordinates whose origin is at the top left.
+        alpha_cutoff: opacity from which a MASK material is there.
+        factor: (4,), linear, or None for what trimesh makes of an extension.
+    """
+
+    has_texture: bool
+    wrap: tuple[str, str]
+    matrix: np.ndarray
+    alpha_cutoff: float
+    factor: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedGltf:
+    """A glTF file for trimesh.
+
+    Attributes:
+        data: the JSON; materials are named by their index, and every primitive has
+            one, whose base colour reads the texture coordinates of set 0.
+        chunks: binary data by the name that `data` gives it.
+        base_colours: one for each material.
+    """
+
+    data: bytes
+    chunks: Mapping[str, bytes]
+    base_colours: tuple[BaseColour, ...]
+
+
+def prepare(path: Path) -> PreparedGltf:
+    """Read a .glb or .gltf file as JSON and check what trimesh would pass over.
+
+    Raises:
+        InputError: the file is not glTF 2.0 or is damaged, or uses what is not
+            supported; the message names it.
+    """
+    raw = files.read_bytes(path, MAX_BYTES)
+    chunks: dict[str, bytes] = {}
+    if path.suffix.lower() == ".glb":
+        raw, binary = _chunks(path, raw)
+        if binary is not None:
+            chunks[BINARY_CHUNK] = binary
+    try:
+        tree = json.loads(raw.decode("utf-8-sig"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: its JSON cannot be read ({error}); export the mesh again"
+        ) from error
+    try:
+        colours = _prepare_tree(path, tree, bool(chunks))
+    except InputError:
+        raise
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: not a valid glTF file ({type(error).__name__}: {error}); "
+            "export the mesh again"
+        ) from error
+    return PreparedGltf(json.dumps(tree).encode(), chunks, colours)
+
+
+def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
+    """Split a .glb file into its JSON and its binary chunk."""
+    version, length = np.frombuffer(raw[4:12].ljust(8, b"\0"), "<u4").tolist()
+    if raw[:4] != _GLB or version != 2:
+        raise InputError(f"{path}: not a binary glTF 2.0 file; export the mesh again")
+    if length != len(raw):
+        raise InputError(
+            f"{path}: {len(raw)} bytes, but its header says {length}; the file is "
+            "damaged or truncated, copy or export it again"
+        )
+    found: list[tuple[bytes, bytes]] = []
+    start = 12
+    while start + 8 <= length:
+        size = int.from_bytes(raw[start : start + 4], "little")
+        found.append((raw[start + 4 : start + 8], raw[start + 8 : start + 8 + size]))
+        start += 8 + size
+    if not found or found[0][0] != _JSON or start > length:
+        raise InputError(f"{path}: its chunks are damaged; export the mesh again")
+    is_binary = len(found) > 1 and found[1][0] == _BIN
+    return found[0][1], found[1][1] if is_binary else None
+
+
+def _prepare_tree(path: Path, tree: Any, has_chunk: bool) -> tuple[BaseColour, ...]:
+    if not str(tree["asset"]["version"]).startswith("2"):
+        raise InputError(
+            f"{path}: asset.version is {tree['asset']['version']}; only glTF 2 is read"
+        )
+    unknown = set(tree.get("extensionsRequired", ())) - _SUPPORTED
+    if unknown:
+        raise InputError(
+            f"{path}: requires {', '.join(sorted(unknown))}, which is not supported; "
+            "export the mesh without it (uncompressed, not quantised)"
+        )
+    for i, buffer in enumerate(tree.get("buffers", ())):
+        if "uri" in buffer:
+            continue
+        if i > 0 or not has_chunk:
+            raise InputError(f"{path}: buffers[{i}] has no data; export the mesh again")
+        buffer["uri"] = BINARY_CHUNK
+    materials = tree.setdefault("materials", [])
+    materials.append(dict(_WHITE))
+    colours = tuple(_base_colour(path, tree, i) for i in range(len(materials)))
+    for i, mesh in enumerate(tree.get("meshes", ())):
+        for j, primitive in enumerate(mesh["primitives"]):
+            where = f"{path}: meshes[{i}].primitives[{j}]"
+            _prepare_primitive(where, tree, primitive, colours)
+    for i, material in enumerate(materials):
+        material["name"] = str(i)
+    return colours
+
+
+def _base_colour(path: Path, tree: Any, index: int) -> BaseColour:
+    material = tree["materials"][index]
+    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    factor = None
+    if gloss is not None:
+        info = gloss.get("diffuseTexture")
+    else:
+        metallic = material.get("pbrMetallicRoughness", {})
+        info = metallic.get("baseColorTexture")
+        factor = np.reshape(metallic.get("baseColorFactor", (1.0,) * 4), 4)
+    cutoff = float(material.get("alphaCutoff", 0.5))
+    if info is None:
+        plain = ("repeat", "repeat")
+        return BaseColour(False, plain, np.eye(2, 3), cutoff, factor)
+    texture = tree["textures"][info["index"]]
+    webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+    if webp.get("source", texture.get("source")) is None:
+        raise InputError(
+            f"{path}: textures[{info['index']}] has no PNG, JPEG or WebP image; "
+            "export the mesh with one of these"
+        )
+    sampler = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    wrap = [_WRAPS[sampler.get(name, 10497)] for name in ("wrapS", "wrapT")]
+    return BaseColour(True, (wrap[0], wrap[1]), _matrix(info), cutoff, factor)
+
+
+def _matrix(info: Any) -> np.ndarray:
+    """Return the affine map of `KHR_texture_transform`, (2, 3)."""
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    turn = float(transform.get("rotation", 0.0))
+    # Counter-clockwise on the image, where v points down: what its text says and all
+    # viewers do; the matrix printed with it has the opposite sense.
+    rotation = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    scale = np.reshape(transform.get("scale", (1.0, 1.0)), 2)
+    offset = np.reshape(transform.get("offset", (0.0, 0.0)), (2, 1))
+    return np.hstack([rotation * scale, offset]).astype(np.float64)
+
+
+def _prepare_primitive(
+    where: str, tree: Any, primitive: Any, colours: tuple[BaseColour, ...]
+) -> None:
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _FAN:
+        raise InputError(f"{where}: is a triangle fan; export plain triangles")
+    if mode not in (_TRIANGLES, _STRIP):
+        return
+    material = primitive.setdefault("material", len(colours) - 1)
+    attributes = primitive["attributes"]
+    if colours[material].has_texture:
+        name = f"TEXCOORD_{_coordinate_set(tree['materials'][material])}"
+        if name not in attributes:
+            raise InputError(
+                f"{where}: has no {name}, which its texture needs; export the mesh "
+                "with texture coordinates"
+            )
+        attributes["TEXCOORD_0"] = attributes[name]
+    kinds = {
+        "POSITION": (_FLOAT,),
+        "NORMAL": (_FLOAT,),
+        "TEXCOORD_0": (_FLOAT,),
+        "COLOR_0": (_FLOAT, _UBYTE, _USHORT),
+    }
+    used = {name: attributes[name] for name in kinds if name in attributes}
+    if "indices" in primitive:
+        used["indices"] = primitive["indices"]
+    for name, index in used.items():
+        allowed = kinds.get(name, (_UBYTE, _USHORT, _UINT))
+        _check_accessor(where, name, tree["accessors"][index], allowed)
+
+
+def _coordinate_set(material: Any) -> int:
+    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if gloss is not None:
+        info = gloss["diffuseTexture"]
+    else:
+        info = material["pbrMetallicRoughness"]["baseColorTexture"]
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    return int(transform.get("texCoord", info.get("texCoord", 0)))
+
+
+def _check_accessor(
+    where: str, name: str, accessor: Any, allowed: tuple[int, ...]
+) -> None:
+    if "sparse" in accessor or "bufferView" not in accessor:
+        raise InputError(
+            f"{where}: {name} is stored sparse or compressed, which is not supported; "
+            "export the mesh uncompressed"
+        )
+    if accessor["componentType"] not in allowed:
+        raise InputError(
+            f"{where}: {name} has component type {accessor['componentType']}, which "
+            "is not supported (KHR_mesh_quantization, normalised texture "
+            "coordinates); export it as floating point"
+        )

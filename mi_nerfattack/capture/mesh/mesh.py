@@ -1,0 +1,294 @@
+"""Textured triangle meshes: metric placement, the cube, Mitsuba shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
+from mi_nerfattack.errors import InputError
+
+#: A cube's faces as seen from outside: outward normal, right and up of the picture.
+#: Around -y, the front of a glTF model, they unfold into a cross.
+CUBE_FACES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
+    "px": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "nx": ((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    "py": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    "ny": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    "pz": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    "nz": ((0, 0, -1), (1, 0, 0), (0, -1, 0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles of one material. Only the diffuse colour of materials is kept.
+
+    The reflectance is the product of `colour`, `vertex_colour` and `texture`.
+
+    Args:
+        vertices: (n, 3), float64.
+        faces: (m, 3), integer.
+        colour: (3,), linear reflectance in [0, 1].
+        normals: (n, 3), or None for flat shading.
+        vertex_colour: (n, 3), linear, or None.
+        uv: (n, 2), origin at the bottom left of the texture, or None.
+        texture: (h, w, 3 or 4), uint8 sRGB, or None. The fourth channel is opacity.
+        wrap: how the texture goes on beyond [0, 1]: "repeat", "mirror" or "clamp".
+        opacity: in [0, 1], of parts without texture.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colour: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    normals: np.ndarray | None = None
+    vertex_colour: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
+    wrap: str = "repeat"
+    opacity: float = 1.0
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether nothing shows through."""
+        return self.opacity == 1 and (
+            self.texture is None or self.texture.shape[2] == 3
+        )
+
+    def placed(self, matrix: np.ndarray, offset: np.ndarray) -> MeshPart:
+        """Apply an affine map, (3, 3) and (3,).
+
+        A map that mirrors turns the triangles around again; one that is flat drops
+        the normals.
+        """
+        determinant = np.linalg.det(matrix)
+        normals = self.normals
+        if determinant == 0:
+            normals = None
+        elif normals is not None:
+            normals = normals @ np.linalg.inv(matrix)
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = normals / np.maximum(length, 1e-30)
+        return replace(
+            self,
+            vertices=self.vertices @ matrix.T + offset,
+            faces=self.faces[:, ::-1] if determinant < 0 else self.faces,
+            normals=normals,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """A mesh of several materials, z up.
+
+    Args:
+        name: for messages.
+        parts: at least one, each with at least one triangle.
+    """
+
+    name: str
+    parts: tuple[MeshPart, ...]
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Smallest and largest coordinates, (2, 3)."""
+        used = np.concatenate([p.vertices[np.unique(p.faces)] for p in self.parts])
+        return np.stack([used.min(0), used.max(0)])
+
+    @property
+    def area(self) -> float:
+        """Sum of the areas of all triangles."""
+        total = 0.0
+        for part in self.parts:
+            a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+            normal = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            total += 0.5 * float(normal.sum())
+        return total
+
+    def transformed(self, scale: float, offset: np.ndarray) -> TexturedMesh:
+        """Return the mesh with vertices `scale * (vertices + offset)`."""
+        matrix = scale * np.eye(3)
+        parts = (part.placed(matrix, scale * offset) for part in self.parts)
+        return replace(self, parts=tuple(parts))
+
+    def turned(self, angle_deg: float) -> TexturedMesh:
+        """Return the mesh turned about z, counter-clockwise as seen from above."""
+        matrix = turn_matrix(angle_deg)
+        parts = (part.placed(matrix, np.zeros(3)) for part in self.parts)
+        return replace(self, parts=tuple(parts))
+
+
+def cube_mesh(
+    edge_m: float, faces: Mapping[str, np.ndarray] | None = None
+) -> TexturedMesh:
+    """Make a cube, centred in x and y and standing on z = 0.
+
+    Args:
+        edge_m: length of the edge in metres, positive.
+        faces: pictures (h, w, 3), uint8 sRGB, by the names of `CUBE_FACES`; None
+            for a grey cube of reflectance 0.5.
+    """
+    if not 0 < edge_m < np.inf:
+        raise InputError(f"edge_m: {edge_m}; must be positive")
+    if faces is not None and set(faces) != set(CUBE_FACES):
+        raise InputError(f"faces: {sorted(faces)}; needs {', '.join(CUBE_FACES)}")
+    parts = []
+    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    for name, axes in CUBE_FACES.items():
+        normal, right, up = (np.array(axis, np.float64) for axis in axes)
+        corners = normal + (2 * uv[:, :1] - 1) * right + (2 * uv[:, 1:] - 1) * up
+        vertices = 0.5 * edge_m * (corners + [0, 0, 1])
+        part = MeshPart(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+        if faces is not None:
+            white, texture = (1.0, 1.0, 1.0), faces[name]
+            part = replace(part, colour=white, uv=uv, texture=texture, wrap="clamp")
+        parts.append(part)
+    return TexturedMesh("cube", tuple(parts))
+
+
+def normalise(
+    mesh: TexturedMesh, height_m: float | None = None, longest_m: float | None = None
+) -> TexturedMesh:
+    """Scale a mesh to metres, centre it in x and y and stand it on z = 0.
+
+    Args:
+        mesh: z up.
+        height_m: extent in z afterwards.
+        longest_m: longest extent afterwards; not together with `height_m`. With
+            neither, the file's unit is taken to be the metre.
+    """
+    low, high = mesh.bounds
+    scale = extent_scale(mesh.name, high - low, height_m, longest_m)
+    offset = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
+    return mesh.transformed(scale, offset)
+
+
+def extent_scale(
+    name: str, extent: np.ndarray, height_m: float | None, longest_m: float | None
+) -> float:
+    """Return the factor that brings an extent (3,) to a height or a longest edge.
+
+    Raises:
+        InputError: with the name, if there is nothing to scale; or a size is not
+            positive, or both are given.
+    """
+    if height_m is not None and longest_m is not None:
+        raise InputError("height_m, longest_m: give one of them, not both")
+    for key, wanted, present in (
+        ("height_m", height_m, float(extent[2])),
+        ("longest_m", longest_m, float(extent.max())),
+    ):
+        if wanted is None:
+            continue
+        if not 0 < wanted < np.inf:
+            raise InputError(f"{key}: {wanted}; must be positive")
+        if present <= 0:
+            raise InputError(f"{name}: has no height to scale; give its longest edge")
+        return wanted / present
+    return 1.0
+
+
+def turn_matrix(angle_deg: float) -> np.ndarray:
+    """Return the rotation (3, 3) about z, counter-clockwise as seen from above."""
+    if not np.isfinite(angle_deg):
+        raise InputError(f"turn_deg: {angle_deg}; must be finite")
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def mitsuba_shapes(mesh: TexturedMesh) -> dict[str, Any]:
+    """Build Mitsuba meshes with two-sided diffuse materials, by name.
+
+    Textures repeat; a texture's fourth channel becomes a `mask`.
+    """
+    return {f"part_{i:03d}": _mitsuba_shape(p) for i, p in enumerate(mesh.parts)}
+
+
+def _mitsuba_shape(part: MeshPart) -> Any:
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(_material(part))
+    properties["face_normals"] = part.normals is None
+    mesh = mi.Mesh(
+        "part",
+        vertex_count=len(part.vertices),
+        face_count=len(part.faces),
+        has_vertex_normals=part.normals is not None,
+        has_vertex_texcoords=part.uv is not None,
+        props=properties,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.float32(part.vertices.ravel()))
+    parameters["faces"] = mi.UInt32(np.uint32(part.faces.ravel()))
+    if part.normals is not None:
+        parameters["vertex_normals"] = mi.Float(np.float32(part.normals.ravel()))
+    if part.uv is not None:
+        # Mitsuba's bitmaps have their origin at the top left
+        uv = np.float32(part.uv * [1, -1] + [0, 1])
+        parameters["vertex_texcoords"] = mi.Float(uv.ravel())
+    parameters.update()
+    if part.vertex_colour is not None:
+        # a texture holds the part's colour already
+        tint = np.array(part.colour) if part.texture is None else np.ones(3)
+        colour = part.vertex_colour * tint
+        mesh.add_attribute("vertex_color", 3, colour.ravel().tolist())
+    return mesh
+
+
+def _material(part: MeshPart) -> dict[str, Any]:
+    reflectance: Any
+    if part.texture is not None:
+        texture = _tinted(part.texture[..., :3], part.colour)
+        reflectance = _bitmap(texture, False, part.wrap)
+        if part.vertex_colour is not None:
+            reflectance = _product(reflectance)
+    elif part.vertex_colour is not None:
+        reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
+    else:
+        reflectance = {"type": "rgb", "value": list(part.colour)}
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+    if part.is_solid:
+        return bsdf
+    opacity: Any = part.opacity
+    if part.texture is not None:
+        opacity = _bitmap(np.ascontiguousarray(part.texture[..., 3:]), True, part.wrap)
+    return {"type": "mask", "opacity": opacity, "bsdf": bsdf}
+
+
+def _product(texture: dict[str, Any]) -> Any:
+    """Multiply a texture by the colours of the vertices."""
+
+    class Product(mi.Texture):
+        def __init__(self) -> None:
+            mi.Texture.__init__(self, mi.Properties())
+            self.texture = mi.load_dict(texture)
+            colours = {"type": "mesh_attribute", "name": "vertex_color"}
+            self.colours = mi.load_dict(colours)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return self.texture.eval(si, active) * self.colours.eval(si, active)
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return f"Product[{self.texture}, {self.colours}]"
+
+    return Product()
+
+
+def _tinted(texture: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
+    """Multiply an sRGB texture by a linear colour."""
+    if colour == (1.0, 1.0, 1.0):
+        return np.ascontiguousarray(texture)
+    linear = srgb_to_linear_numpy(texture.astype(np.float32) / 255)
+    product = linear_to_srgb_numpy(linear * np.array(colour, np.float32))
+    return np.round(255 * product).astype(np.uint8)
+
+
+def _bitmap(image: np.ndarray, raw: bool, wrap: str) -> dict[str, Any]:
+    bitmap = mi.Bitmap(image)
+    return {"type": "bitmap", "bitmap": bitmap, "raw": raw, "wrap_mode": wrap}

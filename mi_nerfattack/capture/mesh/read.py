@@ -1,0 +1,327 @@
+"""Read textured triangle meshes from glTF, OBJ and PLY files, with trimesh."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from PIL import Image
+
+from mi_nerfattack.backend.colour import srgb_to_linear_numpy
+from mi_nerfattack.capture.mesh.gltf import MAX_BYTES, BaseColour, prepare
+from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh
+from mi_nerfattack.capture.mesh.texture import flat_texture, laid_out
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+#: Rotations that bring an axis of a file to z; "y" keeps x and makes +z our -y.
+_TO_Z_UP = {
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+}
+
+
+def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
+    """Read glTF (.glb, .gltf), OBJ or PLY with its diffuse colours.
+
+    Node transforms are applied. Colours of glTF materials and vertices are linear,
+    those of OBJ and PLY sRGB, textures always sRGB. Opacity counts where glTF says
+    MASK or BLEND, but for that of vertices. Metal, gloss and emission are left out.
+
+    Args:
+        path: the mesh; textures lie where it says, in its folder or below.
+        up: the file's axis that points up, "x", "y", "z", "-x", "-y" or "-z"; None
+            for y in glTF and OBJ, z in PLY.
+
+    Raises:
+        InputError: no such file, unknown suffix, unreadable or damaged file, no
+            triangle that has an area, a value that is not finite, a missing texture,
+            buffer or material file, or a feature that is not supported.
+    """
+    import trimesh
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; check the path")
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: unknown suffix; use {', '.join(SUFFIXES)}")
+    turn = up_matrix(up or ("z" if suffix == ".ply" else "y"))
+    base_colours: tuple[BaseColour, ...] = ()
+    chunks: Mapping[str, bytes] = {}
+    if suffix in (".glb", ".gltf"):
+        prepared = prepare(path)
+        data, kind = prepared.data, "gltf"
+        base_colours, chunks = prepared.base_colours, prepared.chunks
+    else:
+        data, kind = files.read_bytes(path, MAX_BYTES), suffix[1:]
+    resolver = _recording_resolver(path, chunks)
+    if kind == "obj":
+        data = _as_utf8(data)
+        _check_materials(path, data, resolver)
+    with _as_input_error(path, resolver):
+        scene = trimesh.load_scene(
+            io.BytesIO(data), file_type=kind, resolver=resolver, process=False
+        )
+    _refuse_missing(path, resolver)
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            with _as_input_error(path, resolver):
+                part = _read_part(geometry, base_colours)
+            part = part.placed(turn @ transform[:3, :3], turn @ transform[:3, 3])
+            parts.append(part)
+    return _checked(path, tuple(parts))
+
+
+def up_matrix(axis: str) -> np.ndarray:
+    """Return the rotation (3, 3) that brings an axis to z.
+
+    Args:
+        axis: "x", "y", "z", "-x", "-y" or "-z". For y, x stays and z becomes -y.
+    """
+    if axis not in _TO_Z_UP:
+        raise InputError(f"up: {axis!r}; allowed: {', '.join(_TO_Z_UP)}")
+    return np.array(_TO_Z_UP[axis], np.float64)
+
+
+def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:
+    if not parts:
+        raise InputError(f"{path}: contains no triangle; export a triangle mesh")
+    mesh = TexturedMesh(path.name, parts)
+    if not np.all(np.isfinite(mesh.bounds)):
+        raise InputError(f"{path}: a vertex is NaN or infinite")
+    if mesh.area <= 0:
+        raise InputError(
+            f"{path}: all its triangles are degenerate (without area); export a "
+            "solid mesh"
+        )
+    return mesh
+
+
+def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
+    """Make a trimesh resolver that remembers what it did not find.
+
+    It finds `chunks` by name, and files in the folder of `path` and below. Images of
+    OBJ and PLY that cannot be read are remembered too.
+    """
+    from trimesh.resolvers import FilePathResolver, Resolver
+
+    folder = FilePathResolver(str(path))
+
+    class RecordingResolver(Resolver):
+        def __init__(self) -> None:
+            self.missing: list[str] = []
+            self.damaged: list[str] = []
+
+        def get(self, key: str) -> bytes:
+            if key in chunks:
+                return chunks[key]
+            name = key.strip().replace("\\", "/")
+            for candidate in (name, unquote(name), name.rpartition("/")[2]):
+                try:
+                    found = folder.absolute(candidate)
+                except ValueError:  # outside of the folder
+                    continue
+                if found.is_file():
+                    data = files.read_bytes(found, MAX_BYTES)
+                    if found.suffix.lower() == ".mtl":
+                        return _as_utf8(data)
+                    if path.suffix.lower() in (".obj", ".ply"):
+                        self._check_image(key, data)
+                    return data
+            self.missing.append(key)
+            raise FileNotFoundError(key)
+
+        def _check_image(self, key: str, data: bytes) -> None:
+            """Remember images that trimesh would pass over in silence."""
+            try:
+                Image.open(io.BytesIO(data)).close()
+            except (OSError, ValueError, Image.DecompressionBombError):
+                self.damaged.append(key)
+
+        def write(self, name: str, data: Any) -> None:
+            raise NotImplementedError("a mesh is only read")
+
+        def namespaced(self, namespace: str) -> Any:
+            raise NotImplementedError("files lie beside the mesh")
+
+        def keys(self) -> Any:
+            return folder.keys()
+
+    return RecordingResolver()
+
+
+def _as_utf8(data: bytes) -> bytes:
+    """Encode text of OBJ as UTF-8; the format names no encoding, so Latin-1 else."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
+    return data
+
+
+def _refuse_missing(path: Path, resolver: Any) -> None:
+    if resolver.missing:
+        raise InputError(
+            f"{path}: refers to the missing file {resolver.missing[0]!r}; put it "
+            "beside the mesh or remove the reference"
+        )
+    if resolver.damaged:
+        raise InputError(
+            f"{path}: its texture {resolver.damaged[0]!r} cannot be read as an image; "
+            "use PNG or JPEG"
+        )
+
+
+@contextmanager
+def _as_input_error(path: Path, resolver: Any) -> Iterator[None]:
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    # a damaged file makes trimesh raise whatever its parser stumbles over
+    except Exception as error:
+        _refuse_missing(path, resolver)
+        raise InputError(
+            f"{path}: cannot be read as {path.suffix.lower()} "
+            f"({type(error).__name__}: {error}); export the mesh again"
+        ) from error
+    finally:
+        logger.setLevel(level)
+
+
+def _check_materials(path: Path, data: bytes, resolver: Any) -> None:
+    """Check that an OBJ's material library is there and defines what is used."""
+    lines = data.decode("utf-8", "replace").splitlines()
+    words = [line.split(None, 1) for line in lines if line[:3] in ("mtl", "use")]
+    named = [(word[0], word[1].strip()) for word in words if len(word) == 2]
+    libraries = sorted({name for key, name in named if key == "mtllib"})
+    used = {name for key, name in named if key == "usemtl"}
+    if len(libraries) > 1:
+        raise InputError(
+            f"{path}: names several material libraries ({', '.join(libraries)}); "
+            "merge them into one"
+        )
+    defined = set()
+    if libraries:
+        try:
+            text = resolver.get(libraries[0]).decode("utf-8", "replace")
+        except FileNotFoundError:
+            _refuse_missing(path, resolver)
+        else:
+            rows = [line.split() for line in text.splitlines()]
+            defined = {" ".join(r[1:]) for r in rows if r and r[0].lower() == "newmtl"}
+    unknown = sorted(used - defined)
+    if unknown:
+        where = libraries[0] if libraries else "any library (it names none)"
+        raise InputError(
+            f"{path}: usemtl {unknown[0]!r} is not defined in {where}; add the "
+            "material, or remove the usemtl lines for a grey object"
+        )
+
+
+def _read_part(geometry: Any, base_colours: tuple[BaseColour, ...]) -> MeshPart:
+    # trimesh computes normals on demand; only those of the file are wanted, and its
+    # cache alone tells which they are (its own glTF exporter asks there too)
+    has_normals = "vertex_normals" in geometry._cache
+    part = MeshPart(
+        np.array(geometry.vertices, np.float64),
+        np.array(geometry.faces, np.int64),
+        normals=np.array(geometry.vertex_normals) if has_normals else None,
+    )
+    if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+        raise InputError(f"a face refers to a vertex beyond {len(part.vertices)}")
+    visual = geometry.visual
+    if base_colours:
+        return _with_base_colour(part, visual, base_colours[int(visual.material.name)])
+    if visual.kind == "texture":
+        return _with_simple_material(part, visual)
+    if visual.kind == "vertex":
+        colours = srgb_to_linear_numpy(_unit(visual.vertex_colors))[:, :3]
+        return replace(part, vertex_colour=colours, colour=(1.0, 1.0, 1.0))
+    if visual.kind == "face":
+        flat = part.faces.ravel()
+        colours = srgb_to_linear_numpy(_unit(visual.face_colors))[:, :3]
+        return MeshPart(
+            part.vertices[flat],
+            np.arange(len(flat)).reshape(-1, 3),
+            (1.0, 1.0, 1.0),
+            None if part.normals is None else part.normals[flat],
+            np.repeat(colours, 3, axis=0),
+        )
+    return part
+
+
+def _unit(colour: Any) -> np.ndarray:
+    """Bring stored colours to [0, 1], float64."""
+    colour = np.asarray(colour)
+    full = np.iinfo(colour.dtype).max if colour.dtype.kind == "u" else 1
+    return colour.astype(np.float64) / full
+
+
+def _with_simple_material(part: MeshPart, visual: Any) -> MeshPart:
+    """Lay on a material of OBJ or PLY, whose colour is sRGB."""
+    material = visual.material
+    factor = srgb_to_linear_numpy(_unit(material.diffuse))
+    part = replace(part, colour=tuple(map(float, factor[:3])))
+    if material.image is None or visual.uv is None:
+        return part
+    texture, uv, wrap = laid_out(
+        flat_texture(material.image, "RGB"), np.array(visual.uv), ("repeat", "repeat")
+    )
+    return replace(part, texture=texture, uv=uv, wrap=wrap)
+
+
+def _with_base_colour(part: MeshPart, visual: Any, base: BaseColour) -> MeshPart:
+    """Lay on a material of glTF, whose colour is linear."""
+    material = visual.material
+    factor = np.ones(4)
+    if base.factor is not None:
+        factor = base.factor
+    elif material.baseColorFactor is not None:
+        factor = _unit(material.baseColorFactor)
+    stored = visual.vertex_attributes.get("color")
+    if stored is not None:
+        part = replace(part, vertex_colour=_unit(stored)[:, :3])
+    part = replace(part, colour=tuple(map(float, factor[:3])))
+    is_solid = material.alphaMode not in ("MASK", "BLEND")
+    opacity = 1.0 if is_solid else float(factor[3])
+    if not base.has_texture:
+        if material.alphaMode == "MASK":
+            opacity = float(opacity >= base.alpha_cutoff)
+        return replace(part, opacity=opacity)
+    if material.baseColorTexture is None:
+        raise InputError(
+            f"the texture of materials[{material.name}] is missing or cannot be read "
+            "as an image; use PNG, JPEG or WebP"
+        )
+    texture = flat_texture(material.baseColorTexture, "RGB" if is_solid else "RGBA")
+    if not is_solid:
+        alpha = opacity * (texture[..., 3] / 255)
+        if material.alphaMode == "MASK":
+            alpha = (alpha >= base.alpha_cutoff).astype(np.float64)
+        texture[..., 3] = np.round(255 * alpha)
+        texture = texture if alpha.min() < 1 else texture[..., :3]
+    # set 0 of trimesh has its origin at the bottom left
+    uv = np.array(visual.uv, np.float64) * [1, -1] + [0, 1]
+    uv = (uv @ base.matrix[:, :2].T + base.matrix[:, 2]) * [1, -1] + [0, 1]
+    texture, uv, wrap = laid_out(texture, uv, base.wrap)
+    return replace(part, texture=texture, uv=uv, wrap=wrap)

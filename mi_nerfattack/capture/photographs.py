@@ -1,0 +1,281 @@
+"""Poses of a folder of photographs, upright, as a `transforms.json`."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack.capture.colmap.reconstruct import (
+    Lens,
+    Matching,
+    StageCallback,
+    Structure,
+    reconstruct,
+)
+from mi_nerfattack.capture.transforms import begin_posed, write_poses
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import Camera
+
+_LEAST = 3
+_LEAST_UP = 0.2  # length of the mean of unit vectors
+_MAX_SEED = 1 << 31  # of COLMAP's generator
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How poses are estimated.
+
+    Attributes:
+        matching: compare every photograph with every other one, or with those taken
+            shortly before and after, by the order of their names.
+        lens: COLMAP's camera model, one for all photographs.
+        long_edge_px: look for features at most at this size.
+        metres_per_unit: of the arbitrary unit of an earlier run; None keeps the
+            unit.
+        seed: of the random choices.
+    """
+
+    matching: Matching = "exhaustive"
+    lens: Lens = "OPENCV"
+    long_edge_px: int = 1600
+    metres_per_unit: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.long_edge_px < 1:
+            raise InputError(f"long_edge_px: {self.long_edge_px}; must be at least 1")
+        scale = self.metres_per_unit
+        if scale is not None and not (np.isfinite(scale) and scale > 0):
+            raise InputError(f"metres_per_unit: {scale}; must be positive")
+        if not 0 <= self.seed < _MAX_SEED:
+            raise InputError(f"seed: {self.seed}; must be in [0, 2^31)")
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """What was written.
+
+    Attributes:
+        path: of the `transforms.json`.
+        placed: names of the photographs with a pose.
+        left_out: names of those that could not be placed.
+        camera: of all photographs.
+        error_px: mean reprojection error.
+        farthest: the two photographs that were taken farthest apart.
+        distance: between these, in the unit of the poses.
+    """
+
+    path: Path
+    placed: tuple[str, ...]
+    left_out: tuple[str, ...]
+    camera: Camera
+    error_px: float
+    farthest: tuple[str, str]
+    distance: float
+
+
+def estimate_poses(
+    photographs: str | Path,
+    output: str | Path,
+    options: PoseOptions | None = None,
+    progress: StageCallback = lambda stage, done, total: None,
+) -> PoseEstimate:
+    """Estimate the poses of photographs, and write them beside copies of these.
+
+    z points up, against the mean of the images' downward directions: photographs held
+    level on average are needed for that. The origin is the mean of the cameras. The
+    unit is arbitrary, as photographs do not tell it, unless `metres_per_unit` does;
+    the JSON file's `units` says which. Photographs that their EXIF data turn are
+    stored upright.
+
+    Args:
+        photographs: folder of at least 3 JPEG, PNG or WebP images of one size, taken
+            by one camera at one focal length.
+        output: folder for `transforms.json`, `images` and `points.safetensors`.
+        options: None for the defaults.
+        progress: called with stage, done and total.
+
+    Raises:
+        InputError: too few photographs, an unreadable one, several sizes, or too few
+            could be placed. Nothing is written then.
+        SetupError: pycolmap failed or crashed; nothing is written either.
+    """
+    options = options or PoseOptions()
+    root = Path(photographs)
+    names = _list(root)
+    _check_output(Path(output))
+    with tempfile.TemporaryDirectory() as folder:
+        staged, work = Path(folder) / "images", Path(folder) / "work"
+        staged.mkdir()
+        work.mkdir()
+        _stage(root, names, staged, progress)
+        _check_in_place(root, names, staged, Path(output) / "images")
+        found = reconstruct(
+            staged,
+            names,
+            work,
+            options.matching,
+            options.lens,
+            options.long_edge_px,
+            options.seed,
+            progress,
+        )
+        found = upright(found, options.metres_per_unit or 1.0)
+        return _write(Path(output), staged, found, names, options)
+
+
+def _list(root: Path) -> list[str]:
+    if not root.is_dir():
+        raise InputError(f"{root}: is not a folder; give the folder of the photographs")
+    names = sorted(
+        p.name for p in root.iterdir() if p.suffix.lower() in files.IMAGE_SUFFIXES
+    )
+    if len(names) < _LEAST:
+        raise InputError(
+            f"{root}: {len(names)} photographs "
+            f"({', '.join(files.IMAGE_SUFFIXES)}); at least "
+            f"{_LEAST} are needed, 20 or more are better"
+        )
+    return names
+
+
+def _check_output(output: Path) -> None:
+    """Check that a folder can be written to, without making it."""
+    existing = output.absolute()
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    files.check_writable(existing / "transforms.json")
+
+
+def _check_in_place(
+    root: Path, names: Sequence[str], staged: Path, target: Path
+) -> None:
+    """Refuse to write turned copies over the photographs themselves."""
+    if not (target.is_dir() and target.samefile(root)):
+        return
+    for name in names:
+        limit = files.MAX_IMAGE_BYTES
+        if files.read_bytes(root / name, limit) != files.read_bytes(
+            staged / name, limit
+        ):
+            raise InputError(
+                f"{root / name}: its EXIF data turn it, and the upright copy would "
+                "replace it; choose another output folder"
+            )
+
+
+def _stage(
+    root: Path, names: Sequence[str], staged: Path, progress: StageCallback
+) -> None:
+    """Copy the photographs upright, and check that they have one size."""
+    first = (0, 0)
+    for done, name in enumerate(names):
+        progress("photographs", done, len(names))
+        size = _copy_upright(root / name, staged / name)
+        first = first if done else size
+        if size != first:
+            raise InputError(
+                f"{root / name}: {size[0]} x {size[1]} px, but {root / names[0]} has "
+                f"{first[0]} x {first[1]} px; all must come from one camera, held one "
+                "way: leave out the others"
+            )
+    progress("photographs", len(names), len(names))
+
+
+def _copy_upright(source: Path, target: Path) -> tuple[int, int]:
+    """Copy an image; turn it, if EXIF data say so; return width and height."""
+    height, width = files.read_image(source).shape[:2]
+    raw = files.read_bytes(source, files.MAX_IMAGE_BYTES)
+    with Image.open(io.BytesIO(raw), formats=("PNG", "JPEG", "WEBP")) as image:
+        kind = image.format
+        turned = ImageOps.exif_transpose(image)
+        if turned.size == (width, height) and not _is_turned(image):
+            files.write_bytes(target, raw)
+            return width, height
+    buffer = io.BytesIO()
+    turned.save(buffer, kind, quality=95, exif=turned.getexif())
+    files.write_bytes(target, buffer.getvalue())
+    return turned.size
+
+
+def _is_turned(image: Image.Image) -> bool:
+    return image.getexif().get(0x0112, 1) != 1  # the tag Orientation
+
+
+def upright(found: Structure, scale: float) -> Structure:
+    """Turn z up, move the origin to the cameras' mean, and scale lengths.
+
+    Raises:
+        InputError: the cameras have no common up.
+    """
+    poses = found.camera_to_world
+    up = -poses[:, :3, 1].mean(0)
+    length = np.linalg.norm(up)
+    if length < _LEAST_UP:
+        raise InputError(
+            "photographs: their upward directions cancel, so that z cannot point up; "
+            "turn the photographs upright first"
+        )
+    turn = _turn_to_z(up / length)
+    centre = poses[:, :3, 3].mean(0)
+    result = poses.copy()
+    result[:, :3, :3] = turn @ poses[:, :3, :3]
+    result[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ turn.T
+    points = scale * (found.points - centre) @ turn.T
+    return Structure(found.names, result, found.camera, points, found.error_px)
+
+
+def _turn_to_z(up: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation (3, 3) of a unit vector to +z."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis)
+    if sine < 1e-9:
+        return np.diag([1.0, 1.0, 1.0] if up[2] > 0 else [1.0, -1.0, -1.0])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[2])).as_matrix()
+
+
+def _write(
+    output: Path,
+    staged: Path,
+    found: Structure,
+    names: Sequence[str],
+    options: PoseOptions,
+) -> PoseEstimate:
+    path = begin_posed(output)
+    for name in found.names:
+        raw = files.read_bytes(staged / name, files.MAX_IMAGE_BYTES)
+        files.write_bytes(output / "images" / name, raw)
+    files.write_safetensors(
+        output / "points.safetensors", {"points": found.points.astype(np.float32)}
+    )
+    left_out = tuple(name for name in names if name not in set(found.names))
+    units = "arbitrary" if options.metres_per_unit is None else "metre"
+    extra = {
+        "units": units,
+        "points_file": "points.safetensors",
+        "reprojection_error_px": found.error_px,
+        "left_out": list(left_out),
+    }
+    stored = [f"images/{name}" for name in found.names]
+    write_poses(path, stored, found.camera, found.camera_to_world, extra)
+    eyes = found.camera_to_world[:, :3, 3]
+    apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
+    a, b = np.unravel_index(int(apart.argmax()), apart.shape)
+    return PoseEstimate(
+        path,
+        found.names,
+        left_out,
+        found.camera,
+        found.error_px,
+        (found.names[a], found.names[b]),
+        float(apart[a, b]),
+    )

@@ -1,0 +1,130 @@
+"""Views of a Mitsuba scene along its routes, as posed images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.capture.transforms import begin_posed, write_poses
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    mount_matrix,
+)
+from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.pathtrace.views import iterate_views
+from mi_nerfattack.vehicle.route.route import Route
+
+_LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
+_HEADING_SD_DEG, _ANY_HEADING_SHARE = 15.0, 0.3
+_OTHER_HEIGHT_SHARE, _HEIGHT_RANGE, _PITCH_SD_DEG = 0.3, (0.8, 3.0), 6.0
+
+
+def drive_poses(
+    routes: Sequence[Route], n: int, seed: int, mount: CameraMount | None = None
+) -> np.ndarray:
+    """Scatter camera poses along routes, for fitting what a drive may see.
+
+    The routes take turns. Arc length is uniform; lateral offset normal with standard
+    deviation 0.8 m, cut at 2 m; heading normal around the route's with 15 degrees, or
+    for 30 % of the poses uniform over all headings. Another 30 % sit at a height
+    uniform in 0.8 to 3 m with the pitch scattered by 6 degrees, the rest as mounted.
+
+    Args:
+        routes: at least one.
+        n: number of poses.
+        seed: of the scatter.
+        mount: the driving camera; None for the default mount.
+
+    Returns:
+        camera_to_world: (n, 4, 4), OpenCV axes.
+    """
+    from scipy.stats import truncnorm
+
+    if not routes or n < 1:
+        raise InputError(
+            f"drive_poses: {len(routes)} routes, n {n}; at least 1 of both"
+        )
+    if seed < 0:
+        raise InputError(f"seed: {seed}; at least 0")
+    mount = CameraMount() if mount is None else mount
+    rng = np.random.default_rng(seed)
+    along = rng.uniform(0, 1, n)
+    cut = _LATERAL_MAX / _LATERAL_SD
+    lateral = _LATERAL_SD * np.asarray(
+        truncnorm.rvs(-cut, cut, size=n, random_state=rng)
+    )
+    any_heading = rng.uniform(size=n) < _ANY_HEADING_SHARE
+    heading = np.where(
+        any_heading,
+        rng.uniform(-np.pi, np.pi, n),
+        rng.normal(0, np.radians(_HEADING_SD_DEG), n),
+    )
+    is_other = rng.uniform(size=n) < _OTHER_HEIGHT_SHARE
+    height = np.where(is_other, rng.uniform(*_HEIGHT_RANGE, n), mount.height_m)
+    pitch = mount.pitch_deg + is_other * rng.normal(0, _PITCH_SD_DEG, n)
+    poses = []
+    for i in range(n):
+        route = routes[i % len(routes)]
+        state = route.pose_at(along[i] * route.length, lateral[i], heading[i])
+        here = CameraMount(float(height[i]), mount.forward_m, float(pitch[i]))
+        poses.append(mount_matrix(state, here)[0])
+    return np.stack(poses)
+
+
+def capture_scene(
+    scene_path: str | Path,
+    routes_path: str | Path,
+    out_folder: str | Path,
+    n: int,
+    camera: Camera,
+    spp: int,
+    seed: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """Write posed sRGB images of a driving scene, for fitting a field.
+
+    Writes `images/0000.png`..., `depth.safetensors` (tensor `depth`, (n, height,
+    width), metres, see `View.depth`) and, last, `transforms.json`.
+
+    Args:
+        scene_path: Mitsuba XML.
+        routes_path: routes file of the scene; all its routes are used.
+        out_folder: made if needed.
+        n: number of views; see `drive_poses`.
+        camera: intrinsics.
+        spp: samples per pixel.
+        seed: of poses and samples.
+        progress: called with (views done, n) after each view.
+
+    Returns:
+        Path of `transforms.json`.
+    """
+    table = files.read_json(routes_path)
+    if not isinstance(table, dict) or not table:
+        raise InputError(f"{routes_path}: needs an object with one key per route")
+    routes = [Route.from_file(routes_path, name) for name in table]
+    poses = drive_poses(routes, n, seed)
+    scene = load_scene(scene_path)
+    path = begin_posed(out_folder)
+    root = path.parent
+    names = [f"images/{i:04d}.png" for i in range(n)]
+    depth = np.empty((n, camera.height, camera.width), np.float32)
+    for i, view in enumerate(iterate_views(scene, camera, poses, spp, seed)):
+        files.write_image(root / names[i], linear_to_uint8(view.rgb))
+        depth[i] = view.depth
+        progress(i + 1, n)
+    files.write_safetensors(root / "depth.safetensors", {"depth": depth})
+    extra = {
+        "units": "metre",
+        "depth_file": "depth.safetensors",
+        "spp": spp,
+        "seed": seed,
+    }
+    write_poses(path, names, camera, poses, extra)
+    return path

@@ -1,0 +1,212 @@
+"""Options of ``evaluate``: where a policy drives, and how it is called."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.deploy.place import Place
+    from mi_nerfattack.evaluation.identity import EnvironmentUnder
+    from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+    from mi_nerfattack.scenario.sections import PolicySection, Section
+
+_Section = TypeVar("_Section", bound="Section")
+#: The policy that is evaluated where none is given.
+BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
+
+
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Where a policy drives."""
+
+    place: str = "intersection"
+    """Bundled place: intersection, or room (a small car that takes steering angles)."""
+    scene: Path | None = None
+    """Mitsuba XML of a scene of your own; needs --routes-file."""
+    field: Path | None = None
+    """Field file of the scene, for the surrogate."""
+    routes_file: Path | None = None
+    """Routes, JSON."""
+    object: tuple[Path, ...] = ()
+    """Grid fields that stand beside the road with random textures; the bundled place's
+    by default."""
+    server: str | None = None
+    """Server of carla, and the town of --routes-file: HOST:PORT/TOWN."""
+
+    def check(self, environments: tuple[str, ...]) -> None:
+        """Check that what CARLA needs is given, and only for CARLA.
+
+        Args:
+            environments: their names.
+
+        Raises:
+            InputError: the server's town, its routes or its scene is missing, or the
+                server is of no use.
+        """
+        from mi_nerfattack.deploy.carla.session import CarlaServer
+
+        if "carla" not in environments:
+            if self.server is not None:
+                raise InputError(
+                    f"--server: {self.server!r}; only the environment carla has one: "
+                    "name it in --environments"
+                )
+            return
+        town = CarlaServer.parse(self.server).town if self.server else None
+        if town is None or self.routes_file is None:
+            raise InputError(
+                "--environments: carla drives along routes of a town; give --server "
+                "HOST:PORT/TOWN and --routes-file (deploy.carla_route makes routes)"
+            )
+        if self.scene is None and (len(environments) > 1 or self.object):
+            raise InputError(
+                "--environments: carla beside others, or past objects, needs the "
+                "town's --scene: the bundled ones are elsewhere"
+            )
+
+    def build(self) -> Place:
+        """Return the place; camera and car are those of the bundled one."""
+        from mi_nerfattack.deploy.place import bundled_place
+
+        place = bundled_place(self.place)
+        if self.scene is not None:
+            if self.routes_file is None:
+                raise InputError(f"--scene: {self.scene}; it needs its --routes-file")
+            place = replace(place, scene=self.scene, field=None, objects=())
+        elif self.server is not None:  # where the ground of a town is nobody knows
+            place = replace(place, field=None, objects=())
+        return replace(
+            place,
+            field=self.field or place.field,
+            routes=self.routes_file or place.routes,
+            objects=self.object or place.objects,
+            server=self.server or place.server,
+        )
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """How a policy is called; a TOML file can say more, as a scenario does."""
+
+    kind: str | None = None
+    """Kind, where the suffix does not tell it: drjit, callable, ..."""
+    weights_file: str | None = None
+    """Weights of a module: .safetensors or a state dict."""
+    goal: str | None = None
+    """How the goal is passed: integer, one_hot or none."""
+    goals: int | None = None
+    """Number of goals."""
+    control_scale: float = 1.0
+    """Factor to the car's unit, rad/s or rad, positive to the left."""
+    column: int | None = None
+    """Column of the control, where the network gives several numbers."""
+
+    def section(self, policy: str | None) -> tuple[PolicySection, Path]:
+        """Return what a scenario's section [policy] would say, and its folder.
+
+        Raises:
+            InputError: an option does not fit, or the TOML file is not usable.
+        """
+        from mi_nerfattack.scenario.sections import PolicySection
+
+        if _is_toml(policy):
+            if self != PolicyOptions():
+                raise InputError(
+                    f"{policy}: says itself how the policy is called; leave out "
+                    "--kind, --weights-file, --goal, --goals, --control-scale, --column"
+                )
+            values = _read_toml(policy).get("policy")
+            if not isinstance(values, dict):
+                raise InputError(f"{policy}: has no section [policy]")
+            section = _checked(f"{policy}: policy", PolicySection, values)
+            return section, Path(policy).parent
+        chosen = policy or BUNDLED_POLICY
+        values = {
+            "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
+            "kind": self.kind,
+            "weights_file": self.weights_file,
+            "goal": self.goal,
+            "goals": self.goals,
+            "control_scale": self.control_scale,
+            "output": self.column,
+        }
+        return _checked(f"{chosen}: policy", PolicySection, values), Path()
+
+
+def parse_conditions(
+    names: tuple[str, ...], conditions: tuple[str, ...], spp: int
+) -> tuple[EnvironmentUnder, ...]:
+    """Return the environments under all conditions; the surrogate under none.
+
+    Args:
+        names: of the environments.
+        conditions: each ``SKY`` or ``SKY:EV``.
+        spp: samples per pixel.
+    """
+    from mi_nerfattack.deploy.place import Conditions
+    from mi_nerfattack.evaluation.identity import EnvironmentUnder
+
+    parsed = []
+    for text in conditions:
+        sky, _, exposure = text.partition(":")
+        try:
+            parsed.append(Conditions(sky, float(exposure or 0), spp))
+        except ValueError as err:
+            raise InputError(f"--conditions: {text!r}: {err}") from err
+    if not parsed or len(set(parsed)) < len(parsed):
+        raise InputError(f"--conditions: {conditions}; at least one, each once")
+    found = []
+    for name in names:
+        several = [Conditions(spp=spp)] if name == "surrogate" else parsed
+        found += [EnvironmentUnder(name, item) for item in several]
+    return tuple(found)
+
+
+def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
+    """Return the camera that a policy's TOML file describes, where it describes one.
+
+    Args:
+        policy: as given to `PolicyOptions.section`.
+
+    Raises:
+        InputError: the section [camera] is not usable.
+    """
+    from mi_nerfattack.scenario.build.camera import build_camera
+    from mi_nerfattack.scenario.sections import CameraSection
+
+    values = _read_toml(policy).get("camera") if _is_toml(policy) else None
+    if values is None:
+        return None
+    return build_camera(_checked(f"{policy}: camera", CameraSection, values))
+
+
+def _is_toml(policy: str | None) -> TypeGuard[str]:
+    return policy is not None and policy.lower().endswith(".toml")
+
+
+def _read_toml(policy: str) -> dict[str, Any]:
+    from mi_nerfattack.io import files
+
+    return files.read_toml(Path(policy))
+
+
+def _checked(name: str, model: type[_Section], values: object) -> _Section:
+    """Return a section of a scenario; `name` is its file's and its own."""
+    from pydantic import ValidationError
+
+    from mi_nerfattack.scenario.sections import explain
+
+    try:
+        return model.model_validate_json(json.dumps(values, default=str))
+    except ValidationError as err:
+        first = err.errors()[0]
+        location, problem = explain(first)
+        where = ".".join([name, *map(str, location)])
+        if first["type"] == "extra_forbidden":
+            problem = "unknown key; remove or correct it"
+        raise InputError(f"{where}: {problem}") from err

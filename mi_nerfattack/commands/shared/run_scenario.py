@@ -1,0 +1,85 @@
+"""What ``attack`` and ``demo`` share: running a scenario, and the final table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+
+def run_scenario(
+    path: Path,
+    output: Path,
+    resume: bool,
+    as_json: bool,
+    object_field: Path | None = None,
+    force: bool = False,
+) -> int:
+    """Run a scenario with a progress bar on stderr, and print its table.
+
+    Args:
+        path: the scenario file.
+        output: the run folder.
+        resume: continue from what an interrupted run left in it.
+        as_json: print the metrics as JSON in place of the table.
+        object_field: grid field that replaces the one of every object.
+        force: resume although something has changed.
+    """
+    from rich.console import Console
+
+    from mi_nerfattack import variant
+    from mi_nerfattack.backend.threads import one_thread
+    from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.errors import InputError
+    from mi_nerfattack.experiment.job import Job
+    from mi_nerfattack.report.table import metrics_table
+    from mi_nerfattack.scenario.build.policy import load_differentiable, policy_kind
+    from mi_nerfattack.scenario.scenario import load_scenario, replace_objects
+
+    scenario, text = load_scenario(path)
+    if object_field is not None:
+        scenario, text = replace_objects(scenario, text, object_field)
+    model = scenario.vehicle.model
+    steered = model not in ("dubins", "custom")
+    if steered and policy_kind(scenario.policy) == "pilotnet":
+        raise InputError(
+            f"{path}: vehicle.model: {model} takes a steering angle in radians, "
+            "PilotNet gives a heading rate in rad/s; use dubins, or a policy of "
+            "another kind"
+        )
+    variant.ensure()
+    policy = load_differentiable(scenario.policy, path.parent)
+    with StageBars() as bars, one_thread():
+
+        def show(stage: str, done: int, total: int, remark: str) -> None:
+            bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+        job = Job(scenario, text, path.parent, policy, output, show, bars.say)
+        document = job.run(resume, force)
+    if as_json:
+        print(json.dumps(document, allow_nan=False))
+        return 0
+    console = Console()
+    console.print(metrics_table(document))
+    _print_files(console, output, document)
+    return 0
+
+
+def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
+    cost = document["cost"]
+    console.print(
+        f"{cost['wall_s']:.0f} s, {cost['renders']} frames, "
+        f"{cost['peak_memory_mb']:.0f} MB at most; "
+        f"{cost['checkpoint_s']:.1f} s of it in checkpoints"
+    )
+    console.print(f"Run folder: {output.resolve()}", soft_wrap=True)
+    for name, meaning in (
+        ("report.html", "everything on one page"),
+        ("overhead.png", "all drives from above"),
+        ("strip.png", "what the policy sees"),
+        ("attribution*.png", "when and where the failure is made"),
+        ("metrics.json, steps.csv", "the numbers"),
+        ("objects/", "the attacked fields"),
+        ("frames/", "EXR frames with layers"),
+    ):
+        console.print(f"  {name:24s} {meaning}")

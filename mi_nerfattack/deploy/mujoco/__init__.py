@@ -1,0 +1,1 @@
+"""MuJoCo: map and car as MJCF, its physics, its renderer."""

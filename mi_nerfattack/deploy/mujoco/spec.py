@@ -1,0 +1,106 @@
+"""MJCF of a place: its map, its light and a car."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.built_in import BuiltInObject
+from mi_nerfattack.deploy.car import Car
+from mi_nerfattack.deploy.mujoco import car as mjcf_car
+from mi_nerfattack.deploy.mujoco.car import Handling
+from mi_nerfattack.deploy.mujoco.light import (
+    SHADOW_RADIUS,
+    SUN_DISTANCE,
+    add_lighting,
+    read_lighting,
+)
+from mi_nerfattack.deploy.mujoco.map import add_meshes, built_in_mesh, read_meshes
+from mi_nerfattack.deploy.mujoco.module import mujoco
+from mi_nerfattack.io import files
+
+NEAR_M = 0.05
+_SHADOW_PX = 2048
+# The sky stands at 0.7 of it; the sun's shadow map ends there, too.
+_FAR, _LEAST_FAR_M = 4.0, 2 * (SUN_DISTANCE + SHADOW_RADIUS)  # radii of the map
+
+
+def map_spec(
+    scene: Any, built_in: Sequence[BuiltInObject] = (), exposure_ev: float = 0.0
+) -> mujoco.MjSpec:
+    """Describe a Mitsuba scene for MuJoCo: meshes, textures, light, level ground.
+
+    Args:
+        scene: `mi.Scene`, metric, z up; meshes and rectangles of opaque materials.
+        built_in: more objects.
+        exposure_ev: its light, of lamps as well, is multiplied by two to this power.
+
+    Returns:
+        what compiles to a model without joints; the ground that cars drive on is the
+        plane z = 0, whatever is drawn.
+
+    Raises:
+        InputError: something in the scene cannot be drawn.
+    """
+    meshes = read_meshes(scene)
+    meshes += [built_in_mesh(index, item) for index, item in enumerate(built_in)]
+    gain = 2.0**exposure_ev
+    lighting = read_lighting(scene).scaled(gain)
+    spec = mujoco.MjSpec()
+    mjcf_car.add_ground(spec)
+    add_meshes(spec, meshes, lighting.white, gain)
+    add_lighting(spec, lighting)
+    _set_visual(spec, np.concatenate([mesh.vertices for mesh in meshes]))
+    return spec
+
+
+def world_spec(scene: Any, car: Car, handling: Handling | None = None) -> mujoco.MjSpec:
+    """Describe map and car in one model, as for MuJoCo's own viewer."""
+    spec = map_spec(scene)
+    mjcf_car.add_car(spec, car, handling or Handling())
+    return spec
+
+
+def write_mjcf(folder: str | Path, spec: mujoco.MjSpec) -> list[Path]:
+    """Write a model as MJCF: `model.xml` and its textures as PNG files.
+
+    Numbers in the XML have six digits, so that a car read from it drives a little
+    differently in the last of them.
+
+    Args:
+        folder: made where it is missing; files of these names are replaced.
+        spec: of `map_spec` or `world_spec`; it stays as it is.
+
+    Returns:
+        The files, `model.xml` last.
+    """
+    folder, written = files.make_folder(folder), []
+    copy = spec.copy()
+    for index, texture in enumerate(copy.textures):
+        name = f"texture_{index:03d}.png"
+        texels = np.frombuffer(bytes(texture.data), np.uint8)
+        shape = texture.height, texture.width, 3
+        files.write_image(folder / name, texels.reshape(shape))
+        written.append(folder / name)
+        texture.data, texture.file = b"", name
+        texture.width = texture.height = 0
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            texture.gridsize, texture.gridlayout = [6, 1], "RLUDFB"
+    copy.modelfiledir = str(folder)
+    copy.compile()
+    files.write_text(folder / "model.xml", copy.to_xml())
+    return [*written, folder / "model.xml"]
+
+
+def _set_visual(spec: mujoco.MjSpec, vertices: np.ndarray) -> None:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    radius = max(0.5 * float(np.linalg.norm(high - low)), 1.0)
+    spec.stat.center, spec.stat.extent = (low + high) / 2, radius
+    view = spec.visual
+    view.map.znear = NEAR_M / radius
+    view.map.zfar = max(_FAR, _LEAST_FAR_M / radius)
+    view.map.shadowclip = SHADOW_RADIUS / radius
+    view.quality.shadowsize, view.quality.offsamples = _SHADOW_PX, 0

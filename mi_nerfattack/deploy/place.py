@@ -1,0 +1,105 @@
+"""Where to drive, and under which conditions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from mi_nerfattack.deploy.built_in import BuiltInObject
+from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
+from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
+
+
+@dataclass(frozen=True)
+class Place:
+    """Files of a scene in its forms, and what drives there.
+
+    Args:
+        scene: Mitsuba XML.
+        field: the scene's field, of the surrogate; None where there is none.
+        routes: JSON.
+        objects: grid fields that may stand beside the road.
+        camera: of the vehicle.
+        mount: the camera's place on it.
+        period: seconds between two images.
+        car: what drives.
+        recording: of `replay`: a folder, a video or a log.
+        server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
+    """
+
+    scene: Path
+    field: Path | None
+    routes: Path
+    objects: tuple[Path, ...]
+    camera: Camera
+    mount: CameraMount
+    period: float = 0.1
+    car: Car = CAR
+    recording: Path | None = None
+    server: str = "127.0.0.1:2000"
+
+    def __post_init__(self) -> None:
+        """Check the period."""
+        if not 0 < self.period < float("inf"):
+            raise InputError(f"place.period: {self.period!r}; a positive time, seconds")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What changes between drives at one place.
+
+    Args:
+        sky: time of day, key of `DAYLIGHT`: "day" (the file's), "morning", "noon",
+            "evening", "overcast".
+        exposure_ev: of the camera, in powers of two.
+        spp: samples per pixel of path-traced images.
+        built_in: objects with geometry, lit and shadowed by the environment.
+    """
+
+    sky: str = "day"
+    exposure_ev: float = 0.0
+    spp: int = 16
+    built_in: tuple[BuiltInObject, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.sky not in DAYLIGHT:
+            raise InputError(f"sky: {self.sky!r}; one of {', '.join(DAYLIGHT)}")
+        if not math.isfinite(self.exposure_ev):
+            raise InputError(f"exposure_ev: {self.exposure_ev}; must be finite")
+        if not isinstance(self.spp, int) or self.spp < 1:
+            raise InputError(f"spp: {self.spp!r}; at least 1 sample per pixel, whole")
+
+
+def bundled_place(name: str = "intersection") -> Place:
+    """Return a bundled scene with its routes, objects and car.
+
+    Args:
+        name: "intersection", with the full-size car; or "room", with the small car on
+            its square track, which has no field.
+    """
+    from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
+
+    if name not in _CARS:
+        raise InputError(f"place: {name!r}; one of {', '.join(_CARS)}")
+    car, mount = _CARS[name]
+    field = "intersection/field.safetensors"
+    return Place(
+        scene=bundled(f"{name}/scene.xml"),
+        field=bundled(field) if name == "intersection" else None,
+        routes=bundled(f"{name}/routes.json"),
+        objects=(bundled("hydrant/field.safetensors"),),
+        camera=from_fov(200, 66, 90.0),
+        mount=mount,
+        car=car,
+    )
+
+
+#: Cars of the bundled places, and where their cameras are.
+_CARS = {
+    "intersection": (CAR, CameraMount()),
+    "room": (SMALL_CAR, CameraMount(height_m=0.2, forward_m=0.3, pitch_deg=10.0)),
+}

@@ -1,0 +1,1 @@
+"""Recorded drives as environments: folders, videos, MCAP."""

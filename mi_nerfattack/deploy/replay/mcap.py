@@ -1,0 +1,292 @@
+"""Recorded drives as MCAP logs of JSON messages in Foxglove's schemas.
+
+====================  ============================  ===================================
+topic (default)       schema                        used
+====================  ============================  ===================================
+`/camera/image`       `foxglove.CompressedImage`    `timestamp`, `data` (JPEG, PNG or
+                                                    WebP in base64)
+`/camera/pose`        `foxglove.PoseInFrame`        `timestamp`, `pose` of the camera,
+                                                    OpenCV axes, in the world
+or `/vehicle/pose`    `foxglove.PoseInFrame`        the same of the vehicle: x forward,
+                                                    y left, z up
+`/camera/calibration` `foxglove.CameraCalibration`  `width`, `height`, `K`, `D`
+                                                    (`plumb_bob`); may be missing
+====================  ============================  ===================================
+
+A frame takes the pose nearest in time. There is no depth.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.replay.folder import required_camera
+from mi_nerfattack.deploy.replay.poses import pose_matrix
+from mi_nerfattack.deploy.replay.recording import (
+    AbstractRecording,
+    Track,
+    check_times,
+    checked_image,
+    nearest_pose,
+    no_depth,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.io.strict_json import parse_json
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+
+MAX_LOG_BYTES = 1 << 32
+MAX_CHUNK_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class McapTopics:
+    """Names of the topics of a log; see the module.
+
+    Args:
+        image: of the frames.
+        camera_pose: comes first where a log has both.
+        vehicle_pose: combined with the camera's mount.
+        calibration: of the camera.
+    """
+
+    image: str = "/camera/image"
+    camera_pose: str = "/camera/pose"
+    vehicle_pose: str = "/vehicle/pose"
+    calibration: str = "/camera/calibration"
+
+    def schemas(self) -> dict[str, str]:
+        """Return the schema that each topic must have."""
+        return {
+            self.image: "foxglove.CompressedImage",
+            self.camera_pose: "foxglove.PoseInFrame",
+            self.vehicle_pose: "foxglove.PoseInFrame",
+            self.calibration: "foxglove.CameraCalibration",
+        }
+
+
+class McapRecording(AbstractRecording):
+    """An MCAP log; the images stay compressed until they are asked for.
+
+    Args:
+        path: of at most 4 GiB.
+        camera: intrinsics, for logs without.
+        mount: of the camera, for poses of the vehicle.
+        topics: names.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera | None,
+        mount: CameraMount,
+        topics: McapTopics | None = None,
+    ) -> None:
+        topics = topics or McapTopics()
+        found = _read_messages(path, topics.schemas())
+        images = found[topics.image]
+        if not images:
+            raise InputError(f"{path}: no message on {topics.image}, so no frame")
+        self._path = path
+        self._images = [_compressed(f"{path}: {topics.image}", item) for item in images]
+        times = _stamps(f"{path}: {topics.image}", images)
+        name, body_to_camera = topics.camera_pose, np.eye(4)
+        if not found[name]:
+            name, body_to_camera = topics.vehicle_pose, mount_matrix(np.zeros(3), mount)
+        if not found[name]:
+            raise InputError(
+                f"{path}: no message on {topics.camera_pose} or {topics.vehicle_pose}; "
+                "record the poses, too"
+            )
+        where = f"{path}: {name}"
+        poses = np.stack([_pose(where, item) for item in found[name]]) @ body_to_camera
+        index = nearest_pose(str(path), name, times, _stamps(where, found[name]))
+        self.track = Track(str(path), times, poses[index])
+        own = _calibration(f"{path}: {topics.calibration}", found[topics.calibration])
+        self.camera = required_camera(path, own, camera)
+
+    def image(self, index: int) -> np.ndarray:
+        """Decode one image."""
+        where = f"{self._path}: frame {index}"
+        image = files.decode_image(where, self._images[index])
+        return checked_image(where, image, self.camera)
+
+    def depth(self, index: int) -> np.ndarray:
+        """Return infinite depth: a log has none."""
+        return no_depth(self.camera)
+
+
+def _read_messages(
+    path: Path, schemas: Mapping[str, str]
+) -> dict[str, list[dict[str, Any]]]:
+    """Return the messages of each topic in the order of the log."""
+    try:
+        from mcap.exceptions import McapError
+    except ImportError as error:
+        raise InputError(
+            f"{path}: MCAP logs need the package mcap ({error}); "
+            "pip install 'mi-nerfattack[mcap]'"
+        ) from error
+    raw = files.read_bytes(path, MAX_LOG_BYTES)
+    found: dict[str, list[dict[str, Any]]] = {topic: [] for topic in schemas}
+    try:
+        for topic, schema, encoding, data in _messages(path, raw, found):
+            wanted = schemas[topic]
+            if schema != wanted or encoding != "json":
+                raise InputError(
+                    f"{path}: {topic} has {schema!r} messages in {encoding!r}; only "
+                    f"{wanted} in JSON is read"
+                )
+            where = f"{path}: {topic}: message {len(found[topic])}"
+            message = parse_json(where, data.decode("utf-8"))
+            if not isinstance(message, dict):
+                raise InputError(f"{where}: not an object")
+            found[topic].append(message)
+    except InputError:
+        raise
+    except (McapError, struct.error, ValueError, KeyError, OverflowError) as error:
+        raise InputError(
+            f"{path}: damaged or truncated log ({type(error).__name__}: {error}); copy "
+            "it again, or repair it with 'mcap recover'"
+        ) from error
+    return found
+
+
+def _messages(
+    path: Path, raw: bytes, topics: Mapping[str, Any]
+) -> Iterator[tuple[str, str, str, bytes]]:
+    """Yield topic, schema, encoding and data of the messages on given topics."""
+    from mcap.records import Channel, Chunk, Message, Schema
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    channels: dict[int, Any] = {}
+    schemas: dict[int, str] = {0: ""}
+    reader = StreamReader(io.BytesIO(raw), emit_chunks=True, record_size_limit=len(raw))
+    for outer in reader.records:
+        is_chunk = isinstance(outer, Chunk)
+        chunk = breakup_chunk(_inflated(path, outer), True) if is_chunk else [outer]
+        for record in chunk:
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels[record.channel_id]
+                if channel.topic in topics:
+                    schema = schemas[channel.schema_id]
+                    yield channel.topic, schema, channel.message_encoding, record.data
+
+
+def _inflated(path: Path, chunk: Any) -> Any:
+    """Decompress a chunk to just the size that it announces."""
+    from dataclasses import replace
+
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise InputError(
+            f"{path}: a chunk of {size} bytes; at most {MAX_CHUNK_BYTES} are read"
+        )
+    if chunk.compression == "zstd":
+        data = _unzstd(chunk.data, size)
+    elif chunk.compression == "lz4":
+        data = _unlz4(chunk.data, size)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise InputError(
+            f"{path}: compression {chunk.compression!r}; only zstd and lz4 are read"
+        )
+    if len(data) != size:
+        raise ValueError(f"a chunk of {len(data)} bytes that announces {size}")
+    return replace(chunk, compression="", data=data)
+
+
+def _unzstd(data: bytes, size: int) -> bytes:
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            return reader.read(size + 1)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from error
+
+
+def _unlz4(data: bytes, size: int) -> bytes:
+    import lz4.frame
+
+    try:
+        return lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
+    except (RuntimeError, EOFError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _stamps(where: str, messages: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    times = []
+    for index, message in enumerate(messages):
+        stamp = message.get("timestamp")
+        parts = (
+            [stamp.get(k) for k in ("sec", "nsec")] if isinstance(stamp, dict) else []
+        )
+        if not parts or not all(type(part) is int for part in parts):
+            raise InputError(
+                f"{where}: message {index}: timestamp {stamp!r}; needs sec and nsec, "
+                "whole numbers"
+            )
+        times.append(parts)
+    # seconds since 1970 leave 0.2 microseconds of a float64
+    seconds = np.array([sec + 1e-9 * nsec for sec, nsec in times])
+    check_times(where, seconds)
+    return seconds
+
+
+def _compressed(where: str, message: Mapping[str, Any]) -> bytes:
+    try:
+        return base64.b64decode(message.get("data", ""), validate=True)
+    except (TypeError, ValueError, binascii.Error) as error:
+        raise InputError(f"{where}: data is not base64 ({error})") from error
+
+
+def _pose(where: str, message: Mapping[str, Any]) -> np.ndarray:
+    pose = message.get("pose")
+    try:
+        position = [float(pose["position"][key]) for key in "xyz"]  # pyright: ignore
+        turn = [float(pose["orientation"][key]) for key in "wxyz"]  # pyright: ignore
+    except (TypeError, KeyError, ValueError) as error:
+        raise InputError(
+            f"{where}: pose {pose!r}; needs position x, y, z and orientation x, y, z, w"
+        ) from error
+    return pose_matrix(where, position, turn)
+
+
+def _calibration(where: str, messages: Sequence[Mapping[str, Any]]) -> Camera | None:
+    """Return the camera of the last calibration; None if there is none."""
+    if not messages:
+        return None
+    message = messages[-1]
+    model = message.get("distortion_model", "plumb_bob") or "plumb_bob"
+    try:
+        size = [int(message[key]) for key in ("width", "height")]
+        k = np.array(message["K"], np.float64).reshape(3, 3)
+        d = [*map(float, message.get("D") or []), 0.0, 0.0, 0.0, 0.0]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: needs width, height, K and D ({error})") from error
+    if model != "plumb_bob" or any(d[4:]):
+        raise InputError(
+            f"{where}: distortion_model {model!r}, D {d[:-4]}; only plumb_bob with k1, "
+            "k2, p1, p2 is read"
+        )
+    try:
+        # counted from the centre of the first pixel there, from its corner here
+        pinhole = map(float, (k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5))
+        return Camera(size[0], size[1], *pinhole, *d[:4])
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error

@@ -1,0 +1,166 @@
+"""Recorded drives as videos with a pose file."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.replay.folder import required_camera
+from mi_nerfattack.deploy.replay.poses import SUFFIXES, PoseTable, read_poses
+from mi_nerfattack.deploy.replay.recording import (
+    AbstractRecording,
+    Track,
+    check_times,
+    checked_image,
+    nearest_pose,
+    no_depth,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm")
+MAX_VIDEO_BYTES = 1 << 32
+
+
+class VideoRecording(AbstractRecording):
+    """A video, and beside it a pose file of the same name (`drive.mp4`, `drive.csv`).
+
+    Poses without times are those of the frames in their order, and as many; poses with
+    times go to the frame nearest to them, and no frame may be without. Frames are
+    decoded when they are asked for; going back starts again from the first.
+
+    Args:
+        path: any container and codec that PyAV decodes.
+        camera: intrinsics, for pose files without.
+        mount: of the camera, for poses of the vehicle.
+    """
+
+    def __init__(self, path: Path, camera: Camera | None, mount: CameraMount) -> None:
+        self._path = path
+        self._raw = files.read_bytes(path, MAX_VIDEO_BYTES)
+        source = _pose_file(path)
+        width, height, times = self._scan()
+        table = read_poses(source, mount, (height, width, 3))
+        self.camera = required_camera(source, table.camera, camera)
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise InputError(
+                f"{path}: {width} x {height} px; the camera has {self.camera.width} x "
+                f"{self.camera.height} px"
+            )
+        self.track = Track(str(path), times, _assign(path, table, times))
+        self._frames: Iterator[Any] = iter(())
+        self._at = len(times)  # the frame shown: beyond the end, so that it starts anew
+        self._shown = np.zeros((0, 0, 3), np.uint8)
+
+    def image(self, index: int) -> np.ndarray:
+        """Decode up to one frame."""
+        if index < self._at:
+            self._frames, self._at = self._decode(), -1
+        while self._at < index:
+            frame = next(self._frames, None)
+            if frame is None:
+                raise InputError(
+                    f"{self._path}: ends at frame {self._at + 1} of "
+                    f"{len(self.track.times)}; truncated: copy it again"
+                )
+            self._at += 1
+            if self._at == index:
+                self._shown = frame.to_ndarray(format="rgb24")
+        where = f"{self._path}: frame {index}"
+        return checked_image(where, self._shown, self.camera)
+
+    def depth(self, index: int) -> np.ndarray:
+        """Return infinite depth: a video has none."""
+        return no_depth(self.camera)
+
+    def close(self) -> None:
+        """Stop decoding."""
+        self._frames, self._at = iter(()), len(self.track.times)
+
+    def _scan(self) -> tuple[int, int, np.ndarray]:
+        """Return width and height in pixels, and the times of all frames, seconds."""
+        from av.error import FFmpegError
+
+        try:
+            with _open(self._raw) as container:
+                stream = _video_stream(self._path, container)
+                width, height = stream.codec_context.width, stream.codec_context.height
+                if not 0 < width * height <= files.MAX_IMAGE_PIXELS:
+                    raise InputError(
+                        f"{self._path}: {width} x {height} px; at most "
+                        f"{files.MAX_IMAGE_PIXELS} pixels are read"
+                    )
+                # what a cut keeps before its first frame is decoded, but not shown
+                packets = [(p.pts, p.is_discard) for p in container.demux(stream)]
+                announced, base = stream.frames, stream.time_base
+        except FFmpegError as error:
+            raise self._damaged(error) from error
+        found = [(stamp, hidden) for stamp, hidden in packets if stamp is not None]
+        stamps = [stamp for stamp, hidden in found if not hidden]
+        if not stamps or base is None or announced > len(found):
+            raise InputError(
+                f"{self._path}: {len(found)} of {announced} frames are there; "
+                "truncated: copy it again"
+            )
+        times = np.sort(np.array([float(stamp * base) for stamp in stamps]))
+        check_times(str(self._path), times)
+        return width, height, times
+
+    def _decode(self) -> Iterator[Any]:
+        from av.error import FFmpegError
+
+        try:
+            with _open(self._raw) as container:
+                stream = _video_stream(self._path, container)
+                limit = str(files.MAX_IMAGE_PIXELS)
+                stream.codec_context.options = {"max_pixels": limit}
+                yield from container.decode(stream)
+        except FFmpegError as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> InputError:
+        return InputError(
+            f"{self._path}: damaged or truncated video ({error}); copy it again"
+        )
+
+
+def _open(raw: bytes) -> Any:
+    import av
+
+    return av.open(io.BytesIO(raw), metadata_errors="replace")
+
+
+def _video_stream(path: Path, container: Any) -> Any:
+    if not container.streams.video:
+        raise InputError(f"{path}: has no pictures; truncated, or only sound")
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise InputError(f"{path}: a codec that PyAV does not know; use H.264")
+    return stream
+
+
+def _pose_file(path: Path) -> Path:
+    candidates = [path.with_suffix(suffix) for suffix in SUFFIXES]
+    found = [item for item in candidates if item.is_file()]
+    if not found:
+        names = ", ".join(item.name for item in candidates)
+        raise InputError(f"{path}: no pose file beside it; add one of {names}")
+    return found[0]
+
+
+def _assign(path: Path, table: PoseTable, times: np.ndarray) -> np.ndarray:
+    """Return the pose (n, 4, 4) of each frame."""
+    poses = table.camera_to_world
+    if table.times is None:
+        if len(poses) != len(times):
+            raise InputError(
+                f"{table.where}: {len(poses)} poses, but {path} has {len(times)} "
+                "frames; give one for each, or times"
+            )
+        return poses
+    return poses[nearest_pose(str(path), str(table.where), times, table.times)]

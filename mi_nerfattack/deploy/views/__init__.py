@@ -1,0 +1,1 @@
+"""What the camera of an environment sees."""

@@ -1,0 +1,156 @@
+"""Paste radiance fields into images by depth, as if they were opaque (appendix B.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.composite import DepthComposite
+from mi_nerfattack.render.march import STOP, March, Rays
+from mi_nerfattack.render.posed import PosedField
+
+#: Opacity from which on a field's pixel counts as solid.
+OPAQUE = 0.5
+#: Largest coordinate of a camera, metres, where 32 bits are 8 mm apart.
+FARTHEST_M = 1e5
+
+
+class Paster:
+    """Pastes objects into the frames of one camera.
+
+    Where the objects' opacity reaches 0.5 and their expected depth is nearer than the
+    frame's, a pixel takes the objects' colour ``I / a`` and their depth; elsewhere it
+    stays. The colour is the field's own: neither the light nor the exposure of the
+    frame changes it. After the first frame no kernel is compiled. Poses and textures
+    of the objects may change between frames; for other objects make another.
+
+    Args:
+        camera: intrinsics of the frames.
+        objects: may be none.
+
+    Source: appendix B.3.
+    """
+
+    def __init__(self, camera: Camera, objects: Sequence[PosedField]) -> None:
+        require_fields(objects)
+        self.camera, self.objects = camera, list(objects)
+        self._rays = PixelRays(camera)
+        self._frozen = freeze_method(self._record, self._state)
+
+    def march(self, camera_to_world: np.ndarray) -> March:
+        """March all objects along the rays of one image; there must be an object.
+
+        Raises:
+            InputError: the camera is so far away that single precision cannot tell
+                where an object ends.
+        """
+        place = np.asarray(camera_to_world)[:3, 3]
+        if not np.abs(place).max() <= FARTHEST_M:
+            raise InputError(
+                f"camera at {place.round(1).tolist()} m: objects are pasted in single "
+                f"precision, within {FARTHEST_M:g} m of the origin; put the origin of "
+                "poses and objects near the drive"
+            )
+        with dr.suspend_grad():
+            return self._frozen(self._rays.at(camera_to_world))
+
+    def paste(self, frame: CameraFrame) -> CameraFrame:
+        """Return the frame with the objects in it.
+
+        Raises:
+            InputError: the frame's size is not the camera's, or it is too far away.
+        """
+        size = (self.camera.height, self.camera.width)
+        if frame.depth.shape != size or frame.image.shape != (*size, 3):
+            raise InputError(
+                f"frame: image {frame.image.shape}, depth {frame.depth.shape}; the "
+                f"camera has {size[0]} x {size[1]} pixels"
+            )
+        if not self.objects:
+            return frame
+        layer = self.march(frame.camera_to_world)
+        mask, colour, depth = cut_out(layer, frame.depth)
+        image = np.where(mask[..., None], linear_to_uint8(colour), frame.image)
+        depth = np.where(mask, depth, frame.depth)
+        return CameraFrame(image, depth, frame.camera_to_world)
+
+    def _record(self, rays: Rays) -> March:
+        return DepthComposite().render(self.objects, rays, STOP).total
+
+    def _state(self, rays: Rays) -> list[Any]:
+        states = [posed.state() for posed in self.objects]
+        return [self, dr.width(rays.direction), states]
+
+
+def require_fields(objects: Sequence[Any]) -> None:
+    """Raise `InputError` unless all objects to show are posed fields."""
+    for item in objects:
+        if not isinstance(item, PosedField):
+            raise InputError(
+                f"objects: {type(item).__name__}; only posed fields can be shown"
+            )
+
+
+def paste_objects(
+    frame: CameraFrame, camera: Camera, objects: Sequence[PosedField]
+) -> CameraFrame:
+    """Paste objects into one frame; for a drive keep a `Paster`, which is faster.
+
+    Args:
+        frame: what the camera saw without them.
+        camera: intrinsics of the frame.
+        objects: may be none.
+    """
+    return Paster(camera, objects).paste(frame)
+
+
+def paste_layer(
+    rgb: np.ndarray, depth: np.ndarray, layer: March, threshold: float = OPAQUE
+) -> np.ndarray:
+    """Paste a march into a linear image as if it were opaque.
+
+    Args:
+        rgb: (height, width, 3), linear.
+        depth: (height, width), metres along the ray; infinite where there is nothing.
+        layer: march of height * width rays, row by row from the top left.
+        threshold: of the opacity.
+
+    Returns:
+        (height, width, 3), linear, float32.
+
+    Source: appendix B.3.
+    """
+    mask, colour, _ = cut_out(layer, depth, threshold)
+    return np.where(mask[..., None], colour, rgb).astype(np.float32)
+
+
+def cut_out(
+    layer: March, depth: np.ndarray, threshold: float = OPAQUE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find what a march covers of an image.
+
+    Args:
+        layer: march of height * width rays, row by row from the top left.
+        depth: (height, width), metres along the ray, of the image.
+        threshold: of the opacity.
+
+    Returns:
+        which pixels are covered (height, width), the march's linear colour ``I / a``
+        there (height, width, 3) and its expected depth (height, width), metres.
+    """
+    shape = depth.shape
+    opacity = layer.opacity.numpy().reshape(shape)
+    nearness = layer.depth.numpy().reshape(shape).copy()
+    mask = (opacity >= threshold) & (nearness < depth)
+    radiance = layer.radiance.numpy().T.reshape(*shape, 3)
+    colour = np.where(mask[..., None], radiance, 0)
+    return mask, colour / np.where(mask, opacity, 1)[..., None], nearness

@@ -1,0 +1,1 @@
+"""Closed-loop error and its intervals; fields against scenes."""

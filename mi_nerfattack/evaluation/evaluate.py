@@ -1,0 +1,380 @@
+"""Closed-loop error of a policy in deployment environments: its card."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.threads import one_thread
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.placement import Ground, Roadside, Scatter
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import card_figures
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.random_textures import random_texture
+from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.drive import Drive, departure_limits
+from mi_nerfattack.vehicle.expert import AbstractExpert
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Called with steps done and steps wanted, of all drives.
+OnSteps = Callable[[int, int], None]
+
+#: Cases of a card, and that of the expert's drives, which is none of its own there.
+CLEAN, RANDOM_OBJECTS, EXPERT = "clean", "random_objects", "expert"
+#: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
+STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """Choices of an evaluation; the same settings give the same drives.
+
+    Start, places and textures of a drive depend on seed, route and number of the
+    drive alone: they are the same in every environment, and more runs add drives.
+
+    Args:
+        runs: drives of each route, environment and case.
+        objects: with random textures beside the road at a time; 0 leaves the case
+            with random objects out.
+        seed: of starts, places and textures.
+        margin_m: arc length before the end of an open route at which a drive ends.
+        horizon: most steps of a drive.
+        scatter: of the starts.
+        ahead_m: arc length from a drive's start to the objects, least and, measured
+            back from its end, most.
+        car_width_m: for departures from the lane.
+        roadside: sizes and places of the objects.
+    """
+
+    runs: int = 20
+    objects: int = 1
+    seed: int = 0
+    margin_m: float = 2.0
+    horizon: int = 1000
+    scatter: Scatter = STARTS
+    ahead_m: tuple[float, float] = (8.0, 2.0)
+    car_width_m: float = 1.8
+    roadside: Roadside = field(default_factory=Roadside)
+
+    def __post_init__(self) -> None:
+        for name, least in (("runs", 1), ("objects", 0), ("seed", 0), ("horizon", 1)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise InputError(
+                    f"EvaluateSettings.{name}: {value!r}; a whole number of at least "
+                    f"{least}"
+                )
+
+    @property
+    def cases(self) -> tuple[str, ...]:
+        """Names of the cases."""
+        return (CLEAN, RANDOM_OBJECTS) if self.objects else (CLEAN,)
+
+    def steps(self, route: Route, period: float = 0.1) -> int:
+        """Return the number of steps of `period` seconds of a drive, at least 1."""
+        length = route.length - (0.0 if route.closed else self.margin_m)
+        count = int(length / (route.speed_ms * period) + 1e-6)
+        return max(1, min(self.horizon, count))
+
+
+def drive(
+    environment: AbstractEnvironment,
+    policy: AbstractPolicy,
+    route: Route,
+    pose: np.ndarray,
+    seed: int,
+    steps: int,
+    on_step: Callable[[int], None] | None = None,
+    case: str = CLEAN,
+    run: int = 0,
+) -> Drive:
+    """Let a policy drive in an environment.
+
+    Args:
+        environment: is reset; what it shows is left alone.
+        policy: sees sRGB images (1, height, width, 3) in [0, 1]; one with memory
+            starts with its initial one.
+        route: whose goal the policy gets, and to which errors are measured.
+        pose: (3,), of the start, metres and radians.
+        seed: of the environment.
+        steps: control periods; fewer where the environment is over before.
+        on_step: called after each with its index; an exception ends the drive.
+        case: of the result.
+        run: of the result.
+
+    Raises:
+        InputError: the policy does not take the camera's images, or its control is
+            not finite.
+    """
+    frame = environment.reset(route, np.asarray(pose, np.float64), seed)
+    memory = policy.initial_memory(1)
+    states, controls = [environment.state[:3]], []
+    for index in range(steps):
+        image = mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
+        row, memory = policy.step(image, route.goal, memory)
+        controls.append(float(np.array(row)[0]))
+        frame = environment.step(controls[-1])
+        states.append(environment.state[:3])
+        if on_step is not None:
+            on_step(index)
+        if environment.is_over:
+            break
+    return Drive(
+        environment=environment.name,
+        route=route.name,
+        case=case,
+        run=run,
+        seed=seed,
+        states=np.stack(states),
+        controls=np.array(controls),
+        cross_track_m=route.cross_track_numpy(np.stack(states[1:])),
+        time_s=environment.period * np.arange(1, len(controls) + 1),
+    )
+
+
+class ExpertPolicy(AbstractPolicy):
+    """Driver that looks at an environment's state in place of the images.
+
+    Args:
+        environment: in which it drives.
+        expert: of its route and its unit of control.
+    """
+
+    differentiable = False
+
+    def __init__(
+        self, environment: AbstractEnvironment, expert: AbstractExpert
+    ) -> None:
+        self.environment, self.expert = environment, expert
+
+    def initial_memory(self, count: int) -> Memory:
+        """Let the expert forget the drive before."""
+        self.expert.reset()
+        del count
+        return ()
+
+    def control(self, image: Any, goal: Any) -> Any:
+        """Ask the expert."""
+        del image, goal
+        control = self.expert.control(self.environment.state)
+        return dr.opaque(mi.Float, float(control[0]), 1)
+
+    def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
+        """Refuse: what it sees is no image."""
+        raise InputError("the expert sees no image and has no derivative")
+
+
+def random_start(
+    route: Route, settings: EvaluateSettings, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw a pose (3,) near the start of a route, metres and radians."""
+    return settings.scatter.states(route, np.zeros(1), rng)[0]
+
+
+def evaluate_run(
+    environment: AbstractEnvironment,
+    policy: AbstractPolicy,
+    route: Route,
+    case: str,
+    run: int,
+    objects: Sequence[GridField],
+    ground: Ground,
+    settings: EvaluateSettings,
+    on_step: Callable[[int], None] | None = None,
+) -> Drive:
+    """Drive once from a random start, alone or past objects of random texture.
+
+    Args:
+        environment: shows nothing but its world afterwards.
+        policy: drives.
+        route: from its start.
+        case: "clean" or "random_objects".
+        run: number of the drive, from 0.
+        objects: stand beside the road, in turns; their own textures come back.
+        ground: of the world.
+        settings: see there.
+        on_step: called after each step.
+    """
+    rng = _generator(settings, route, run)
+    pose, seed = random_start(route, settings, rng), int(rng.integers(2**31))
+    steps = settings.steps(route, environment.period)
+    shown = objects if case == RANDOM_OBJECTS else ()
+    with own_textures(shown):
+        posed = list(_roadside(route, shown, ground, settings, run, rng))
+        environment.show(posed)
+        try:
+            with one_thread():
+                return drive(
+                    environment, policy, route, pose, seed, steps, on_step, case, run
+                )
+        finally:
+            environment.show([])
+
+
+def evaluate(
+    policy: AbstractPolicy,
+    environments: Sequence[AbstractEnvironment],
+    routes: Sequence[Route],
+    objects: Sequence[GridField],
+    ground: Ground,
+    settings: EvaluateSettings,
+    progress: OnSteps = lambda done, total: None,
+) -> dict[str, Any]:
+    """Drive every route in every environment, and return the card.
+
+    Args:
+        policy: drives.
+        environments: with different names.
+        routes: with different names.
+        objects: at least `settings.objects` of them; none: no random case.
+        ground: where they can stand.
+        settings: see there.
+        progress: called after each step of a drive.
+
+    Returns:
+        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}}, see `card`.
+
+    Raises:
+        InputError: before the first drive, a lane that is too narrow for the car or a
+            route too short for objects; then whatever a drive raises.
+    """
+    cases = settings.cases if objects else (CLEAN,)
+    departure_limits(routes, settings.car_width_m)
+    if RANDOM_OBJECTS in cases:
+        check_roadside(routes, settings, len(objects))
+    jobs = [
+        (environment, route, case, run)
+        for environment in environments
+        for route in routes
+        for case in cases
+        for run in range(settings.runs)
+    ]
+    total = sum(settings.steps(route, env.period) for env, route, _, _ in jobs)
+    done, drives = 0, []
+
+    def count(step: int) -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    for environment, route, case, run in jobs:
+        arguments = (case, run, objects, ground, settings, count)
+        drives.append(evaluate_run(environment, policy, route, *arguments))
+    return card(drives, routes, settings.car_width_m)
+
+
+def card(
+    drives: Sequence[Drive], routes: Sequence[Route], car_width_m: float
+) -> dict[str, Any]:
+    """Summarise drives by environment, route and case.
+
+    Returns:
+        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}} of JSON types,
+        in the order of the drives; the figures are those of `card_figures`.
+    """
+    groups: dict[tuple[str, str, str], list[Drive]] = {}
+    for item in drives:
+        groups.setdefault((item.environment, item.route, item.case), []).append(item)
+    return make_card(groups, departure_limits(routes, car_width_m))
+
+
+def make_card(
+    drives: Mapping[tuple[str, str, str], Sequence[Drive]],
+    limits: Mapping[str, float],
+) -> dict[str, Any]:
+    """Summarise drives, and set the expert's figures beside the policy's.
+
+    Args:
+        drives: by environment, route and case.
+        limits: departure limit of each route, metres.
+    """
+    card: dict[str, Any] = {}
+    for (label, route, case), group in drives.items():
+        if case == EXPERT:
+            continue
+        figures = card_figures(group, limits[route])
+        expert = drives.get((label, route, EXPERT))
+        if case == CLEAN and expert is not None:
+            seen = card_figures(expert, limits[route])
+            names = ("n", "cross_track_mean_m", "cross_track_max_m", "departures")
+            figures["expert"] = {name: seen[name] for name in names}
+        card.setdefault(label, {}).setdefault(route, {})[case] = figures
+    return card
+
+
+@contextmanager
+def own_textures(objects: Sequence[GridField]) -> Iterator[None]:
+    """Give objects their own textures back at the end."""
+    own = [item.texture.numpy().copy() for item in objects]
+    try:
+        yield
+    finally:
+        for item, texture in zip(objects, own, strict=True):
+            item.set_parameter("texture", texture)
+
+
+def check_roadside(
+    routes: Sequence[Route], settings: EvaluateSettings, count: int
+) -> None:
+    """Check that objects find room beside routes.
+
+    Args:
+        routes: all must be long enough.
+        settings: see there.
+        count: number of fields at hand.
+
+    Raises:
+        InputError: a route is too short, or the fields are too few.
+    """
+    for route in routes:
+        first, last = _object_stretch(route, settings)
+        if first > last or settings.objects > count:
+            raise InputError(
+                f"EvaluateSettings: ahead_m {settings.ahead_m} on route "
+                f"{route.name!r} of {route.length:.1f} m, objects {settings.objects} "
+                f"of {count}; the route must be longer, and each object a field of its "
+                "own; or leave the objects out (objects 0)"
+            )
+
+
+def _object_stretch(route: Route, settings: EvaluateSettings) -> tuple[float, float]:
+    """Return the least and the most arc length of objects, metres."""
+    first, before = settings.ahead_m
+    return first, route.length - settings.margin_m - before
+
+
+def _generator(
+    settings: EvaluateSettings, route: Route, run: int
+) -> np.random.Generator:
+    """Return the source of all draws of a drive."""
+    return np.random.default_rng([settings.seed, zlib.crc32(route.name.encode()), run])
+
+
+def _roadside(
+    route: Route,
+    objects: Sequence[GridField],
+    ground: Ground,
+    settings: EvaluateSettings,
+    run: int,
+    rng: np.random.Generator,
+) -> Iterator[PosedField]:
+    """Give some of the objects random textures and places."""
+    if not objects:
+        return
+    check_roadside([route], settings, len(objects))
+    stretch = _object_stretch(route, settings)
+    for index in range(settings.objects):
+        item = objects[(run + index) % len(objects)]
+        texture = random_texture(item, "mixed", int(rng.integers(2**31)))
+        item.set_parameter("texture", texture)
+        pose = settings.roadside.place(item, route, stretch, ground, rng)
+        yield PosedField(item, pose)

@@ -1,0 +1,270 @@
+"""Cross-track metrics of closed-loop drives and the document `metrics.json`.
+
+The error is measured from the lane centre, positive to the left of the direction of
+travel. A step departs when its distance exceeds half a lane width less half a car
+width: the car then touches the lane's edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pydantic
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
+from mi_nerfattack.rollout.drive import CASES, ENVIRONMENTS, Drive
+
+SCHEMA = 1
+
+
+def summarise(
+    drives: Iterable[Drive], limits: Mapping[str, float], seed: int = 0
+) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+    """Summarise drives by route, environment and case.
+
+    The figures of one case of n runs, |e| being the distance from the lane centre:
+
+    - `n`: number of runs;
+    - `cross_track_mean_m`: mean of |e| over all steps of all runs;
+    - `cross_track_mean_ci95_m`: 95 % percentile bootstrap interval of the mean over
+      runs of each run's mean of |e|; null for a single run, which has no spread;
+    - `cross_track_mean_worst_run_m`: largest of the runs' means;
+    - `cross_track_max_m`: largest |e| of any step;
+    - `cross_track_total`: plain sum of |e| over the steps of a run (unit: metre-steps,
+      so it grows when the time step shrinks), averaged over the runs;
+    - `departures`: number of steps beyond the limit, summed over the runs;
+    - `runs_departed`: number of runs with at least one such step;
+    - `per_run`: the figures of each run, ordered by its index.
+
+    Args:
+        drives: in any order; lengths may differ.
+        limits: departure limit of each route, metres.
+        seed: seed of the bootstrap.
+
+    Returns:
+        {route: {environment: {case: figures}}} of plain Python values.
+
+    Raises:
+        InputError: for the same run twice, or a route without a limit.
+    """
+    groups: dict[tuple[str, str, str], dict[int, Drive]] = {}
+    for drive in drives:
+        key = (drive.route, drive.environment, drive.case)
+        runs = groups.setdefault(key, {})
+        if drive.run in runs:
+            raise InputError(f"{' / '.join(key)}: run {drive.run} twice; number runs")
+        runs[drive.run] = drive
+    result: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
+    for route, environment, case in sorted(groups, key=_order):
+        runs = groups[route, environment, case]
+        ordered = [runs[index] for index in sorted(runs)]
+        figures = _case_figures(ordered, limit_of(route, limits), seed)
+        result.setdefault(route, {}).setdefault(environment, {})[case] = figures
+    return result
+
+
+def card_figures(
+    drives: Sequence[Drive], limit: float, seed: int = 0
+) -> dict[str, Any]:
+    """Summarise the drives of one environment, route and case for a policy card.
+
+    - `n`, `cross_track_mean_m`, `cross_track_max_m`, `cross_track_mean_ci95_m`: as of
+      `summarise`;
+    - `departures`: number of drives that left the lane;
+    - `departure_rate_ci95`: 95 % interval of their share (Wilson);
+    - `per_run`: by run its seed and steps, its figures, its start (x, y, heading),
+      where and when its error was largest, and when it left the lane (null if it did
+      not).
+
+    Args:
+        drives: at least one.
+        limit: departure limit, metres.
+        seed: of the bootstrap.
+    """
+    ordered = sorted(drives, key=lambda drive: drive.run)
+    means = np.array([drive.distance_m.mean() for drive in ordered])
+    distances = np.concatenate([drive.distance_m for drive in ordered])
+    left = sum(bool(drive.departed(limit).any()) for drive in ordered)
+    return {
+        "n": len(ordered),
+        "cross_track_mean_m": float(distances.mean()),
+        "cross_track_max_m": float(distances.max()),
+        "departures": left,
+        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        "departure_rate_ci95": share_interval(left, len(ordered)),
+        "departure_limit_m": limit,
+        "per_run": [_card_run(drive, limit) for drive in ordered],
+    }
+
+
+def metrics_document(
+    scenario: Mapping[str, Any],
+    seed: int,
+    drives: Iterable[Drive],
+    limits: Mapping[str, float],
+    cost: Mapping[str, float],
+) -> dict[str, Any]:
+    """Build the validated content of `metrics.json`.
+
+    Args:
+        scenario: the scenario as run, in JSON types.
+        seed: the run's seed; also that of the bootstrap.
+        drives: all drives of the run, at least one.
+        limits: departure limit of each route, metres.
+        cost: `wall_s`, `peak_memory_mb` and `renders`; more keys are kept.
+
+    Returns:
+        A document for `files.write_json`.
+    """
+    routes = summarise(drives, limits, seed)
+    document = {
+        "schema": SCHEMA,
+        "scenario": dict(scenario),
+        "seed": seed,
+        "departure_limits_m": {route: limit_of(route, limits) for route in routes},
+        "routes": routes,
+        "cost": dict(cost),
+    }
+    validate(document)
+    return document
+
+
+def limit_of(route: str, limits: Mapping[str, float]) -> float:
+    """Return a route's departure limit; InputError if it has none or it is not > 0."""
+    if route not in limits:
+        known = ", ".join(sorted(limits)) or "none"
+        raise InputError(f"limits: no limit for route {route!r}; given: {known}")
+    limit = float(limits[route])
+    if not 0 < limit < float("inf"):
+        raise InputError(f"limits.{route}: {limit!r}; must be positive metres")
+    return limit
+
+
+def validate(document: Any) -> None:
+    """Check a metrics document against schema 1.
+
+    Raises:
+        InputError: naming the first key that is missing, of a wrong type, negative or
+            not finite, or a case whose `n` is not its number of runs.
+    """
+    try:
+        _Document.model_validate(document)
+    except pydantic.ValidationError as err:
+        first = err.errors()[0]
+        place = ".".join(["metrics", *map(str, first["loc"])])
+        value = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
+        raise InputError(f"{place}: {first['msg']}{value}; see schema 1") from err
+
+
+class _Model(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+
+
+class _Run(_Model):
+    run: pydantic.NonNegativeInt
+    seed: pydantic.NonNegativeInt
+    cross_track_mean_m: pydantic.NonNegativeFloat
+    cross_track_max_m: pydantic.NonNegativeFloat
+    cross_track_total: pydantic.NonNegativeFloat
+    departures: pydantic.NonNegativeInt
+
+
+class _Case(_Model):
+    n: pydantic.PositiveInt
+    cross_track_mean_m: pydantic.NonNegativeFloat
+    cross_track_max_m: pydantic.NonNegativeFloat
+    cross_track_total: pydantic.NonNegativeFloat
+    departures: pydantic.NonNegativeInt
+    per_run: list[_Run]
+
+    @pydantic.model_validator(mode="after")
+    def _count_runs(self) -> _Case:
+        if self.n != len(self.per_run):
+            raise ValueError(f"n is {self.n} but per_run has {len(self.per_run)} runs")
+        return self
+
+
+class _Cost(_Model):
+    wall_s: pydantic.NonNegativeFloat
+    peak_memory_mb: pydantic.NonNegativeFloat
+    renders: pydantic.NonNegativeInt
+
+
+class _Cases(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+    unperturbed: _Case | None = None
+    random: _Case | None = None
+    gradient: _Case | None = None
+
+
+class _Environments(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+    surrogate: _Cases | None = None
+    deployment: _Cases | None = None
+
+
+class _Document(_Model):
+    schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
+    scenario: dict[str, Any]
+    seed: pydantic.NonNegativeInt
+    routes: dict[str, _Environments] = pydantic.Field(min_length=1)
+    cost: _Cost
+
+
+def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any]:
+    per_run = [_run_figures(drive, limit) for drive in drives]
+    means = np.array([run["cross_track_mean_m"] for run in per_run])
+    distances = np.concatenate([drive.distance_m for drive in drives])
+    return {
+        "n": len(drives),
+        "cross_track_mean_m": float(distances.mean()),
+        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        "cross_track_mean_worst_run_m": float(means.max()),
+        "cross_track_max_m": float(distances.max()),
+        "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
+        "departures": sum(run["departures"] for run in per_run),
+        "runs_departed": sum(run["departures"] > 0 for run in per_run),
+        "per_run": per_run,
+    }
+
+
+def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
+    return {
+        "run": drive.run,
+        "seed": drive.seed,
+        "steps": len(drive.distance_m),
+        "cross_track_mean_m": float(drive.distance_m.mean()),
+        "cross_track_max_m": float(drive.distance_m.max()),
+        "cross_track_total": float(drive.distance_m.sum()),
+        "departures": int(drive.departed(limit).sum()),
+    }
+
+
+def _card_run(drive: Drive, limit: float) -> dict[str, Any]:
+    worst = int(drive.distance_m.argmax())
+    out = np.flatnonzero(drive.departed(limit))
+    return {
+        "run": drive.run,
+        "seed": drive.seed,
+        "steps": len(drive.distance_m),
+        "cross_track_mean_m": float(drive.distance_m.mean()),
+        "cross_track_max_m": float(drive.distance_m.max()),
+        "start": drive.states[0].tolist(),
+        "worst_at_m": drive.states[1 + worst, :2].tolist(),
+        "worst_time_s": float(drive.time_s[worst]),
+        "departed": bool(len(out)),
+        "departed_time_s": float(drive.time_s[out[0]]) if len(out) else None,
+    }
+
+
+def environment_order(name: str) -> tuple[int, str]:
+    """Return what sorts environments for documents and plots."""
+    known = ENVIRONMENTS.index(name) if name in ENVIRONMENTS else len(ENVIRONMENTS)
+    return known, name
+
+
+def _order(key: tuple[str, str, str]) -> tuple[str, tuple[int, str], int]:
+    return key[0], environment_order(key[1]), CASES.index(key[2])

@@ -1,0 +1,1 @@
+"""One attack as a job: stages, run folder, results."""

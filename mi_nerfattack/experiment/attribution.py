@@ -1,0 +1,112 @@
+"""When in a drive, and where on the objects, a finished attack's failure is made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.io import files
+from mi_nerfattack.report.plots.heat import side_views, write_heat
+from mi_nerfattack.report.plots.time import TimeAttribution, plot_attribution
+from mi_nerfattack.rollout.loop import OnStep
+from mi_nerfattack.rollout.sweep import StepRecorder
+
+#: The gradient of an attack on poses alone.
+UNCHANGED = "gradient by the unchanged texture"
+
+
+@dataclass(frozen=True, eq=False)
+class FailureAttribution:
+    """The gradient of a finished attack, taken apart.
+
+    Attributes:
+        times: by control periods.
+        norms: (T, k), Euclidean norms of each period's texture gradients.
+        textures: (n_vertices, 3) an object, the gradient by its texture.
+        subject: what the gradient is, in words.
+    """
+
+    times: TimeAttribution
+    norms: np.ndarray
+    textures: list[np.ndarray]
+    subject: str = "gradient"
+
+
+def attribute(
+    attack: GradientAttack,
+    objects: Sequence[str],
+    limit_m: float,
+    on_step: OnStep | None = None,
+) -> FailureAttribution:
+    """Drive with the best textures found, and take the gradient apart.
+
+    The share of a control period is ``<g_t, g> / <g, g>``, with g its sum over the
+    periods. Costs one drive forward and two backward.
+
+    Args:
+        attack: finished; its best parameters are installed.
+        objects: names, in the order of the sensor's objects.
+        limit_m: departure limit, metres.
+        on_step: called after each of the 3 x horizon control periods.
+    """
+    attack.restore_best()
+    rollout, route = attack.rollout, attack.route
+    evaluation = rollout.run(attack.initial, on_step)
+    total = rollout.gradient(evaluation, on_step=on_step)
+    textures = [texture.numpy().copy() for texture in total.textures]
+    recorder = StepRecorder(textures)
+    parts = rollout.gradient(evaluation, recorder=recorder, on_step=on_step)
+    assert parts.attribution is not None, "asked for by the recorder"
+    drive = evaluation.trajectory
+    states = drive.states_numpy()[:, 1:]
+    error = [route.cross_track_numpy(vehicle) for vehicle in states]
+    times = TimeAttribution(
+        drive.dt * np.arange(1, drive.horizon + 1),
+        total.costates,
+        parts.attribution.along,
+        np.stack(error, axis=1),
+        limit_m,
+        list(objects),
+    )
+    subject = "gradient" if attack.freedom.texture_rate is not None else UNCHANGED
+    return FailureAttribution(times, parts.attribution.norms, textures, subject)
+
+
+def write_attribution(
+    folder: Path, found: FailureAttribution, fields: Sequence[GridField]
+) -> dict[str, Path]:
+    """Write ``attribution.json``, ``attribution.png``, ``attribution_object.png``.
+
+    Args:
+        folder: the run folder.
+        found: from :func:`attribute`.
+        fields: the objects, with the textures that are to be seen.
+
+    Returns:
+        the pictures by title.
+    """
+    times = found.times
+    data = {
+        "time_s": times.time_s.tolist(),
+        "costates": times.costates.tolist(),
+        "cross_track_m": times.cross_track_m.tolist(),
+        "gradient_norm": _columns(times.objects, found.norms),
+        "gradient_share": _columns(times.objects, times.shares),
+    }
+    files.write_json(folder / "attribution.json", data)
+    when, where = folder / "attribution.png", folder / "attribution_object.png"
+    plot_attribution(when, times, found.subject)
+    pairs = zip(times.objects, fields, found.textures, strict=True)
+    write_heat(where, {name: side_views(grid, g) for name, grid, g in pairs})
+    note = f" ({UNCHANGED})" if found.subject == UNCHANGED else ""
+    titles = (f"{word} the failure is made{note}" for word in ("When", "Where"))
+    return dict(zip(titles, (when, where), strict=True))
+
+
+def _columns(names: Sequence[str], table: np.ndarray) -> dict[str, list[float]]:
+    return {name: table[:, i].tolist() for i, name in enumerate(names)}

@@ -1,0 +1,180 @@
+"""The main job: drives, random baseline, attack, transfer, run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.backend.determinism import deterministic
+from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.experiment.effort import Account, Effort
+from mi_nerfattack.experiment.run_folder import RunFolder
+from mi_nerfattack.experiment.stages import OnProgress, Stages
+from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.scenario.build.attack import build_attack
+from mi_nerfattack.scenario.build.world import World, build_world
+from mi_nerfattack.scenario.scenario import Scenario, portable_text
+from mi_nerfattack.system.interrupts import held_interrupts
+
+#: Called with a sentence.
+OnNotice = Callable[[str], None]
+
+
+def _quiet(*arguments: Any) -> None:
+    del arguments
+
+
+@dataclass
+class Job:
+    """One scenario on its way through all stages.
+
+    Attributes:
+        scenario: what to do.
+        text: the scenario file, kept in the run folder.
+        base: folder that the scenario's relative paths start from.
+        policy: the policy under test.
+        output: the run folder.
+        on_progress: told about every time step.
+        on_notice: told what a resumed run ignores, or that there is none.
+    """
+
+    scenario: Scenario
+    text: str
+    base: Path
+    policy: Any
+    output: Path
+    on_progress: OnProgress = _quiet
+    on_notice: OnNotice = _quiet
+
+    def run(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
+        """Do the whole job and write the run folder.
+
+        Args:
+            resume: go on from what an interrupted run left in the folder; from the
+                beginning if that is nothing.
+            force: resume although scenario, files or versions have changed: the
+                attack goes on, the drives are repeated.
+
+        Returns:
+            the document that ``metrics.json`` holds.
+
+        Raises:
+            InputError: a file is missing or wrong, the folder is not empty or in use,
+                or the run in it is damaged, or of another scenario or versions.
+            SetupError: the scenario is deterministic and the variant cannot be.
+        """
+        started = time.perf_counter()
+        identity = {**versions(), **self.scenario.identity(self.base)}
+        text = portable_text(self.text, self.base)
+        route, seed = self.scenario.scene.route, self.scenario.seed
+        strict = self.scenario.attack.deterministic
+        with (
+            deterministic() if strict else nullcontext(),
+            RunFolder(self.output, text, identity, route, seed) as folder,
+        ):
+            if resume:
+                folder.read(force, self.on_notice)
+            else:
+                folder.check_new()
+            return self._work(folder, Account(started, folder.effort))
+
+    def _work(self, folder: RunFolder, account: Account) -> dict[str, Any]:
+        """Do what is not done yet."""
+        world = build_world(self.scenario, self.base, self.policy)
+        departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
+        folder.begin()
+
+        def effort() -> Effort:
+            renders = world.surrogate.renders + world.deployment.renders
+            return account.total(renders, folder.checkpoint.seconds)
+
+        def remarks() -> dict[str, str]:
+            return effort().about()
+
+        stages = Stages(world, folder.drives, self.on_progress, remarks)
+        original = world.appearance()
+        stages.drive_all(world.surrogate, "unperturbed")
+        stages.drive_random(world.surrogate)
+        world.show(original)
+        attack = self._attack(world, folder, remarks)
+        attacked = world.appearance()
+        stages.drive_all(world.surrogate, "gradient")
+        world.show(original)
+        stages.drive_all(world.deployment, "unperturbed")
+        stages.drive_random(world.deployment)
+        world.show(attacked)
+        stages.drive_all(world.deployment, "gradient")
+        from mi_nerfattack.experiment.results import write_results  # it loads the plots
+
+        return write_results(
+            self.output,
+            world,
+            stages.drives,
+            attack,
+            {"unperturbed": original, "gradient": attacked},
+            self.text,
+            asdict(effort()),
+            folder.checkpoint.ignored,
+            self._counter("surrogate: attribution", 3),
+        )
+
+    def _counter(self, stage: str, sweeps: int) -> Callable[[int], None]:
+        """Report the progress of some sweeps through a drive, step by step."""
+        done, total = 0, sweeps * self.scenario.drive.horizon
+
+        def on_step(step: int) -> None:
+            nonlocal done
+            del step
+            done += 1
+            self.on_progress(stage, done, total, "")
+
+        return on_step
+
+    def _attack(
+        self, world: World, folder: RunFolder, remarks: Callable[[], dict[str, str]]
+    ) -> GradientAttack:
+        """Do the iterations that are missing; whatever stops them, keep those done."""
+        attack = build_attack(world)
+        section, checkpoint = self.scenario.attack, folder.checkpoint
+        if checkpoint.found:
+            checkpoint.restore(attack)
+        if not attack.best_is_judged:
+            attack.judge_best(self._counter("surrogate: best so far", 1))
+            checkpoint.save(attack, remarks())
+        try:
+            with held_interrupts() as check:
+                while attack.iteration < section.iterations:
+                    self._iterate(attack, check)
+                    if attack.iteration % section.checkpoint_every == 0:
+                        checkpoint.save(attack, remarks())
+                    check()
+        finally:
+            done = attack.iteration > checkpoint.iteration
+            if done and attack.whole and not checkpoint.failed:
+                checkpoint.save(attack, remarks())
+        attack.measure()
+        attack.restore_best()
+        return attack
+
+    def _iterate(self, attack: GradientAttack, check: Callable[[], None]) -> None:
+        horizon = self.scenario.drive.horizon
+        total = 2 * horizon * self.scenario.attack.iterations
+        done = 2 * horizon * attack.iteration
+        remark = f"iteration {attack.iteration + 1}"
+        if attack.history:
+            mean = attack.history[-1].cross_track_mean_m
+            remark += f", |e| {mean:.3f} m (best {attack.best_mean_m:.3f})"
+
+        def on_step(step: int) -> None:
+            nonlocal done
+            del step
+            done += 1
+            self.on_progress("surrogate: attack", done, total, remark)
+            check()
+
+        attack.step(on_step)

@@ -1,0 +1,123 @@
+"""The run folder of an attack: what a killed run left, and what this one keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+from mi_nerfattack.attack.checkpoint import CheckpointFile
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.effort import Effort, latest
+from mi_nerfattack.experiment.kept_drives import KeptDrives
+from mi_nerfattack.io import files, locks
+
+CHECKPOINT = "checkpoint.safetensors"
+DRIVES = "drives.safetensors"
+SCENARIO = "scenario.toml"
+
+
+class RunFolder:
+    """A folder that one process at a time works in; a context manager.
+
+    Its files appear in this order: ``scenario.toml``, ``drives.safetensors`` (without
+    drives), ``checkpoint.safetensors``, results. A process may be killed between any
+    two of them, or before the folder exists.
+
+    Args:
+        path: the folder, may be missing.
+        text: the scenario file, its paths absolute.
+        identity: versions and scenario, see :meth:`Scenario.identity`.
+        route: name of the route.
+        seed: of the scenario.
+    """
+
+    def __init__(
+        self, path: Path, text: str, identity: Mapping[str, str], route: str, seed: int
+    ) -> None:
+        self.path = path
+        self._text = text
+        self.checkpoint = CheckpointFile(path / CHECKPOINT, identity)
+        self.drives = KeptDrives(path / DRIVES, identity, route, seed)
+        self.effort = Effort()
+        self._lock = ExitStack()
+        self._locked = False
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.close()
+
+    def check_new(self) -> None:
+        """Raise InputError unless the folder is missing or empty."""
+        if self.path.exists():
+            if not self.path.is_dir() or any(self.path.iterdir()):
+                raise InputError(
+                    f"{self.path}: exists and is not an empty folder; choose another, "
+                    "or continue the run in it with 'mi-nerfattack attack --resume'"
+                )
+
+    def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
+        """Take up what a run left; nothing is written.
+
+        A folder that is missing, or holds nothing but what a writer that was killed
+        left, is that of a run that came to nothing: it starts from the beginning.
+
+        Args:
+            force: ignore that the run was of another scenario or other versions: its
+                attack goes on, its drives are repeated.
+            on_notice: told about what is taken up and ignored.
+
+        Raises:
+            InputError: the folder is no run's, another process works in it, a file is
+                damaged, or the run was of another scenario or other versions.
+        """
+        if not self._holds_run(force, on_notice):
+            on_notice(f"{self.path}: holds no run yet; it starts from the beginning")
+            return
+        self._enter()
+        about = self.checkpoint.read(force)
+        of_drives, ignored = self.drives.read(force)
+        self.effort = latest(about, of_drives)
+        if not self.checkpoint.found:
+            self.drives.drop("gradient")
+        for line in dict.fromkeys([*self.checkpoint.ignored, *ignored]):
+            on_notice(f"{self.path}: ignored, as told: {line}")
+
+    def begin(self) -> None:
+        """Make the folder ready to work in."""
+        files.make_folder(self.path)
+        self._enter()
+        locks.remove_partial(self.path)
+        files.write_text(self.path / SCENARIO, self._text)
+        self.drives.add([], self.effort.about())
+
+    def _enter(self) -> None:
+        if not self._locked:
+            self._lock.enter_context(locks.exclusive(self.path))
+            self._locked = True
+
+    def _holds_run(self, force: bool, on_notice: Callable[[str], None]) -> bool:
+        """Tell a run from nothing; InputError for something else."""
+        if not self.path.exists():
+            return False
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: is not a folder; choose another name")
+        present = [p for p in self.path.iterdir() if not locks.is_partial(p)]
+        scenario = self.path / SCENARIO
+        if present and scenario not in present:
+            raise InputError(
+                f"{self.path}: is no run folder; there is nothing to resume"
+            )
+        kept = {self.checkpoint.path, self.drives.path}
+        if present and not kept & set(present):
+            if files.read_text(scenario) != self._text:
+                what = f"{scenario}: is another scenario, and nothing was done of it"
+                if not force:
+                    raise InputError(
+                        f"{what}; choose another folder, remove the file, or replace "
+                        "it (--force)"
+                    )
+                on_notice(f"{what}; replaced, as told")
+        return bool(present)

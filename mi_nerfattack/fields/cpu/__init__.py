@@ -1,0 +1,1 @@
+"""Fields on a CPU: NumPy networks and packed parameters."""

@@ -1,0 +1,149 @@
+"""The two networks of an NGP over many points, as products of matrices on a CPU.
+
+A kernel that differentiates the networks point by point adds each point's part to
+every weight by an atomic operation, which takes most of its time. As products of
+matrices the derivatives by the weights are products again, and NumPy's library for
+these (BLAS) is two to three times faster than Dr.Jit's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from mi_nerfattack.system.cores import cores
+
+BLOCK = 1 << 12  # points whose activations exist side by side, in a cache
+
+
+@dataclass(frozen=True)
+class MLP:
+    """Linear layers without bias, with rectifiers between them.
+
+    Attributes:
+        weights: a matrix (outputs, inputs) for each layer, float32.
+    """
+
+    weights: list[np.ndarray]
+
+    def forward(self, x: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the outputs for rows x (n, inputs), and the inputs of each layer."""
+        inputs = [x]
+        for weight in self.weights[:-1]:
+            x = x @ weight.T
+            np.maximum(x, 0, out=x)
+            inputs.append(x)
+        return x @ self.weights[-1].T, inputs
+
+    def backward(
+        self, inputs: list[np.ndarray], slope: np.ndarray
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return derivatives by x (n, inputs) and by each weight.
+
+        Args:
+            inputs: from :meth:`forward`.
+            slope: (n, outputs), derivative of an objective by the outputs.
+        """
+        by_weight = []
+        for k in range(len(self.weights) - 1, -1, -1):
+            by_weight.append(slope.T @ inputs[k])
+            slope = slope @ self.weights[k]
+            if k:
+                slope *= inputs[k] > 0
+        return slope, by_weight[::-1]
+
+
+class Networks:
+    """Density and colour network over rows, block by block on all cores.
+
+    Results do not depend on the number of cores.
+
+    Args:
+        density: from features to geometry, whose first entry is the raw density.
+        colour: from geometry and view to raw colours.
+    """
+
+    def __init__(self, density: MLP, colour: MLP) -> None:
+        self.density, self.colour = density, colour
+        self._kept: list[tuple[list[np.ndarray], list[np.ndarray]]] = []
+
+    def raw_density(self, features: np.ndarray, out: np.ndarray) -> None:
+        """Evaluate the raw density alone.
+
+        Args:
+            features: (n, k).
+            out: (n,), is filled.
+        """
+        *hidden, last = self.density.weights
+        first = MLP([*hidden, last[:1]])
+
+        def work(part: slice) -> None:
+            out[part] = first.forward(features[part])[0][:, 0]
+
+        _each(work, len(features))
+
+    def forward(self, features: np.ndarray, view: np.ndarray, out: np.ndarray) -> None:
+        """Evaluate, and keep what :meth:`backward` needs.
+
+        Args:
+            features: (n, k), of the encoding.
+            view: (n, m), of the directions.
+            out: (n, 4), is filled with raw density and raw colours.
+        """
+
+        def work(part: slice) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            geometry, first = self.density.forward(features[part])
+            joined = np.concatenate([geometry, view[part]], axis=1)
+            raw, second = self.colour.forward(joined)
+            out[part, 0], out[part, 1:] = geometry[:, 0], raw
+            return first, second
+
+        self._kept = _each(work, len(features))
+
+    def backward(
+        self, slope: np.ndarray, out: np.ndarray
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Differentiate what the last :meth:`forward` gave.
+
+        Args:
+            slope: (n, 4), derivative of an objective by the outputs.
+            out: (n, k), is filled with the derivative by the features.
+
+        Returns:
+            the derivatives by the weights of the density and of the colour network.
+        """
+        outputs = self.density.weights[-1].shape[0]
+
+        def work(part: slice) -> list[np.ndarray]:
+            first, second = self._kept[part.start // BLOCK]
+            joined, by_colour = self.colour.backward(second, slope[part, 1:])
+            geometry = joined[:, :outputs]
+            geometry[:, 0] += slope[part, 0]
+            out[part], by_density = self.density.backward(first, geometry)
+            return by_density + by_colour
+
+        blocks = _each(work, len(slope))
+        self._kept = []
+        total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
+        split = len(self.density.weights)
+        return total[:split], total[split:]
+
+
+def _each(work: Callable[[slice], Any], count: int) -> list[Any]:
+    """Do work on blocks of rows, and return the results in order."""
+    parts = (slice(s, min(s + BLOCK, count)) for s in range(0, count, BLOCK))
+    if not _WORKERS:
+        pool = ThreadPoolExecutor(cores())
+        _WORKERS.append((pool, ThreadpoolController()))
+    pool, libraries = _WORKERS[0]
+    # products this small are faster side by side than each on several threads
+    with libraries.limit(limits=1, user_api="blas"):
+        return list(pool.map(work, parts))
+
+
+_WORKERS: list[tuple[ThreadPoolExecutor, ThreadpoolController]] = []

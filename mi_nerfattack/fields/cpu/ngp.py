@@ -1,0 +1,107 @@
+"""An NGP laid out for marches on a CPU whose parameters are constants."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import drjit.nn as nn
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.fields.cpu.grid import PackedGrid
+from mi_nerfattack.fields.cpu.rows import networks
+from mi_nerfattack.fields.ngp import NGPField
+
+
+class PackedNGP:
+    """A copy of an NGP's parameters with less to do at a sample.
+
+    The last layer of the density network and the first of the colour network are
+    linear: they become one matrix. What the view adds to that layer is computed once a
+    ray. Matrices are stored by columns, the order in which a product reads them; by
+    rows it takes 1.3 times as long. Values are those of :meth:`NGPField.eval` but for
+    rounding.
+
+    Args:
+        field: the field, on the LLVM backend, with an even number of features.
+    """
+
+    def __init__(self, field: NGPField) -> None:
+        self._field = field
+        self._source = _identities(field)
+        self._grid = PackedGrid(field.encoding)
+        host = networks(field)
+        *hidden, last = host.density.weights
+        first, *rest = host.colour.weights
+        split = len(last)
+        joined = first[:, :split].astype(np.float64) @ last
+        groups = [hidden, [np.vstack([last[:1], joined])], [first[:, split:]], rest]
+        packed = nn.pack([_tensor(w.T) for group in groups for w in group])
+        views = iter(packed)
+        parts = [[next(views) for _ in group] for group in groups]
+        self._hidden, (self._joined,), (self._view,), self._rest = parts
+        self._weights = packed[0].buffer
+        dr.make_opaque(self._weights)
+
+    def is_current(self) -> bool:
+        """Tell whether the field's parameters are those that were copied."""
+        pairs = zip(self._source, _identities(self._field), strict=True)
+        return all(a.index == b.index for a, b in pairs)
+
+    def arrays(self) -> list[Any]:
+        """Return what :meth:`eval` reads, for `drjit.freeze`."""
+        return [self._grid.table.array, self._weights]
+
+    def view(self, heading: mi.Vector3f) -> list[mi.Float]:
+        """Return what directions add to the first layer of the colour network.
+
+        Args:
+            heading: (3, n), unit vectors in the field's frame.
+
+        Returns:
+            (n,) for each neuron.
+        """
+        harmonics = dr.sh_eval(mi.Vector3f(heading), self._field.sh_order)
+        return _product(self._view, [mi.Float(x) for x in harmonics])
+
+    def eval(
+        self, point: mi.Point3f, view: list[mi.Float], active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate density and radiance; as :meth:`NGPField.eval`.
+
+        Args:
+            point: (3, n), metres in the field's frame.
+            view: from :meth:`view`.
+            active: (n,) mask; masked lanes give zeros.
+        """
+        x = self._grid.encode(self._field.clipped(point), active)
+        for weight in self._hidden:
+            x = _rectify(_product(weight, x))
+        raw_density, *x = _product(self._joined, x)
+        pairs = zip(x, view, strict=True)
+        x = [a + b for a, b in pairs]
+        for weight in self._rest:
+            x = _product(weight, _rectify(x))
+        density, colour = self._field.activate(raw_density, x)
+        return density & active, colour & active
+
+
+def _product(weight: nn.MatrixView, x: list[mi.Float]) -> list[mi.Float]:
+    return [mi.Float(y) for y in nn.matvec(weight, nn.CoopVec(*x), transpose=True)]
+
+
+def _rectify(x: list[mi.Float]) -> list[mi.Float]:
+    return [dr.maximum(value, 0) for value in x]
+
+
+def _tensor(weight: np.ndarray) -> mi.TensorXf:
+    return mi.TensorXf(np.ascontiguousarray(weight, np.float32))
+
+
+def _identities(field: NGPField) -> list[Any]:
+    """Return the arrays themselves: an array that is held keeps its index."""
+    return [dr.detach(field.parameters()[k]) for k in _COPIED]
+
+
+_COPIED = ("table", "density_weights", "colour_weights")

@@ -1,0 +1,1 @@
+"""Optimise a field to posed images."""

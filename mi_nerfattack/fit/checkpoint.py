@@ -1,0 +1,119 @@
+"""Checkpoints of a fit: one safetensors file, replaced atomically."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import astuple, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fit.options import FitProgress
+from mi_nerfattack.fit.training import Training
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import read_kept, write_kept
+
+FORMAT = "mi_nerfattack fit checkpoint 2"
+_REMEDY = (
+    "resume with the same images, depth, options and versions, or delete the file to "
+    "start again"
+)
+_EVERY_S = 30.0
+_MAX_SHARE = 0.02  # of the time that may go into writing
+
+
+class FitCheckpoint:
+    """Keeps the state of a fit on disk.
+
+    Args:
+        path: file, replaced atomically.
+        training: the fit.
+        resume: continue from the file if it exists; False refuses one that does.
+
+    Attributes:
+        elapsed_s: wall time of the fit before it was interrupted.
+        history: reports before it was interrupted.
+
+    Raises:
+        InputError: the file exists and `resume` is False, cannot be read, or belongs
+            to other images, depth, options or versions.
+    """
+
+    def __init__(self, path: Path, training: Training, resume: bool) -> None:
+        self.path, self.training = path, training
+        self.elapsed_s = 0.0
+        self.history: list[FitProgress] = []
+        self._header = {"format": FORMAT, **versions(), "fit": _digest(training)}
+        check_unfinished(path, resume)
+        if path.exists():
+            self._load()
+        files.check_writable(path)
+        self._written = time.perf_counter()
+        self._cost_s = 0.0
+
+    def save_if_due(self, elapsed_s: float, history: Sequence[FitProgress]) -> None:
+        """Save if the last time is long enough ago, for what saving costs."""
+        waited = time.perf_counter() - self._written
+        if waited >= max(_EVERY_S, self._cost_s / _MAX_SHARE):
+            self.save(elapsed_s, history)
+
+    def save(self, elapsed_s: float, history: Sequence[FitProgress]) -> None:
+        """Write the complete state."""
+        start = time.perf_counter()
+        tensors = self.training.tensors()
+        rows = [astuple(replace(at, steps=at.steps or -1)) for at in history]
+        shape = len(rows), len(fields(FitProgress))
+        tensors["history"] = np.array(rows, np.float64).reshape(shape)
+        tensors["elapsed"] = np.array([elapsed_s])
+        write_kept(self.path, tensors, self._header, {})
+        self._written = time.perf_counter()
+        self._cost_s = self._written - start
+
+    def _load(self) -> None:
+        tensors = read_kept(self.path, self._header, _REMEDY).tensors
+        try:
+            self.training.load_tensors(tensors)
+            self.elapsed_s = float(tensors["elapsed"][0])
+            rows = tensors["history"]
+        except KeyError as err:
+            raise InputError(
+                f"{self.path}: entry {err} is missing; the file is damaged"
+            ) from err
+        whole = [item.name for item in fields(FitProgress)]
+        for row in rows:
+            at = FitProgress(**dict(zip(whole, map(float, row), strict=True)))
+            steps = None if at.steps == -1 else int(at.steps or 0)
+            self.history.append(replace(at, step=int(at.step), steps=steps))
+
+
+def check_unfinished(path: Path, resume: bool) -> None:
+    """Raise InputError if there is a checkpoint that is not to be continued.
+
+    Args:
+        path: where the checkpoint of a fit would be.
+        resume: whether to continue from it.
+    """
+    if path.exists() and not resume:
+        raise InputError(
+            f"{path}: an unfinished fit; continue it (--resume), or delete the file "
+            "to start again"
+        )
+
+
+def _digest(training: Training) -> str:
+    """Hash what decides a fit: images, poses, depth, options, architecture, box."""
+    digest = hashlib.sha256()
+    images = training.images
+    digest.update(np.ascontiguousarray(images.images).data)
+    digest.update(np.ascontiguousarray(images.camera_to_world).data)
+    if training.depth is not None:
+        digest.update(np.ascontiguousarray(training.depth).data)
+    digest.update(repr((images.camera, images.cameras, training.options)).encode())
+    place = training.field.metadata()
+    info = {key: place[key] for key in place if key not in training.field.info}
+    digest.update(repr((info, training.pixels)).encode())
+    return digest.hexdigest()[:16]

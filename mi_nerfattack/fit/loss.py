@@ -1,0 +1,114 @@
+"""What a fit minimises, and its derivative by what a march returns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fit.rays import RayBatch
+from mi_nerfattack.render.march import March
+
+# Rounding may lift a white pixel above 1, where the sRGB curve has no derivative.
+_BELOW_WHITE = 1 - 1e-5
+_MOMENT_DELTA = 0.1  # of the depth, relative
+_OPACITY_DELTA = 0.02  # small: a bright sky shines through a road of opacity 0.96
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights and shapes of the terms of the loss.
+
+    Attributes:
+        huber: where the colour's Huber loss turns linear, sRGB values.
+        depth: of the depth term, against that of colour; 0 ignores depths.
+        opacity: of the opacity term where depths tell it; 0 ignores it.
+        spread: of the spread of weights along a ray, which gathers fog on surfaces; of
+            an NGP on a CPU alone.
+    """
+
+    huber: float = 0.1
+    depth: float = 0.1
+    opacity: float = 0.05
+    spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("depth", "opacity", "spread"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; must not be negative")
+        if not 0 < self.huber < math.inf:
+            raise InputError(f"huber: {self.huber}; must be positive")
+
+
+def huber(error: Any, delta: float) -> Any:
+    """Return ``error^2 / (2 delta)`` up to `delta`, ``|error| - delta / 2`` beyond."""
+    size = dr.abs(error)
+    return dr.select(size < delta, error * error * (0.5 / delta), size - 0.5 * delta)
+
+
+def loss_and_cotangent(
+    primal: March,
+    background: Any,
+    batch: RayBatch,
+    weights: LossWeights,
+    share: Any,
+    gain: Any = None,
+) -> tuple[Any, Any, March]:
+    """Compare a march with the images.
+
+    Per ray, the mean over channels of the Huber loss between sRGB values, plus, where
+    the batch has depths, the Huber loss of relative error of the depth moment (for
+    rays that hit something) and of opacity; neither where depth is NaN, unknown.
+    Derivatives reach `background` and `gain` through Dr.Jit's graph.
+
+    Args:
+        primal: of the batch's rays, detached.
+        background: `mi.Color3f`, (3, n) linear, behind the field.
+        batch: rays and images.
+        weights: of the terms.
+        share: (n,), weight of each ray in the objective.
+        gain: (3, n), exposure of the rays' images; None for 1.
+
+    Returns:
+        loss (n,) and squared sRGB error (n,), both detached, and the derivative of the
+        objective by radiance, opacity and moment.
+    """
+    seen = March(
+        mi.Color3f(primal.radiance), mi.Float(primal.opacity), mi.Float(primal.moment)
+    )
+    leaves = (seen.radiance, seen.opacity, seen.moment)
+    dr.enable_grad(leaves)
+    behind = dr.detach(background)
+    wanted = linear_to_srgb(
+        batch.alpha * srgb_to_linear(batch.colour) + (1 - batch.alpha) * behind
+    )
+    linear = seen.radiance + (1 - seen.opacity) * background
+    if gain is not None:
+        linear *= gain
+    error = linear_to_srgb(linear * _BELOW_WHITE) - wanted
+    terms = [huber(channel, weights.huber) for channel in error]
+    loss = (terms[0] + terms[1] + terms[2]) / 3
+    if batch.depth is not None:
+        loss += _geometry_loss(seen, batch.depth, weights)
+    square = dr.detach(dr.squared_norm(mi.Vector3f(error))) / 3
+    dr.backward(loss * share)
+    cotangent = March(*(dr.grad(leaf) for leaf in leaves))
+    return dr.detach(loss), square, cotangent
+
+
+def _geometry_loss(seen: March, depth: Any, weights: LossWeights) -> Any:
+    is_known = ~dr.isnan(depth)
+    is_hit = dr.isfinite(depth)
+    known = dr.select(is_hit, depth, 1)
+    moment_error = dr.select(is_hit, seen.moment / known - 1, 0)
+    opacity_error = seen.opacity - dr.select(is_hit, mi.Float(1), 0)
+    loss = weights.depth * huber(moment_error, _MOMENT_DELTA) + (
+        weights.opacity * huber(opacity_error, _OPACITY_DELTA)
+    )
+    return dr.select(is_known, loss, 0)

@@ -1,0 +1,155 @@
+"""Settings, progress and result of a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.ngp import NGPField
+from mi_nerfattack.fit.loss import LossWeights
+from mi_nerfattack.fit.scores import ViewScore
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How a field is fitted.
+
+    Attributes:
+        steps: of the optimiser; None for as many as `epochs` take.
+        epochs: over the pixels of the fitted images, where `steps` is None.
+        budget_minutes: end after this time if the fit is not done by then; the
+            learning rate then decays by time. None sets no limit.
+        patience: end early if this many steps lower the loss by less than 1 % against
+            as many steps before; None never does.
+        batch_rays: rays a step, at most.
+        samples: of a step, about; as long as the occupancy is full, and rays therefore
+            long, a batch has fewer rays.
+        seed: of initialisation, pixels, sample positions and backgrounds. Results
+            still differ in the last bits unless Dr.Jit runs on one thread.
+        learning_rate: of Adam, constant in the first half of the fit.
+        final_rate: share of `learning_rate` that is left at the end; between, it
+            falls exponentially.
+        occupancy_resolution: cells along the longest edge of the box.
+        occupancy_every: steps between two looks at some cells; every fourth changes
+            the occupancy.
+        occupancy_start: steps before the first one.
+        sky: of an NGP and images without alpha, learn light from behind the box, by
+            direction; otherwise a random colour lies behind each ray, as with objects.
+        exposure: learn the exposure of each image.
+        poses: learn corrections of the cameras' poses.
+        camera_rate: learning rate of these, as a share of the field's.
+        loss: weights of the terms.
+    """
+
+    steps: int | None = None
+    epochs: float = 50.0
+    budget_minutes: float | None = None
+    patience: int | None = None
+    batch_rays: int = 1 << 14
+    samples: int = 1 << 16
+    seed: int = 0
+    learning_rate: float = 1e-2
+    final_rate: float = 0.03
+    occupancy_resolution: int = 128
+    occupancy_every: int = 16
+    occupancy_start: int = 128
+    sky: bool = True
+    exposure: bool = False
+    poses: bool = False
+    camera_rate: float = 0.02
+    loss: LossWeights = field(default_factory=LossWeights)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in (
+            "steps",
+            "patience",
+            "batch_rays",
+            "samples",
+            "occupancy_resolution",
+            "occupancy_every",
+        ):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name}: {value}; must be at least 1")
+        if self.seed < 0 or self.occupancy_start < 0:
+            raise InputError(
+                f"seed, occupancy_start: {self.seed}, {self.occupancy_start}; must "
+                "not be negative"
+            )
+        if not 0 < self.final_rate <= 1:
+            raise InputError(f"final_rate: {self.final_rate}; must be in (0, 1]")
+        for name in ("epochs", "budget_minutes", "camera_rate"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name}: {value}; must be positive")
+        if not 0 < self.learning_rate < 1:
+            raise InputError(f"learning_rate: {self.learning_rate}; must be in (0, 1)")
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """State of a running fit.
+
+    Attributes:
+        step: done.
+        steps: planned; None where epochs or time decide.
+        fraction: of the whole fit, by steps or by time, whichever is further.
+        loss: mean over the last steps.
+        psnr_db: of the last batches, sRGB.
+        elapsed_s, remaining_s: wall time.
+        occupied: share of cells that are marched through.
+        rays: of a step, mean over the last steps.
+        samples: of a step that light reaches the eye from, likewise.
+    """
+
+    step: int
+    steps: int | None
+    fraction: float
+    loss: float
+    psnr_db: float
+    elapsed_s: float
+    remaining_s: float
+    occupied: float
+    rays: float = 0.0
+    samples: float = 0.0
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted field and how well it shows the images that it never saw.
+
+    Attributes:
+        field: the field, with its occupancy.
+        psnr_heldout_db: mean over held-out views, sRGB.
+        ssim_heldout: mean over held-out views.
+        per_view: one entry for each held-out view.
+        history: reports in order.
+        wall_s: of the fit and the evaluation, interruptions not counted.
+        steps: done.
+        exposure: (n, 3), factors of linear radiance of the fitted images, or None.
+        poses: (n, 4, 4), corrected camera_to_world of the fitted images, or None.
+    """
+
+    field: GridField | NGPField
+    psnr_heldout_db: float
+    ssim_heldout: float
+    per_view: tuple[ViewScore, ...]
+    history: tuple[FitProgress, ...]
+    wall_s: float
+    steps: int
+    exposure: np.ndarray | None = None
+    poses: np.ndarray | None = None
+
+
+ProgressCallback = Callable[[FitProgress], None]
+
+
+def no_progress(progress: FitProgress) -> None:
+    """Show nothing."""
+    del progress

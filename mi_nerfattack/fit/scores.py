@@ -1,0 +1,162 @@
+"""How well a field shows given images: PSNR, SSIM, hazy rays, and what it renders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
+from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
+
+HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
+MIN_EDGE_PX = 11  # of the window of SSIM
+_WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """What a field shows from one pose, one ray through the centre of each pixel.
+
+    Attributes:
+        image: (height, width, 3), float32, sRGB in [0, 1].
+        opacity: (height, width), float32.
+        depth: (height, width), float32, expected depth along the ray, metres;
+            infinite where the opacity is 0.
+    """
+
+    image: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def hazy(self) -> float:
+        """Share of rays whose opacity lies inside `HAZY`."""
+        return float(np.mean((self.opacity > HAZY[0]) & (self.opacity < HAZY[1])))
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Agreement of one view.
+
+    Attributes:
+        index: of the image.
+        name: of the image.
+        psnr_db: of sRGB values in [0, 1], infinite for equal images.
+        ssim: Wang et al. 2004, Gaussian window of 1.5 px, mean over channels.
+        hazy: share of rays that are neither solid nor free; see `Rendering.hazy`.
+        rendering: what the field shows; kept for the worst views alone.
+    """
+
+    index: int
+    name: str
+    psnr_db: float
+    ssim: float
+    hazy: float = 0.0
+    rendering: Rendering | None = field(default=None, repr=False, compare=False)
+
+
+class FieldRenderer:
+    """Renders a field from any pose; one kernel for all views of one size.
+
+    Args:
+        field: the field.
+        over_white: put white behind it in place of its own background.
+    """
+
+    def __init__(self, field: AbstractField, over_white: bool = False) -> None:
+        self._posed, self._over_white = PosedField(field), over_white
+
+    def render(self, camera: Camera, camera_to_world: np.ndarray) -> Rendering:
+        """Render one view.
+
+        Args:
+            camera: intrinsics.
+            camera_to_world: (4, 4), OpenCV axes, metres.
+        """
+        origin, rotation = pose_arrays(camera_to_world)
+        o, d = generate_rays(camera, origin, rotation, 1)
+        half, far = mi.Float(0.5), mi.Float(dr.inf)
+        with dr.suspend_grad():
+            result = march(self._posed, o, d, far, half, mi.Bool(True))
+            behind = self._posed.background(d)
+            if self._over_white:
+                behind = mi.Color3f(_WHITE)
+            colour = result.radiance + (1 - result.opacity) * behind
+            depth = result.depth
+            dr.eval(colour, result.opacity, depth)
+        size = (camera.height, camera.width)
+        return Rendering(
+            linear_to_srgb_numpy(colour.numpy().T.reshape(*size, 3)),
+            result.opacity.numpy().reshape(size).copy(),
+            depth.numpy().reshape(size).copy(),
+        )
+
+
+def reference(images: PosedImages, index: int) -> np.ndarray:
+    """Return an image, over white if it has alpha, sRGB (height, width, 3), float32."""
+    image = images.images[index].astype(np.float32) / 255
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:]
+    linear = alpha * srgb_to_linear_numpy(image[..., :3]) + (1 - alpha) * _WHITE
+    return linear_to_srgb_numpy(linear)
+
+
+def evaluate(
+    field: AbstractField, images: PosedImages, indices: Iterable[int], keep: int = 4
+) -> list[ViewScore]:
+    """Score a field against images; those with alpha lie over white.
+
+    Args:
+        field: the field; its background lies behind it, or white where the images
+            have alpha.
+        images: the posed images.
+        indices: of the images to score.
+        keep: number of views, those of least PSNR, whose rendering is kept.
+
+    Returns:
+        a score for each index, in order.
+    """
+    renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
+    scores: list[ViewScore] = []
+    for index in map(int, indices):
+        pose = images.camera_to_world[index]
+        rendering = renderer.render(images.camera_of(index), pose)
+        psnr, ssim = compare(rendering.image, reference(images, index))
+        name, hazy = images.names[index], rendering.hazy
+        scores.append(ViewScore(index, name, psnr, ssim, hazy, rendering))
+        kept = {score.index for score in worst_views(scores, keep)}
+        scores = [s if s.index in kept else replace(s, rendering=None) for s in scores]
+    return scores
+
+
+def worst_views(scores: Iterable[ViewScore], count: int) -> list[ViewScore]:
+    """Return the views of least PSNR whose rendering is kept, worst first."""
+    kept = [score for score in scores if score.rendering is not None]
+    return sorted(kept, key=lambda score: score.psnr_db)[:count]
+
+
+def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """Return PSNR (dB) and SSIM of two sRGB images (h, w, 3) in [0, 1]."""
+    from skimage.metrics import structural_similarity
+
+    error = float(np.mean((image.astype(np.float64) - reference) ** 2))
+    psnr = float("inf") if error == 0 else -10 * float(np.log10(error))
+    ssim = structural_similarity(
+        image,
+        reference,
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    return psnr, float(ssim)

@@ -1,0 +1,1 @@
+"""Files of all kinds, checked and atomic: the only place that opens user files."""

@@ -1,0 +1,66 @@
+"""Folders that one process at a time works in, and what a killed one left there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+try:
+    import fcntl
+except ImportError:  # not on Windows, which has no such locks
+    fcntl = None
+
+
+@contextmanager
+def exclusive(folder: str | Path) -> Iterator[None]:
+    """Keep other processes of this program out of a folder.
+
+    The lock ends with the process, however it ends, and leaves no file. Where the
+    file system or platform has no locks, nothing is kept out.
+
+    Args:
+        folder: must exist.
+
+    Raises:
+        InputError: another process works in the folder.
+    """
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise InputError(
+                f"{folder}: another process works in it; wait for it or end it"
+            ) from err
+        except OSError:  # some network file systems: work without, as on Windows
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def remove_partial(folder: str | Path) -> list[Path]:
+    """Remove what killed writers left in a folder and in the folders inside it.
+
+    Call it only where no other process writes, see :func:`exclusive`.
+
+    Returns:
+        the files that were removed.
+    """
+    found = [path for path in Path(folder).rglob(".*.tmp") if is_partial(path)]
+    for path in found:
+        path.unlink(missing_ok=True)
+    return found
+
+
+def is_partial(path: Path) -> bool:
+    """Tell the temporary file of a killed writer, see :mod:`files`."""
+    return files.TEMPORARY.fullmatch(path.name) is not None and path.is_file()

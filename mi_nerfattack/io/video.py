@@ -1,0 +1,104 @@
+"""Write videos that every player shows: H.264 in MP4."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.io import files
+
+CODEC = "libx264"
+_OPTIONS = {"crf": "17", "preset": "medium"}
+_BT709 = 1  # primaries and matrix of ITU-T H.273, equal to those of sRGB
+_SRGB_CURVE = 13
+
+
+def even_size(width: int, height: int) -> tuple[int, int]:
+    """Return the next size that 4:2:0 subsampling can hold: both even."""
+    return width + width % 2, height + height % 2
+
+
+def write_video(
+    path: str | Path, frames: Iterable[np.ndarray], fps: float
+) -> tuple[int, int]:
+    """Write an MP4 file atomically: H.264, yuv420p, BT.709, constant quality.
+
+    Nothing is scaled. 4:2:0 subsampling needs even sizes: the last column or row of an
+    odd size is repeated once.
+
+    Args:
+        path: the file; it appears when all frames are encoded.
+        frames: (height, width, 3), uint8, sRGB, all of one size; at least one.
+        fps: frames per second.
+
+    Returns:
+        Width and height of the video, pixels.
+
+    Raises:
+        InputError: no frames, frames of several sizes, or a file that cannot be
+            written.
+        SetupError: PyAV was built without H.264.
+    """
+    import av
+
+    if CODEC not in av.codecs_available:
+        raise SetupError(f"PyAV {av.__version__} has no {CODEC}; install it from PyPI")
+    buffer = io.BytesIO()
+    shape: tuple[int, ...] | None = None
+    container = av.open(buffer, "w", format="mp4")
+    with container:
+        stream: Any = None
+        for frame in frames:
+            if shape is None:
+                shape = frame.shape
+                stream = _add_stream(container, shape, fps)
+            if frame.shape != shape:
+                raise InputError(
+                    f"{path}: frames of {frame.shape} and {shape}; all need one size"
+                )
+            container.mux(stream.encode(_to_yuv(frame)))
+        if stream is None:
+            raise InputError(f"{path}: no frames; give at least one")
+        container.mux(stream.encode())
+        size = stream.width, stream.height
+    files.write_bytes(path, buffer.getvalue())
+    return size
+
+
+def _add_stream(container: Any, shape: tuple[int, ...], fps: float) -> Any:
+    rate = Fraction(fps).limit_denominator(1001)
+    stream = container.add_stream(CODEC, rate=rate, options=_OPTIONS)
+    stream.width, stream.height = even_size(shape[1], shape[0])
+    stream.pix_fmt = "yuv420p"
+    context = stream.codec_context
+    context.color_primaries = context.colorspace = _BT709
+    context.color_trc = _SRGB_CURVE
+    context.color_range = 1  # 16 to 235, as players expect
+    return stream
+
+
+def _to_yuv(image: np.ndarray) -> Any:
+    from av.video.frame import VideoFrame
+    from av.video.reformatter import ColorRange, Colorspace
+
+    height, width = image.shape[:2]
+    even = even_size(width, height)
+    more = ((0, even[1] - height), (0, even[0] - width), (0, 0))
+    frame = VideoFrame.from_ndarray(np.pad(image, more, "edge"), format="rgb24")
+    return frame.reformat(
+        format="yuv420p",
+        dst_colorspace=Colorspace.ITU709,
+        dst_color_range=ColorRange.MPEG,
+    )
+
+
+def check_fps(fps: float) -> None:
+    """Raise InputError unless frames per second are in [0.1, 1000]."""
+    if not 0.1 <= fps <= 1000:
+        raise InputError(f"fps: {fps}; frames per second, from 0.1 to 1000")

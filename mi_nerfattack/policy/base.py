@@ -1,0 +1,116 @@
+"""Interface of a driving policy to the closed loop."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+from mi_nerfattack.errors import InputError
+
+#: What a policy carries from one control period to the next: arrays of its own kind.
+Memory = tuple[Any, ...]
+
+
+class AbstractPolicy(ABC):
+    """Map from images to controls with a vector-Jacobian product.
+
+    Images and controls are Dr.Jit arrays, so that the closed loop needs to know no
+    other library. A call starts by waiting for the images. The closed loop calls
+    `step` and its derivatives; those here are of policies without memory.
+
+    Attributes:
+        differentiable: whether derivatives exist; gradient methods refuse others.
+    """
+
+    differentiable: ClassVar[bool] = True
+
+    def initial_memory(self, count: int) -> Memory:
+        """Return the memory of `count` vehicles before their first image."""
+        del count
+        return ()
+
+    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+        """Evaluate the policy and its next memory.
+
+        Args:
+            image: as for `control`.
+            goal: as for `control`.
+            memory: from `initial_memory` or the step before; left unchanged.
+
+        Returns:
+            The control, as `control` gives it, and the memory for the next step.
+        """
+        return self.control(image, goal), memory
+
+    def step_vjp(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Multiply cotangents by the derivative of `step`.
+
+        Args:
+            image: as given to `step`.
+            goal: likewise.
+            memory: likewise.
+            cotangent: row (n,), derivative of the objective by the control.
+            d_memory: derivative of the objective by the memory that `step`
+                returned, of its structure; ``()`` after the last step.
+
+        Returns:
+            Derivatives of the objective by the image and by `memory`.
+        """
+        del memory, d_memory
+        return self.vjp(image, goal, cotangent)[1], ()
+
+    def step_jvp(
+        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Multiply the derivative of `step` by tangents (forward mode).
+
+        Args:
+            image: as given to `step`.
+            goal: likewise.
+            memory: likewise.
+            t_image: tangent of the image, a tensor of its shape.
+            t_memory: tangent of `memory`, of its structure; ``()`` stands for zeros.
+
+        Returns:
+            Tangents of the control, a row (n,), and of the memory that `step` returns.
+
+        Raises:
+            InputError: the policy has no forward derivative.
+        """
+        del image, goal, memory, t_image, t_memory
+        raise InputError(
+            f"{type(self).__name__}: has no forward derivative; implement step_jvp"
+        )
+
+    def memory_bytes(self, memory: Memory) -> int:
+        """Return the size of a memory, bytes."""
+        assert not memory, "a policy with memory says how large it is"
+        return 0
+
+    @abstractmethod
+    def control(self, image: Any, goal: Any) -> Any:
+        """Evaluate the policy.
+
+        Args:
+            image: tensor (n, height, width, 3), sRGB in [0, 1]; taken as a constant.
+            goal: an integer, or one for each image.
+
+        Returns:
+            Row (n,), evaluated and detached, in the unit of the vehicle's control.
+        """
+
+    @abstractmethod
+    def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
+        """Multiply a cotangent by the derivative of `control`.
+
+        Args:
+            image: as for `control`.
+            goal: as for `control`.
+            cotangent: row (n,), derivative of the objective by the control.
+
+        Returns:
+            The control (n,), and the derivative of the objective by the image, a
+            tensor of the image's shape; both evaluated and detached.
+        """

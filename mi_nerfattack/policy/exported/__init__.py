@@ -1,0 +1,1 @@
+"""Policies as programs: torch.export and TorchScript."""

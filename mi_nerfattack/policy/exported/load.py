@@ -1,0 +1,89 @@
+"""Programs that were exported from torch: ``torch.export`` and TorchScript."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.exported.archive import check_archive, check_script
+
+MAX_PROGRAM_BYTES = 1 << 31
+
+
+class ExportedNetwork(torch.nn.Module):
+    """A program of ``torch.export``; its mode was fixed when it was exported.
+
+    Attributes:
+        batch: the number of images that it takes, None where any.
+    """
+
+    def __init__(self, program: torch.export.ExportedProgram) -> None:
+        super().__init__()
+        self.program = program.module()
+        self.batch = _batch(program)
+
+    def train(self, mode: bool = True) -> ExportedNetwork:
+        """Do nothing: an exported program cannot change its mode."""
+        del mode
+        return self
+
+    def forward(self, *arguments: torch.Tensor) -> Any:
+        """Call the program."""
+        return self.program(*arguments)
+
+
+def load_exported(path: Path) -> ExportedNetwork:
+    """Read a ``.pt2`` file of ``torch.export.save``.
+
+    Raises:
+        InputError: no such file, another format, or one with pickled objects or code.
+    """
+    raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
+    check_archive(path, raw)
+    try:
+        program = torch.export.load(io.BytesIO(raw))
+        network = ExportedNetwork(program)
+    except Exception as err:
+        if is_interrupt(err):
+            raise
+        raise InputError(
+            f"{path}: torch {torch.__version__} cannot load the program ({err}); "
+            "export it again with this version"
+        ) from err
+    return network
+
+
+def load_torchscript(path: Path) -> torch.nn.Module:
+    """Read a file of ``torch.jit.save``, onto the CPU.
+
+    Raises:
+        InputError: no such file, another format, or a program that opens files.
+    """
+    raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
+    check_script(path, raw)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "`torch.jit.load`", DeprecationWarning)
+            return torch.jit.load(io.BytesIO(raw), map_location="cpu")
+    except RuntimeError as err:
+        reason = str(err).strip().splitlines()[0]
+        raise InputError(
+            f"{path}: is no TorchScript program ({reason}); save one with "
+            "torch.jit.save, or give weights to a FILE.py:NAME as policy.weights_file"
+        ) from err
+
+
+def _batch(program: torch.export.ExportedProgram) -> int | None:
+    """Return the first size of the first input where it is fixed."""
+    first = program.graph_signature.user_inputs[0]
+    for node in program.graph.nodes:
+        if node.op == "placeholder" and node.name == first:
+            size = node.meta["val"].shape[0]
+            return size if isinstance(size, int) else None
+    return None

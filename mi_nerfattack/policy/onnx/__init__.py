@@ -1,0 +1,1 @@
+"""Policies from ONNX files, with derivatives."""

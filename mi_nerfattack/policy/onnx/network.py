@@ -1,0 +1,263 @@
+"""ONNX files as torch modules: an interpreter with the derivatives of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mi_nerfattack.errors import InputError, SetupError, is_interrupt
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.onnx.call import Call
+from mi_nerfattack.policy.onnx.operators import OPERATORS
+
+MAX_ONNX_BYTES = 1 << 31
+_DOUBLE = 11
+_CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Node:
+    """An operator of the graph, and the names of what it reads and writes."""
+
+    operator: str
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input of the graph: its name, whether it is integer, and its sizes.
+
+    A size is None where it is free.
+    """
+
+    name: str
+    whole: bool
+    sizes: tuple[int | None, ...]
+
+
+class OnnxNetwork(torch.nn.Module):
+    """Graph of ONNX operators, evaluated one by one.
+
+    Arguments go to the graph's inputs in their order; its outputs come back in
+    theirs. Floating constants are buffers, so that ``.double()`` and ``.to(device)``
+    work; all floating types are one in an evaluation. Slower than a runtime by the
+    Python of each node, about 20 us.
+
+    Attributes:
+        batch: the number of images that it takes, None where any.
+    """
+
+    def __init__(self, model: Any, name: str) -> None:
+        """Take a ``ModelProto`` apart; `name` is for messages."""
+        super().__init__()
+        self.name = name
+        self.opset = _opset(model, name)
+        graph = model.graph
+        self.whole: dict[str, torch.Tensor] = {}
+        self.floating: dict[str, str] = {}
+        nodes = [_node(node, name) for node in graph.node]
+        self._read_constants(graph, nodes)
+        self.nodes = [node for node in nodes if node.operator != "Constant"]
+        known = {*self.whole, *self.floating}
+        self.inputs = [_input(i) for i in graph.input if i.name not in known]
+        self.outputs = [output.name for output in graph.output]
+        if not self.inputs or not self.inputs[0].sizes:
+            raise InputError(f"{name}: has no image among its inputs")
+        self.batch = self.inputs[0].sizes[0]
+
+    def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Evaluate all nodes."""
+        dtype = next((b.dtype for b in self.buffers()), arguments[0].dtype)
+        device = arguments[0].device
+        values: dict[str, torch.Tensor] = dict(self.whole)
+        for name, buffer in self.floating.items():
+            values[name] = self.get_buffer(buffer)
+        values.update(self._bound(arguments, dtype))
+        for node in self.nodes:
+            given = [values[name] if name else None for name in node.inputs]
+            call = Call(
+                node.operator, given, node.attributes, self.opset, dtype, device
+            )
+            result = self._evaluate(node, call)
+            results = result if isinstance(result, tuple) else (result,)
+            for name, value in zip(node.outputs, results, strict=False):
+                values[name] = value
+        return tuple(values[name] for name in self.outputs)
+
+    def _evaluate(self, node: Node, call: Call) -> Any:
+        try:
+            return OPERATORS[node.operator](call)
+        except InputError as err:
+            raise InputError(f"{self.name}: node {node.name}: {err}") from err
+        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as err:
+            if is_interrupt(err) or isinstance(err, torch.OutOfMemoryError):
+                raise
+            raise InputError(
+                f"{self.name}: node {node.name} ({node.operator}): {err}"
+            ) from err
+
+    def _bound(
+        self, arguments: tuple[torch.Tensor, ...], dtype: torch.dtype
+    ) -> dict[str, torch.Tensor]:
+        """Match arguments with the graph's inputs."""
+        names = [item.name for item in self.inputs]
+        if len(arguments) != len(names):
+            raise InputError(
+                f"{self.name}: has the inputs {names}; image, goal and hidden states "
+                f"are {len(arguments)}: set policy.goal and policy.recurrent"
+            )
+        for item, value in zip(self.inputs, arguments, strict=True):
+            pairs = zip(item.sizes, value.shape, strict=False)
+            wrong = any(size not in (None, actual) for size, actual in pairs)
+            if wrong or len(item.sizes) != value.ndim:
+                sizes = ["any" if size is None else size for size in item.sizes]
+                raise InputError(
+                    f"{self.name}: input {item.name!r} has the shape {sizes}; it gets "
+                    f"{list(value.shape)}: set policy.preprocess"
+                )
+        return {
+            item.name: value.to(torch.int64 if item.whole else dtype)
+            for item, value in zip(self.inputs, arguments, strict=True)
+        }
+
+    def _read_constants(self, graph: Any, nodes: list[Node]) -> None:
+        """Keep initial values: floating ones as buffers, others on the CPU."""
+        double = any(i.type.tensor_type.elem_type == _DOUBLE for i in graph.input[:1])
+        dtype = torch.float64 if double else torch.float32
+        if len(graph.sparse_initializer):
+            raise InputError(f"{self.name}: sparse tensors are not supported")
+        values = [(t.name, _tensor(t, self.name)) for t in graph.initializer]
+        for node in nodes:
+            if node.operator == "Constant":
+                call = Call("Constant", (), node.attributes, self.opset, dtype, _CPU)
+                values.append((node.outputs[0], self._evaluate(node, call)))
+        for name, value in values:
+            if value.is_floating_point():
+                self.floating[name] = f"constant_{len(self.floating)}"
+                self.register_buffer(self.floating[name], value.to(dtype))
+            else:
+                self.whole[name] = value
+
+
+def load_onnx(path: Path) -> OnnxNetwork:
+    """Read an ``.onnx`` file with its weights inside.
+
+    Raises:
+        InputError: no such file, another format, weights in other files, or operators
+            that are not supported, by name.
+        SetupError: the package ``onnx`` is not installed.
+    """
+    try:
+        import onnx
+        from google.protobuf.message import DecodeError
+    except ImportError as err:
+        raise SetupError(
+            f"{path}: reading it needs the package onnx; pip install "
+            "'mi-nerfattack[onnx]'"
+        ) from err
+    raw = files.read_bytes(path, MAX_ONNX_BYTES)
+    try:
+        model = onnx.load_model_from_string(raw)
+        outside = _outside(model)
+        if not outside:
+            onnx.checker.check_model(model)
+    except (DecodeError, onnx.checker.ValidationError) as err:
+        reason = str(err).strip().split("\n")[0]
+        raise InputError(
+            f"{path}: is no ONNX model ({reason}); write or copy it again"
+        ) from err
+    if outside:
+        raise InputError(
+            f"{path}: keeps {outside[0]!r} in another file; save it with the weights "
+            "inside: onnx.save(onnx.load(FILE), FILE)"
+        )
+    network = OnnxNetwork(model, str(path))
+    if network.inputs[0].whole:
+        raise InputError(
+            f"{path}: input {network.inputs[0].name!r}, the image, is of integers, "
+            "which have no derivative; export the network with a float input, and "
+            "scale the image by policy.preprocess.scale"
+        )
+    return network
+
+
+def _outside(model: Any) -> list[str]:
+    """Return names of tensors whose data is in other files."""
+    external = 1  # TensorProto.EXTERNAL
+    tensors = list(model.graph.initializer)
+    for node in model.graph.node:
+        tensors += [t for item in node.attribute for t in (item.t, *item.tensors)]
+    return [t.name or "a constant" for t in tensors if t.data_location == external]
+
+
+def _opset(model: Any, name: str) -> int:
+    """Return the version of the standard operators; refuse unknown operators."""
+    domains = {item.domain: item.version for item in model.opset_import}
+    unknown = sorted(
+        {
+            f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+            for node in model.graph.node
+            if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS
+        }
+    )
+    if unknown:
+        raise InputError(
+            f"{name}: operators {', '.join(unknown)} are not supported; supported are "
+            f"{', '.join(sorted(OPERATORS))}"
+        )
+    return int(domains.get("", domains.get("ai.onnx", 1)))
+
+
+def _node(node: Any, owner: str) -> Node:
+    """Read a node and its attributes."""
+    from onnx import TensorProto
+    from onnx.helper import get_attribute_value
+
+    attributes: dict[str, Any] = {"outputs": len(node.output)}
+    for item in node.attribute:
+        value = get_attribute_value(item)
+        if isinstance(value, bytes):
+            value = value.decode("utf-8", "replace")
+        elif isinstance(value, (list, tuple)):
+            value = [v.decode() if isinstance(v, bytes) else v for v in value]
+        elif isinstance(value, TensorProto):
+            value = _tensor(value, owner)
+        attributes[item.name] = value
+    name = node.name or f"that gives {node.output[0]!r}"
+    return Node(node.op_type, name, tuple(node.input), tuple(node.output), attributes)
+
+
+def _tensor(tensor: Any, owner: str) -> torch.Tensor:
+    """Read a tensor; floating ones as at least single precision."""
+    from onnx.numpy_helper import to_array
+
+    try:
+        array = np.array(to_array(tensor))
+        if array.dtype.kind in "iub":
+            return torch.from_numpy(array.astype(_WHOLE.get(array.dtype, array.dtype)))
+        double = array.dtype == np.float64
+        return torch.from_numpy(array.astype(np.float64 if double else np.float32))
+    except (TypeError, ValueError) as err:
+        raise InputError(f"{owner}: tensor {tensor.name!r}: {err}") from err
+
+
+#: Types that torch lacks or hardly computes with.
+_WHOLE = {np.dtype(f"uint{bits}"): np.int64 for bits in (16, 32, 64)}
+
+
+def _input(value: Any) -> Input:
+    kind = value.type.tensor_type
+    sizes = tuple(
+        size.dim_value if size.HasField("dim_value") and size.dim_value > 0 else None
+        for size in kind.shape.dim
+    )
+    floating = kind.elem_type in (1, 10, 11, 16)
+    return Input(value.name, not floating, sizes)

@@ -1,0 +1,241 @@
+"""Interface of a driving policy to the closed loop, and the bridge to torch."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
+
+import torch
+from torch.autograd import forward_ad
+
+from mi_nerfattack.backend.torch_arrays import to_row, to_tensor, to_torch
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.policy.checks import (
+    check_hidden,
+    check_images,
+    expand_goals,
+    steering,
+)
+from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal
+from mi_nerfattack.policy.module_call import call_module, check_repeatable
+from mi_nerfattack.policy.preprocess import Preprocess
+
+
+class TorchPolicy(AbstractPolicy):
+    """Policy given by a torch module; memory is shared, not copied, both ways.
+
+    The module is called as ``module(image, *goal, *hidden)`` and returns the control,
+    or a tuple of the control and the hidden states for the next image. It keeps no
+    state in itself; the very first image is evaluated twice to see that. The memory is
+    the frame stack, where there is one, and the hidden states.
+
+    Args:
+        module: takes what `preprocess` and `goal` make of the camera's image, (n, 3,
+            height, width), sRGB in [0, 1], unless told otherwise, and gives controls
+            (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
+            evaluation mode, its parameters are frozen, and it is moved to the device
+            of the images.
+        goal: how the goal is passed; ``IntegerGoal(module.goals)`` unless given.
+        preprocess: from the camera's image to the network's.
+        recurrent: shapes of the hidden states, zero at first, with -1 for the number
+            of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.
+        control_scale: factor from the module's unit and sign to the vehicle's.
+        output: column of the control, needed where there are several.
+        name: for messages; the module's class unless given.
+    """
+
+    def __init__(
+        self,
+        module: torch.nn.Module,
+        goal: AbstractGoal | None = None,
+        preprocess: Preprocess | None = None,
+        recurrent: Sequence[Sequence[int]] = (),
+        control_scale: float = 1.0,
+        output: int | None = None,
+        name: str | None = None,
+    ) -> None:
+        """Take over `module`."""
+        self.module = module.eval()
+        for parameter in module.parameters():  # a ScriptModule has no requires_grad_
+            parameter.requires_grad_(False)
+        self.goal = _own_goal(module) if goal is None else goal
+        self.preprocess = preprocess or Preprocess()
+        self.recurrent = check_hidden(recurrent)
+        self.control_scale, self.output = float(control_scale), output
+        self.name = name or type(module).__name__
+        self._checked = False
+
+    def control(self, image: Any, goal: Any) -> Any:
+        """Evaluate the module on first images, without recording a graph."""
+        return self.step(image, goal, self.initial_memory(len(image)))[0]
+
+    def vjp(self, image: Any, goal: Any, cotangent: Any) -> tuple[Any, Any]:
+        """Evaluate the module and its reverse derivative on first images."""
+        memory = self.initial_memory(len(image))
+        control, (d_image, *_) = self._pull_back(image, goal, memory, cotangent, ())
+        return to_row(control, image), to_tensor(d_image, image)
+
+    def initial_memory(self, count: int) -> Memory:
+        """Return an empty frame stack, where there is one, and zeros."""
+        like = self._precision()
+        stack = (torch.zeros(count, 0, 0, 0, 0, dtype=like),)
+        hidden = (
+            torch.zeros([count if size < 0 else size for size in shape], dtype=like)
+            for shape in self.recurrent
+        )
+        return (*(stack if self.preprocess.history else ()), *hidden)
+
+    def memory_bytes(self, memory: Memory) -> int:
+        """Return the size of all tensors, bytes."""
+        return sum(part.numel() * part.element_size() for part in memory)
+
+    def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
+        """Evaluate the module without recording a graph."""
+        self._check(image, goal, memory)
+        with torch.no_grad():
+            control, after = self._evaluate(to_torch(image), goal, memory)
+        return to_row(control, image), after
+
+    def step_vjp(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Evaluate the module again and its reverse derivative, one graph at a time."""
+        _, (d_image, *rest) = self._pull_back(image, goal, memory, cotangent, d_memory)
+        return to_tensor(d_image, image), tuple(rest)
+
+    def step_jvp(
+        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
+    ) -> tuple[Any, Memory]:
+        """Evaluate the module on dual numbers."""
+        self._check(image, goal, memory)
+        primals = (to_torch(image), *memory)
+        tangents = (to_torch(t_image), *(t_memory or map(torch.zeros_like, memory)))
+        with torch.no_grad(), forward_mode():
+            duals = [
+                forward_ad.make_dual(primal, tangent.to(primal))
+                for primal, tangent in zip(primals, tangents, strict=True)
+            ]
+            control, after = self._evaluate(duals[0], goal, tuple(duals[1:]))
+            t_control, *t_after = [_tangent(value) for value in (control, *after)]
+        return to_row(t_control, image), tuple(t_after)
+
+    def _pull_back(
+        self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """Return the control, and derivatives by the image and each part of memory."""
+        self._check(image, goal, memory)
+        leaves = [
+            part.detach().requires_grad_(True) for part in (to_torch(image), *memory)
+        ]
+        with torch.enable_grad(), self._plain_layers():
+            control, after = self._evaluate(leaves[0], goal, tuple(leaves[1:]))
+        weight = to_torch(cotangent).to(control)
+        if weight.shape != control.shape:
+            raise InputError(
+                f"cotangent: {tuple(weight.shape)} for {tuple(control.shape)} controls"
+            )
+        weights = (weight, *(d_memory or map(torch.zeros_like, after)))
+        pairs = zip((control, *after), weights, strict=True)
+        used = [(value, weight) for value, weight in pairs if value.requires_grad]
+        gradients: Sequence[torch.Tensor | None] = [None]
+        if used:
+            values, weights = zip(*used, strict=True)
+            gradients = torch.autograd.grad(values, leaves, weights, allow_unused=True)
+        if gradients[0] is None:
+            raise InputError(
+                f"{self.name}: its control has no derivative by the image; it must "
+                "not detach the image or leave torch"
+            )
+        filled = [
+            torch.zeros_like(leaf) if gradient is None else gradient
+            for leaf, gradient in zip(leaves, gradients, strict=True)
+        ]
+        return control, tuple(filled)
+
+    def _check(self, image: Any, goal: Any, memory: Memory) -> None:
+        """Evaluate the very first image twice; a state in the module shows itself."""
+        if not self._checked:
+            images = to_torch(image)
+            check_repeatable(
+                self.module, lambda: self._evaluate(images, goal, memory)[0], self.name
+            )
+            self._checked = True
+
+    def _evaluate(
+        self, image: torch.Tensor, goal: Any, memory: Memory
+    ) -> tuple[torch.Tensor, Memory]:
+        """Apply the module to (n, height, width, 3), in the module's precision."""
+        check_images(image)
+        self.module.to(image.device)
+        image = image.to(self._precision() or image.dtype)
+        memory = tuple(part.to(image) for part in memory)
+        planes = self.preprocess.stage(image)
+        past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
+        network_image, past = self.preprocess.stack(planes, past)
+        hidden = memory[1:] if self.preprocess.history else memory
+        goals = self.goal.arguments(expand_goals(goal, image), image)
+        outputs = call_module(self.module, self.name, network_image, *goals, *hidden)
+        control = steering(outputs[0], len(image), self.output, self.name)
+        after = outputs[1:]
+        shapes = [tuple(part.shape) for part in after]
+        if shapes != [tuple(part.shape) for part in hidden]:
+            raise InputError(
+                f"{self.name}: hidden states {shapes} come out where "
+                f"{[tuple(part.shape) for part in hidden]} went in; declare their "
+                "shapes as policy.recurrent, or return several controls as one tensor "
+                "(n, k) and tell the column by policy.output"
+            )
+        stack = (past,) if self.preprocess.history else ()
+        return self.control_scale * control, (*stack, *after)
+
+    def _plain_layers(self) -> AbstractContextManager[None]:
+        """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.
+
+        Programs do not show their layers; hidden states betray them.
+        """
+        layers = self.module.modules()
+        if self.recurrent or any(isinstance(m, torch.nn.RNNBase) for m in layers):
+            return torch.backends.cudnn.flags(enabled=False)
+        return nullcontext()
+
+    def _precision(self) -> torch.dtype | None:
+        """Return the type of the module's parameters and buffers, if it has any."""
+        tensors = (*self.module.parameters(), *self.module.buffers())
+        return next((t.dtype for t in tensors if t.is_floating_point()), None)
+
+
+@contextmanager
+def forward_mode() -> Iterator[None]:
+    """Open a level of torch's forward mode.
+
+    The fused kernels of cuDNN and oneDNN have no forward derivative of recurrent
+    layers and are not used. Switching them, and opening the level, warns of nothing
+    that a caller could change.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+        warnings.filterwarnings("ignore", "TF32 acceleration on top", UserWarning)
+        with (
+            torch.backends.mkldnn.flags(enabled=False),
+            torch.backends.cudnn.flags(enabled=False),
+            forward_ad.dual_level(),
+        ):
+            yield
+
+
+def _tangent(value: torch.Tensor) -> torch.Tensor:
+    tangent = forward_ad.unpack_dual(value).tangent
+    return torch.zeros_like(value) if tangent is None else tangent
+
+
+def _own_goal(module: torch.nn.Module) -> AbstractGoal:
+    count = getattr(module, "goals", None)
+    if not isinstance(count, int):
+        raise InputError(
+            f"{type(module).__name__}.goals: {count!r}; an integer of at least 1, or "
+            "pass goal=NoGoal()"
+        )
+    return IntegerGoal(count)

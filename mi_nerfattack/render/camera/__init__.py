@@ -1,0 +1,1 @@
+"""Cameras: intrinsics, distortion, poses and their conventions."""

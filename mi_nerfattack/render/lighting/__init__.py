@@ -1,0 +1,1 @@
+"""Light between fields and surfaces, and spectra."""

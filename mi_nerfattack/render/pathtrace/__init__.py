@@ -1,0 +1,1 @@
+"""Pictures of Mitsuba scenes: loading, daylight, views, frames, sequences."""

@@ -1,0 +1,158 @@
+"""Load Mitsuba scenes, with other parameters or another film size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+_CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+_FILENAME = re.compile(r"""filename\s*=\s*["']([^"'$]+)["']""")
+
+
+def load_scene(
+    path: str | Path,
+    parameters: Mapping[str, str] | None = None,
+    size_px: tuple[int, int] | None = None,
+    shapes: Mapping[str, Any] | None = None,
+) -> Any:
+    """Load a Mitsuba scene in the active variant.
+
+    Args:
+        path: XML file; the files it names are relative to its folder.
+        parameters: values of its `$NAME`s, in place of the `<default>` ones.
+        size_px: width and height of all films, as if the file gave them; None keeps
+            the file's.
+        shapes: `mi.Shape`s by name that the scene gets besides its own.
+
+    Returns:
+        `mi.Scene`.
+
+    Raises:
+        InputError: whatever the parser or a plugin refuses, in one line with the file;
+            a root element that is no scene; a size for a film with a crop window.
+    """
+    config = _config()
+    try:
+        with _resolved_from(path):
+            state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+            if size_px is not None:
+                _resize_films(path, state, size_px)
+            config.merge_meshes = not _has_rectangles(state)
+            for name, shape in (shapes or {}).items():
+                state.nodes[0].props[name] = shape
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(
+            f"{path}: describes a {type(scene).__name__}; its root must be <scene>"
+        )
+    return scene
+
+
+def scene_files(path: str | Path) -> list[Path]:
+    """List a scene's file and all files that it names, as far as they exist.
+
+    Args:
+        path: XML file; included ones are followed.
+
+    Returns:
+        in the order of the text, each once: the XML files first, then meshes, images,
+        volumes, fields and spectra.
+
+    Raises:
+        InputError: the XML cannot be read.
+    """
+    with _resolved_from(path):
+        try:
+            state = mi.parser.parse_file(_config(), str(path))
+        except RuntimeError as error:
+            raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
+        texts = [Path(str(name)) for name in state.files]
+        names = [
+            str(node.props[key])
+            for node in state.nodes
+            for key in node.props
+            if "file" in key
+        ]
+        for text in texts:  # the parser replaces a spectrum's file by its numbers
+            names += _FILENAME.findall(files.read_text(text))
+        resolver = mi.file_resolver()
+        found = [Path(str(resolver.resolve(name))) for name in names if name]
+    there = [item.resolve() for item in (*texts, *found) if item.is_file()]
+    return list(dict.fromkeys(there))
+
+
+def _config() -> Any:
+    config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False  # Python plugins
+    return config
+
+
+def _has_rectangles(state: Any) -> bool:
+    """Return whether meshes of equal materials must stay apart.
+
+    Mitsuba 3.9.1 leaves rectangles that it merges out of the scene's bounding box, on
+    whose size the light of sky, sun and other far emitters depends.
+    """
+    return any(node.props.plugin_name() == "rectangle" for node in state.nodes)
+
+
+def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> None:
+    if min(size_px) < 1:
+        raise InputError(f"size: {size_px[0]} x {size_px[1]} px; at least 1 x 1")
+    if size_px[0] * size_px[1] > files.MAX_IMAGE_PIXELS:
+        raise InputError(
+            f"size: {size_px[0]} x {size_px[1]} px; at most {files.MAX_IMAGE_PIXELS} "
+            "pixels in all"
+        )
+    for node in state.nodes:
+        if node.type != mi.ObjectType.Film:
+            continue
+        if any(name in node.props for name in _CROP):
+            raise InputError(
+                f"{path}: a film has a crop window, which another size would move; "
+                "remove crop_* from it, or give no size"
+            )
+        node.props["width"], node.props["height"] = size_px
+
+
+@contextmanager
+def _resolved_from(path: str | Path) -> Iterator[None]:
+    """Let Mitsuba look for files beside a scene's first, as its own loader does."""
+    source = Path(path)
+    if source.is_dir():
+        raise InputError(f"{path}: is a folder; give a Mitsuba scene (XML)")
+    if not source.is_file():
+        raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    resolver.prepend(str(source.resolve().parent))
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
+
+
+def _in_one_line(path: str | Path, text: str) -> str:
+    """Strip from an error's text what only developers need, and add a remedy."""
+    text = re.sub(r"\[[a-z_]+\.cpp:\d+\] ", "", text)
+    traceback = r"(?s)Traceback \(most recent call last\):.*?\n(?=\w+: )"
+    text = re.sub(traceback, "", text)
+    text = re.sub(r"\b(Input|Setup|Value)Error: ", "", text)
+    text = " ".join(text.replace(f"At {path} (", "(").split())
+    if "unused parameters" in text:
+        return f"{text}; the file has no <default> of this name"
+    if "undefined parameter" in text:
+        return f"{text}; give it a value, or the file a <default>"
+    return text

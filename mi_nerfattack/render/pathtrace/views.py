@@ -1,0 +1,147 @@
+"""Render posed views of Mitsuba scenes: colour, opacity and depth.
+
+One sensor is kept and moved from view to view. Compared with Mitsuba's `batch` sensor,
+whose scene must be built (and whose kernels compiled) again for other poses, it
+compiles nothing after the first view, and no reconstruction filter crosses from one
+view into the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.conventions import (
+    mitsuba_sensor_dict,
+    opencv_to_mitsuba,
+)
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    generate_rays,
+    pose_arrays,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One rendered view, linear Rec.709.
+
+    Args:
+        rgb: (height, width, 3), float32, premultiplied by alpha.
+        alpha: (height, width), float32, share of samples that hit a surface (or an
+            environment emitter, unless the integrator hides emitters).
+        depth: (height, width), float32, metres from the camera along the ray through
+            the pixel's centre to the first surface, infinite where there is none.
+            A surface with a partly transparent `mask` counts as solid.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+
+
+class ViewRenderer:
+    """Renders one scene with one camera from any number of poses.
+
+    After the first view no kernel is compiled. Not differentiable.
+
+    Args:
+        scene: any scene; its own sensors are ignored.
+        camera: intrinsics.
+        integrator: `mi.Integrator` for colour; None for the scene's own.
+    """
+
+    def __init__(self, scene: Any, camera: Camera, integrator: Any = None) -> None:
+        """Build the sensor."""
+        film = {"pixel_format": "rgba"}
+        self.scene, self.camera = scene, camera
+        self._integrator = scene.integrator() if integrator is None else integrator
+        self._sensor = mi.load_dict(mitsuba_sensor_dict(camera, np.eye(4), 1, film))
+        self._parameters = mi.traverse(self._sensor)
+
+    def render(self, camera_to_world: np.ndarray, spp: int, seed: int) -> View:
+        """Render one view.
+
+        Args:
+            camera_to_world: (4, 4), OpenCV axes, metres.
+            spp: samples per pixel, at least 1; rounded up to a grid (32 to 35).
+            seed: of the samples, in [0, 2^32).
+        """
+        to_world = mi.Transform4f(opencv_to_mitsuba(camera_to_world))
+        dr.make_opaque(to_world)
+        self._parameters["to_world"] = to_world
+        self._parameters.update()
+        image = mi.render(
+            self.scene,
+            sensor=self._sensor,
+            integrator=self._integrator,
+            spp=_grid_samples(spp),
+            seed=mi.UInt32(seed),
+        ).numpy()
+        return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
+
+    def depth(self, camera_to_world: np.ndarray) -> np.ndarray:
+        """Return the depth image alone; see `View.depth`."""
+        origin, rotation = pose_arrays(camera_to_world)
+        o, d = generate_rays(self.camera, origin, rotation, 1)
+        t = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
+        return t.numpy().reshape(self.camera.height, self.camera.width)
+
+
+def _grid_samples(spp: int) -> int:
+    """Round up as the `multijitter` sampler does, which warns where it has to."""
+    if spp < 1:
+        raise InputError(f"spp: {spp}; must be at least 1")
+    rows = math.isqrt(spp)
+    return rows * -(-spp // rows)
+
+
+def iterate_views(
+    scene: Any,
+    camera: Camera,
+    camera_to_world: np.ndarray,
+    spp: int,
+    seed: int,
+    integrator: Any = None,
+) -> Iterator[View]:
+    """Render views one after the other; see `render_views`."""
+    renderer = ViewRenderer(scene, camera, integrator)
+    seeds = np.random.SeedSequence(seed).generate_state(len(camera_to_world))
+    for matrix, view_seed in zip(camera_to_world, seeds, strict=True):
+        yield renderer.render(matrix, spp, int(view_seed))
+
+
+def render_views(
+    scene: Any,
+    camera: Camera,
+    camera_to_world: np.ndarray,
+    spp: int,
+    seed: int,
+    integrator: Any = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render a scene from n poses.
+
+    Args:
+        scene: any scene; its own sensors are ignored.
+        camera: intrinsics.
+        camera_to_world: (n, 4, 4), OpenCV axes, metres.
+        spp: samples per pixel.
+        seed: each view has samples of its own derived from it.
+        integrator: `mi.Integrator`; None for the scene's own.
+
+    Returns:
+        rgb (n, height, width, 3), alpha and depth (n, height, width) as in `View`.
+    """
+    views = list(iterate_views(scene, camera, camera_to_world, spp, seed, integrator))
+    return (
+        np.stack([view.rgb for view in views]),
+        np.stack([view.alpha for view in views]),
+        np.stack([view.depth for view in views]),
+    )

@@ -1,0 +1,179 @@
+"""Whether a fitted field is good enough to test a policy in, by stated criteria."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.fit.scores import HAZY, ViewScore
+
+MIN_PSNR_DB = 24.0  # mean over held-out views
+MIN_WORST_DB = 18.0  # of any held-out view
+MAX_GAP_DB = 5.0  # fitted less held-out views
+MAX_HAZY = 0.10  # share of rays, mean over held-out views
+MIN_VIEWS = 3  # held-out views that a mean is worth something from
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a field stands for, in the words of a verdict.
+
+    Attributes:
+        use: what the field must be good enough for.
+        reach: where it is, as far as views tell.
+        few: advice where there are few views.
+        blurred: where the mean PSNR is low.
+        worst: where one view is bad.
+        fog: where many rays are hazy.
+        learnt: where the fitted rays are much better than the held-out ones.
+    """
+
+    use: str
+    reach: str
+    few: str
+    blurred: str
+    worst: str
+    fog: str
+    learnt: str
+
+
+PLACE = Subject(
+    use="to test a policy in",
+    reach="near the cameras and from heights and headings like theirs. Where there is "
+    "a scene to deploy in, compare with it along the routes too.",
+    few="Take more images: every 8th is held out, and so few say little.",
+    blurred="Fit for longer, or check poses, intrinsics and blurred images.",
+    worst="Look at the worst views: add images where they were taken, and leave out "
+    "images with a wrong pose, blur, or things that moved.",
+    fog="Fog or thin floaters: add depth or views from other sides, or narrow the "
+    "bounds; depths and occlusion by objects are unsure until then.",
+    learnt="The field has learnt images, not the place: add images between the "
+    "present ones, refine the poses, or take a smaller network.",
+)
+OBJECT = Subject(
+    use="as an object to attack",
+    reach="seen from where these views lie, and not from nearer than a voxel can show.",
+    few="Give more views (--views for a mesh): every 8th is held out, and so few say "
+    "little.",
+    blurred="Fit for longer (--steps) or with a finer grid (--resolution 128); of a "
+    "folder, check that all images show the object at rest in one light.",
+    worst="Look at the worst views: parts thinner than a voxel need a finer grid "
+    "(--resolution 128); of a folder, leave out images that show something else.",
+    fog="The surface is not solid: fit for longer (--steps) or with a finer grid "
+    "(--resolution 128); what is transparent stays so.",
+    learnt="The field has learnt views, not the object: give more views (--views for a "
+    "mesh).",
+)
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One thing that was measured and what it should be.
+
+    Attributes:
+        name: what was measured, with its unit.
+        value: as measured.
+        limit: of the value.
+        at_least: whether the limit is the least good value, or else the greatest.
+        advice: what helps if it is not met.
+        subject: what the field stands for.
+    """
+
+    name: str
+    value: float
+    limit: float
+    at_least: bool
+    advice: str
+    subject: Subject
+
+    @property
+    def met(self) -> bool:
+        """Whether the value lies on the good side of the limit."""
+        if self.at_least:
+            return self.value >= self.limit
+        return self.value <= self.limit
+
+
+def pooled_db(psnr_db: Sequence[float]) -> float:
+    """Return the PSNR of the mean of the squared errors that PSNRs stand for."""
+    error = float(np.mean(10 ** (-0.1 * np.asarray(psnr_db, np.float64))))
+    return float("inf") if error == 0 else -10 * float(np.log10(error))
+
+
+def judge(
+    scores: Sequence[ViewScore],
+    fitted_db: float | None = None,
+    subject: Subject = PLACE,
+) -> list[Criterion]:
+    """Judge a fit by its held-out views.
+
+    Args:
+        scores: of the held-out views, at least one.
+        fitted_db: PSNR of the rays fitted to, at the end of the fit; None if unknown.
+        subject: what the field stands for.
+    """
+    gap = [] if fitted_db is None else [_gap(scores, fitted_db, subject)]
+    return [*_criteria(scores, subject), *gap]
+
+
+def _gap(scores: Sequence[ViewScore], fitted_db: float, subject: Subject) -> Criterion:
+    pooled = pooled_db([score.psnr_db for score in scores])
+    return Criterion(
+        "PSNR of fitted rays less that of held-out ones (dB)",
+        0.0 if pooled == fitted_db else fitted_db - pooled,  # both may be infinite
+        MAX_GAP_DB,
+        False,
+        subject.learnt,
+        subject,
+    )
+
+
+def _criteria(scores: Sequence[ViewScore], subject: Subject) -> list[Criterion]:
+    psnr = [score.psnr_db for score in scores]
+    return [
+        Criterion(
+            "held-out views",
+            len(scores),
+            MIN_VIEWS,
+            True,
+            subject.few,
+            subject,
+        ),
+        Criterion(
+            "mean PSNR of held-out views (dB)",
+            float(np.mean(psnr)),
+            MIN_PSNR_DB,
+            True,
+            subject.blurred,
+            subject,
+        ),
+        Criterion(
+            "PSNR of the worst held-out view (dB)",
+            float(min(psnr)),
+            MIN_WORST_DB,
+            True,
+            subject.worst,
+            subject,
+        ),
+        Criterion(
+            f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}",
+            float(np.mean([score.hazy for score in scores])),
+            MAX_HAZY,
+            False,
+            subject.fog,
+            subject,
+        ),
+    ]
+
+
+def verdict(criteria: Sequence[Criterion]) -> str:
+    """Say in words what criteria, at least one, come to."""
+    subject = criteria[0].subject
+    failed = [item for item in criteria if not item.met]
+    if not failed:
+        return f"Good enough {subject.use}, as far as these views tell: {subject.reach}"
+    names = "; ".join(item.name for item in failed)
+    advice = " ".join(item.advice for item in failed)
+    return f"Not good enough {subject.use}: {names}. {advice}"

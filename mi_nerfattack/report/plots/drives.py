@@ -1,0 +1,264 @@
+"""Plots of drives and of an attack's progress, written as PNG files.
+
+Blue, orange-red and grey stay apart for colour-blind readers (Okabe and Ito 2008) and
+are drawn with different widths and dashes too. Figures are 1200 pixels wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import environment_order
+from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, save
+from mi_nerfattack.rollout.drive import CASES, Drive
+
+_STYLES: dict[str, dict[str, Any]] = {
+    "random": {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
+    "unperturbed": {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
+    "gradient": {
+        "color": "#D55E00",
+        "linewidth": 2.0,
+        "zorder": 5,
+        "linestyle": (0, (5, 1.2)),
+    },
+}
+_LABELS = {
+    "unperturbed": "unperturbed",
+    "random": "random texture",
+    "gradient": "attacked (gradient)",
+}
+_LANE, _CENTRE, _OBJECT, _LIMIT = "#ececec", "#9a9a9a", "#F0C000", "#000000"
+
+
+def overhead(
+    path: str | Path,
+    drives: Sequence[Drive],
+    route_points: np.ndarray,
+    lane_width_m: float,
+    object_footprints: Sequence[np.ndarray],
+    limit: float,
+) -> None:
+    """Plot the drives of one route from above, a panel per environment.
+
+    Args:
+        path: PNG file.
+        drives: of one route; the steps beyond the limit are marked with crosses.
+        route_points: (n, 2) with n >= 2, lane centre, metres.
+        lane_width_m: lane width, metres.
+        object_footprints: corners of each object on the ground, (n, 2), metres.
+        limit: departure limit, metres.
+    """
+    route = _checked_points("route_points", route_points)
+    objects = [_checked_points("object_footprints", o) for o in object_footprints]
+    panels = _environments(drives)
+    low, high = _view(drives, objects, lane_width_m)
+    with matplotlib.rc_context(RC):
+        figure, axes = _map_panels(len(panels), low, high)
+        for axis, (environment, group) in zip(axes, panels.items(), strict=True):
+            _draw_lane(axis, route, lane_width_m)
+            for footprint in objects:
+                axis.fill(*footprint.T, facecolor=_OBJECT, edgecolor="black", zorder=6)
+            for drive in sorted(group, key=_drawing_order):
+                axis.plot(*drive.states[:, :2].T, **_STYLES[drive.case])
+                out = drive.states[1:][drive.departed(limit)]
+                axis.plot(out[:, 0], out[:, 1], **_cross(drive.case))
+            axis.set_xlim(low[0], high[0])
+            axis.set_ylim(low[1], high[1])
+            axis.set_aspect("equal")
+            axis.set_title(f"{drives[0].route}: {environment}", loc="left")
+            axis.set_xlabel("x (m)")
+            axis.set_ylabel("y (m)")
+        _legend_below(figure, _map_handles(drives, bool(objects), limit))
+        save(path, figure)
+
+
+def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
+    """Plot the distance from the lane centre over time, a panel per environment.
+
+    Random textures appear as the range over their runs and its mean, both at each
+    time over the runs that last so long; the other cases as a line per run.
+
+    Args:
+        path: PNG file.
+        drives: of one route.
+        limit: departure limit, metres.
+    """
+    panels = _environments(drives)
+    with matplotlib.rc_context(RC):
+        figure = Figure((WIDTH_PX / DPI, 3.3), DPI, layout="constrained")
+        grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)
+        for axis, (environment, group) in zip(grid[0], panels.items(), strict=True):
+            _draw_band(axis, [d for d in group if d.case == "random"])
+            for drive in sorted(group, key=_drawing_order):
+                if drive.case != "random":
+                    axis.plot(drive.time_s, drive.distance_m, **_STYLES[drive.case])
+            axis.axhline(limit, color=_LIMIT, linewidth=1, linestyle=":", zorder=2)
+            axis.set_title(f"{drives[0].route}: {environment}", loc="left")
+            axis.set_xlabel("time (s)")
+            axis.set_ylim(bottom=0)
+            axis.set_xlim(left=0)
+            axis.grid(alpha=0.25)
+        grid[0][0].set_ylabel("distance from lane centre (m)")
+        handles: list[Any] = []
+        for case in _cases(drives):
+            style = _style(case, linewidth=2)
+            handles.append(Line2D([], [], label=_LABELS[case], **style))
+            if case == "random":
+                handles[-1].set_label("random texture, mean")
+                band = {"facecolor": _STYLES[case]["color"], "alpha": 0.25}
+                handles.append(Patch(label="random texture, range", **band))
+        label = f"departure limit {limit:.2f} m"
+        handles.append(Line2D([], [], color=_LIMIT, linestyle=":", label=label))
+        _legend_below(figure, handles)
+        save(path, figure)
+
+
+def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
+    """Plot an attack's objective and mean cross-track error per iteration.
+
+    Args:
+        path: PNG file.
+        history: one mapping per iteration with the keys `objective` and
+            `cross_track_mean_m`; iterations count from 0.
+    """
+    names = {"objective": "objective", "cross_track_mean_m": "mean distance (m)"}
+    if not history or any(name not in entry for entry in history for name in names):
+        raise InputError(f"history: each iteration needs the keys {', '.join(names)}")
+    iterations = np.arange(len(history))
+    marker = "o" if len(history) < 60 else ""
+    with matplotlib.rc_context(RC):
+        figure = Figure((WIDTH_PX / DPI, 4.2), DPI, layout="constrained")
+        for axis, (name, label) in zip(
+            figure.subplots(2, 1, sharex=True), names.items(), strict=True
+        ):
+            values = [float(entry[name]) for entry in history]
+            axis.plot(iterations, values, color="#D55E00", marker=marker, markersize=3)
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.25)
+            axis.xaxis.get_major_locator().set_params(integer=True)
+        figure.axes[0].set_title("Attack, per iteration", loc="left")
+        figure.axes[-1].set_xlabel("iteration")
+        figure.align_ylabels()
+        save(path, figure)
+
+
+def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
+    routes = sorted({drive.route for drive in drives})
+    if len(routes) != 1:
+        raise InputError(f"drives: routes {routes}; a plot shows exactly one route")
+    names = sorted({drive.environment for drive in drives}, key=environment_order)
+    return {name: [d for d in drives if d.environment == name] for name in names}
+
+
+def _cases(drives: Sequence[Drive]) -> list[str]:
+    present = {drive.case for drive in drives}
+    return [case for case in CASES if case in present]
+
+
+def _style(case: str, **changes: Any) -> dict[str, Any]:
+    return {**_STYLES[case], **changes}
+
+
+def _drawing_order(drive: Drive) -> float:
+    return _STYLES[drive.case]["zorder"]
+
+
+def _checked_points(name: str, points: np.ndarray) -> np.ndarray:
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[0] < 2 or array.shape[1] != 2:
+        raise InputError(f"{name}: shape {array.shape}; must be (n, 2) with n >= 2")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"{name}: holds a value that is not finite; give metres")
+    return array
+
+
+def _view(
+    drives: Sequence[Drive], objects: Sequence[np.ndarray], lane_width_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    points = np.concatenate([*(d.states[:, :2] for d in drives), *objects])
+    margin = max(0.75 * lane_width_m, 1.0)
+    return points.min(axis=0) - margin, points.max(axis=0) + margin
+
+
+def _map_panels(count: int, low: np.ndarray, high: np.ndarray) -> tuple[Figure, Any]:
+    """Place panels above each other where the map is wide, else beside each other."""
+    width_in = WIDTH_PX / DPI
+    aspect = float((high[1] - low[1]) / (high[0] - low[0]))
+    rows = count if aspect < 0.6 else 1
+    columns = count // rows
+    panel_in = (width_in - 0.7 * columns) / columns * aspect
+    height_in = min(rows * (max(panel_in, 1.0) + 0.65) + 0.6, 14.0)
+    figure = Figure((width_in, height_in), DPI, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+
+
+def _draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
+    tangent = np.gradient(route, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    offset = lane_width_m / 2 * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    left, right = route + offset, route - offset
+    axis.fill(*np.concatenate([left, right[::-1]]).T, facecolor=_LANE, zorder=0)
+    for edge in (left, right):
+        axis.plot(*edge.T, color="#b5b5b5", linewidth=0.8, zorder=1)
+    axis.plot(*route.T, color=_CENTRE, linewidth=1, linestyle="--", zorder=2)
+
+
+def _cross(case: str) -> dict[str, Any]:
+    dark = {"random": "#4d4d4d", "unperturbed": "#003f66", "gradient": "#7a1f00"}
+    style = {"linestyle": "none", "marker": "x", "markersize": 4.5, "zorder": 7}
+    return style | {"color": dark[case], "markeredgewidth": 1.2}
+
+
+def _map_handles(drives: Sequence[Drive], objects: bool, limit: float) -> list[Any]:
+    lines = [
+        Line2D([], [], label=_LABELS[c], **_style(c, linewidth=2))
+        for c in _cases(drives)
+    ]
+    centre = Line2D([], [], color=_CENTRE, linestyle="--", label="lane centre")
+    handles = [
+        *lines,
+        centre,
+        Patch(facecolor=_LANE, edgecolor="#b5b5b5", label="lane"),
+    ]
+    if objects:
+        handles.append(Patch(facecolor=_OBJECT, edgecolor="black", label="object"))
+    if any(np.any(drive.departed(limit)) for drive in drives):
+        label = f"departed (> {limit:.2f} m)"
+        handles.append(Line2D([], [], label=label, **_cross("gradient")))
+    return handles
+
+
+def _draw_band(axis: Axes, drives: Sequence[Drive]) -> None:
+    if not drives:
+        return
+    longest = max(drives, key=lambda drive: len(drive.time_s))
+    table = np.ma.masked_all((len(drives), len(longest.time_s)))
+    for row, drive in zip(table, drives, strict=True):
+        row[: len(drive.time_s)] = drive.distance_m
+    axis.fill_between(
+        longest.time_s,
+        table.min(axis=0),
+        table.max(axis=0),
+        facecolor=_STYLES["random"]["color"],
+        alpha=0.25,
+        linewidth=0,
+        zorder=1,
+    )
+    axis.plot(longest.time_s, table.mean(axis=0), **_style("random", linewidth=1.6))
+
+
+def _legend_below(figure: Figure, handles: list[Any]) -> None:
+    columns = 3 if len(handles) in (3, 5, 6) else 4
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, frameon=False
+    )

@@ -1,0 +1,87 @@
+"""Plots of a fit: how it went, and how its held-out views are spread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from mi_nerfattack.fit.options import FitProgress
+from mi_nerfattack.fit.scores import ViewScore
+from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
+
+_SMOOTH = 20  # points that a running mean spans, at most
+
+
+def write_curve(
+    path: str | Path, history: Sequence[FitProgress], heldout_db: float
+) -> None:
+    """Plot loss and PSNR of a fit against its steps and its time.
+
+    Args:
+        path: PNG file.
+        history: reports in order; may be empty.
+        heldout_db: mean PSNR of the held-out views at the end.
+    """
+    steps = [at.step for at in history]
+    minutes = [at.elapsed_s / 60 for at in history]
+    loss, psnr = [at.loss for at in history], [at.psnr_db for at in history]
+    with chart(path, 4.6) as figure:
+        grid = figure.subplots(2, 2, sharex="col", sharey="row")
+        for axes, across in zip(grid.T, (steps, minutes), strict=True):
+            for axis, values, colour in zip(
+                axes, (loss, psnr), (ORANGE, BLUE), strict=True
+            ):
+                axis.plot(across, values, color=colour, linewidth=0.6, alpha=0.45)
+                axis.plot(across, running_mean(values), color=colour, linewidth=1.8)
+                axis.grid(alpha=0.25)
+            if np.isfinite(heldout_db):
+                axes[1].axhline(heldout_db, color=GREY, linestyle="--", zorder=1)
+                text = f"held-out views at the end: {heldout_db:.2f} dB"
+                axes[1].set_title(text, loc="right", fontsize=8, color="#555555")
+            axes[1].xaxis.set_major_locator(MaxNLocator(6))
+        if loss and min(loss) > 0:
+            grid[0, 0].set_yscale("log")
+        grid[0, 0].set_title("Rays that are fitted to", loc="left")
+        grid[0, 0].set_ylabel("loss")
+        grid[1, 0].set_ylabel("PSNR (dB)")
+        grid[1, 0].set_xlabel("step")
+        grid[1, 1].set_xlabel("time (minutes)")
+        figure.align_ylabels()
+
+
+def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:
+    """Plot how many held-out views have which PSNR.
+
+    Args:
+        path: PNG file.
+        scores: of the held-out views; those of infinite PSNR are left out.
+    """
+    values = [score.psnr_db for score in scores if np.isfinite(score.psnr_db)]
+    with chart(path, 2.6) as figure:
+        axis = figure.subplots()
+        if values:
+            low, high = np.floor(min(values)), np.floor(max(values)) + 1
+            width = max(0.5, np.ceil((high - low) / 30))
+            bins = np.arange(low, high + width, width).tolist()
+            axis.hist(values, bins, color=BLUE, rwidth=0.9)
+            axis.axvline(float(np.mean(values)), color=ORANGE, linestyle="--")
+            label = f"mean {np.mean(values):.2f} dB"
+            axis.set_title(label, loc="right", fontsize=8, color=ORANGE)
+        axis.set_title("Held-out views", loc="left")
+        axis.set_xlabel("PSNR (dB)")
+        axis.set_ylabel("views")
+        axis.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        axis.grid(alpha=0.25, axis="y")
+
+
+def running_mean(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Average each value with those around it, fewer at both ends; same length."""
+    data = np.asarray(values, np.float64)
+    reach = min(_SMOOTH // 2, len(data) // 8)
+    total = np.concatenate([[0.0], np.cumsum(data)])
+    index = np.arange(len(data))
+    low, high = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(data))
+    return (total[high] - total[low]) / (high - low)

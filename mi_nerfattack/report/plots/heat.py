@@ -1,0 +1,293 @@
+"""Where on an object a failure is made: its texture's gradient as heat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import matplotlib
+import mitsuba as mi
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    generate_rays,
+    look_at,
+    pose_arrays,
+)
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
+
+#: Sides of the object, by the compass of its own frame: degrees about z from +x.
+SIDES = {"from +x": 0.0, "from +y": 90.0, "from -x": 180.0, "from -y": 270.0}
+ELEVATION_DEG = 15.0
+DISTANCE = 4.0  # of the eye from the object's centre, in radii of its box
+#: Opacity below which a pixel counts as beside the object.
+VISIBLE = 0.1
+COLOUR_MAP = "viridis"  # perceptually uniform
+PAPER = np.array([1.0, 1.0, 1.0])
+#: The finest level that is shown has at most so many vertices along an edge: finer
+#: ones show which rays were traced rather than where the object matters.
+MAX_RESOLUTION = 28
+
+
+class MagnitudeField(AbstractField):
+    """A grid field's geometry, with numbers of its vertices in place of colours.
+
+    Not differentiable.
+
+    Args:
+        grid: gives bounds, occupancy and density.
+        values: (n_vertices,) numbers at least 0 on one level and 0 on all others,
+            which are interpolated.
+    """
+
+    kind = "magnitude_field"
+
+    def __init__(self, grid: GridField, values: np.ndarray) -> None:
+        self.grid = grid
+        self.lower, self.upper = grid.lower, grid.upper
+        self.step_m, self.cone, self.occupancy = grid.step_m, grid.cone, grid.occupancy
+        table = np.repeat(np.asarray(values, np.float32)[:, None], 3, axis=1)
+        density = grid.parameters()["density"].numpy().copy()
+        self.values = GridField(
+            grid.layout,
+            grid.lower,
+            grid.upper,
+            density,
+            table,
+            grid.occupancy,
+            grid.density_scale,
+            grid.step_m,
+        )
+
+    def eval(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate density and, as a grey radiance, the interpolated number."""
+        density, _ = self.grid.eval(point, direction, active)
+        unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
+        features = self.values.encoding(unit, active)
+        levels = range(1, self.grid.layout.levels)
+        number = sum((features[4 * level + 1] for level in levels), start=features[1])
+        return density, mi.Color3f(number) & active
+
+    def parameters(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def set_parameter(self, name: str, value: Any) -> None:
+        """Refuse every name."""
+        del value
+        raise KeyError(f"{name}: a magnitude field has no parameters")
+
+    def arrays(self) -> list[Any]:
+        """Return what both grids read."""
+        return [*self.grid.arrays(), self.values.packed]
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return nothing: the field is never stored."""
+        return {}
+
+    def metadata(self) -> dict[str, str]:
+        """Return nothing."""
+        return {}
+
+    def density_bound(self) -> float:
+        """Return the grid's."""
+        return self.grid.density_bound()
+
+
+@dataclass(frozen=True, eq=False)
+class SideView:
+    """An object from one side.
+
+    Attributes:
+        name: of the side.
+        colour: (height, width, 3), sRGB in [0, 1], over white.
+        heat: (height, width), gradient per volume, NaN beside the object.
+    """
+
+    name: str
+    colour: np.ndarray
+    heat: np.ndarray
+
+
+def surface_heat(grid: GridField, gradient: np.ndarray) -> np.ndarray:
+    """Turn a texture's gradient into numbers that one level's vertices hold.
+
+    The gradient at a vertex adds up what the surface within a voxel around it
+    contributes; on the chosen level, the finest of at most `MAX_RESOLUTION` vertices
+    along an edge, it is divided by the volume of that voxel.
+
+    Args:
+        grid: the object.
+        gradient: (n_vertices, 3), derivative by the raw colours.
+
+    Returns:
+        (n_vertices,), Euclidean norm over colours, per cubic metre.
+
+    Raises:
+        InputError: another shape, or not finite.
+    """
+    gradient = np.asarray(gradient, np.float64)
+    if gradient.shape != (grid.n_vertices, 3) or not np.isfinite(gradient).all():
+        raise InputError(
+            f"gradient: shape {gradient.shape}; expected finite {(grid.n_vertices, 3)}"
+        )
+    level, resolution = _shown_level(grid)
+    start = grid.encoding.level_offset(level)
+    end = start + resolution**3
+    voxel = np.prod((grid.upper - grid.lower) / (resolution - 1))
+    values = np.zeros(grid.n_vertices)
+    values[start:end] = np.linalg.norm(gradient[start:end], axis=1) / voxel
+    return values
+
+
+def side_views(
+    grid: GridField, gradient: np.ndarray, edge_px: int = 320
+) -> list[SideView]:
+    """Render an object and its heat from four sides, a little from above.
+
+    Args:
+        grid: the object, with the texture that is to be seen.
+        gradient: (n_vertices, 3), derivative by its texture.
+        edge_px: longer edge of the views.
+    """
+    values = surface_heat(grid, gradient)
+    largest = values.max() or 1.0  # keeps the march in a good range of numbers
+    colours = PosedField(grid)
+    heats = PosedField(MagnitudeField(grid, values / largest))
+    poses = {name: _pose(grid, azimuth) for name, azimuth in SIDES.items()}
+    camera = _camera(grid, list(poses.values()), edge_px)
+    views = []
+    for name, pose in poses.items():
+        colour, opacity = _render(colours, camera, pose)
+        heat, _ = _render(heats, camera, pose)
+        seen = opacity > VISIBLE
+        shown = heat[..., 0] / np.where(seen, opacity, 1) * largest
+        over = colour + (1 - opacity[..., None]) * PAPER
+        srgb = linear_to_srgb_numpy(over).clip(0, 1)
+        views.append(SideView(name, srgb, np.where(seen, shown, np.nan)))
+    return views
+
+
+def write_heat(
+    path: str | Path, objects: dict[str, Sequence[SideView]], unit: str = "cost"
+) -> None:
+    """Write a picture: two rows an object, as it looks and its heat, a column a side.
+
+    The colours of all objects have one scale, from zero to the 99.5th percentile.
+
+    Args:
+        path: PNG file.
+        objects: views by name of the object.
+        unit: of the objective, for the colour bar.
+    """
+    if not objects:
+        raise InputError("objects: none; give at least one")
+    heats = np.concatenate(
+        [view.heat.ravel() for views in objects.values() for view in views]
+    )
+    known = heats[np.isfinite(heats)]
+    top = float(np.percentile(known, 99.5)) if known.size else 0.0
+    norm = Normalize(0.0, top or 1.0)
+    rows = 2 * len(objects)
+    with chart(path, _height_in(objects)) as figure:
+        axes = figure.subplots(rows, len(SIDES), squeeze=False)
+        for i, (name, views) in enumerate(objects.items()):
+            for column, view in enumerate(views):
+                _show(axes[2 * i, column], view.colour, f"{name} {view.name}")
+                _show(axes[2 * i + 1, column], _coloured(view, norm), "")
+            axes[2 * i, 0].set_ylabel("as it looks")
+            axes[2 * i + 1, 0].set_ylabel("sensitivity")
+        bar = figure.colorbar(
+            ScalarMappable(norm, COLOUR_MAP),
+            ax=axes.ravel().tolist(),
+            extend="max",
+            fraction=0.03,
+            aspect=40,
+        )
+        bar.set_label(f"|d {unit} / d raw colour| per m³")
+
+
+def _height_in(objects: dict[str, Sequence[SideView]]) -> float:
+    """Return the height at which views fill their cells, inches."""
+    cell_in = WIDTH_PX / DPI / (len(SIDES) + 0.7)
+    aspects = [views[0].heat.shape for views in objects.values()]
+    rows = sum(2 * height / width for height, width in aspects)
+    return rows * cell_in + 0.35 * len(objects)
+
+
+def _shown_level(grid: GridField) -> tuple[int, int]:
+    """Return the level that is shown, and its vertices along an edge."""
+    encoding: Any = grid.encoding
+    best = (0, 0)
+    for level in range(grid.layout.levels):
+        resolution = int(encoding._resolution(encoding._level_scale(level)))
+        if level == 0 or best[1] < resolution <= MAX_RESOLUTION:
+            best = level, resolution
+    return best
+
+
+def _pose(grid: GridField, azimuth_deg: float) -> np.ndarray:
+    """Place the eye on one side of the object, camera_to_world (4, 4)."""
+    centre = 0.5 * (grid.lower + grid.upper)
+    distance = DISTANCE * 0.5 * float(np.linalg.norm(grid.upper - grid.lower))
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(ELEVATION_DEG)
+    level = np.cos(elevation)
+    outwards = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
+    return look_at(centre + distance * np.array(outwards), centre)
+
+
+def _camera(grid: GridField, poses: Sequence[np.ndarray], edge_px: int) -> Camera:
+    """Make the camera whose frame the object's box just fits in from all poses."""
+    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper, strict=True)), -1)
+    corners = corners.reshape(-1, 3)
+    slopes = []
+    for pose in poses:
+        local = (corners - pose[:3, 3]) @ pose[:3, :3]
+        slopes.append(np.abs(local[:, :2] / local[:, 2:]).max(axis=0))
+    reach = np.max(slopes, axis=0)
+    focal = 0.5 * edge_px / reach.max()
+    width, height = (max(1, int(size)) for size in np.ceil(2 * focal * reach))
+    return Camera(width, height, focal, focal, width / 2, height / 2)
+
+
+def _render(
+    posed: PosedField, camera: Camera, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return premultiplied radiance (height, width, 3) and opacity."""
+    origin, direction = generate_rays(camera, *pose_arrays(pose), 1)
+    far, middle = mi.Float(dr.inf), mi.Float(0.5)
+    seen = march(posed, origin, direction, far, middle, mi.Bool(True))
+    dr.eval(seen.radiance, seen.opacity)
+    shape = (camera.height, camera.width)
+    radiance = seen.radiance.numpy().T.reshape(*shape, 3)
+    return radiance.copy(), seen.opacity.numpy().reshape(shape).copy()
+
+
+def _coloured(view: SideView, norm: Normalize) -> np.ndarray:
+    """Colour a heat map by the colour map, white beside the object."""
+    known = np.isfinite(view.heat)
+    mapped = matplotlib.colormaps[COLOUR_MAP](norm(np.where(known, view.heat, 0)))
+    return np.where(known[..., None], mapped[..., :3], PAPER)
+
+
+def _show(axis: Axes, image: np.ndarray, title: str) -> None:
+    axis.imshow(image, interpolation="nearest")
+    axis.set_xticks([])
+    axis.set_yticks([])
+    axis.spines[:].set_visible(False)
+    axis.set_title(title, fontsize=9)

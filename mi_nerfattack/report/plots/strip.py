@@ -1,0 +1,91 @@
+"""A strip of first-person frames: one row per drive, one column per time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+SCALE = 2
+GAP_PX = 6
+FONT_PX = 24
+
+_BACKGROUND, _INK, _ABSENT = (255, 255, 255), (20, 20, 20), (225, 225, 225)
+
+
+def first_person_strip(
+    path: str | Path,
+    rows: Mapping[str, Sequence[np.ndarray]],
+    times_s: Sequence[float],
+) -> None:
+    """Write a labelled grid of frames as an image.
+
+    Pixels are doubled, not interpolated, so that the picture shows what the policy
+    saw. A row shorter than the times (the drive ended) is filled with plain grey.
+
+    Args:
+        path: PNG or JPEG file.
+        rows: frames of each row by label, sRGB, uint8, (H, W, 3), all of one size; a
+            line break in a label starts another line.
+        times_s: time of each column, seconds.
+    """
+    height, width = _checked_size(rows, times_s)
+    font = _font()
+    label_px = 2 * GAP_PX + max(_text_width(font, label) for label in rows)
+    header_px = FONT_PX + 2 * GAP_PX
+    column_px, row_px = SCALE * width + GAP_PX, SCALE * height + GAP_PX
+    size = (label_px + column_px * len(times_s), header_px + row_px * len(rows))
+    sheet = Image.new("RGB", size, _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    for column, time in enumerate(times_s):
+        centre = label_px + column * column_px + SCALE * width // 2
+        text = f"{time:.1f} s"
+        draw.text((centre, header_px // 2), text, _INK, font, anchor="mm")
+    for row, (label, frames) in enumerate(rows.items()):
+        top = header_px + row * row_px
+        middle = (GAP_PX, top + SCALE * height // 2)
+        draw.text(middle, label, _INK, font, anchor="lm", spacing=GAP_PX)
+        for column in range(len(times_s)):
+            left = label_px + column * column_px
+            if column < len(frames):
+                sheet.paste(_enlarged(frames[column]), (left, top))
+            else:
+                corner = (left + SCALE * width - 1, top + SCALE * height - 1)
+                draw.rectangle(((left, top), corner), fill=_ABSENT)
+    files.write_image(path, np.asarray(sheet))
+
+
+def _checked_size(
+    rows: Mapping[str, Sequence[np.ndarray]], times_s: Sequence[float]
+) -> tuple[int, int]:
+    shapes = {frame.shape for frames in rows.values() for frame in frames}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 3 or next(iter(shapes))[2] != 3:
+        raise InputError(f"rows: frames of shapes {sorted(shapes)}; need one (H, W, 3)")
+    for label, frames in rows.items():
+        if len(frames) > len(times_s):
+            raise InputError(
+                f"rows.{label}: {len(frames)} frames for {len(times_s)} times"
+            )
+        if any(frame.dtype != np.uint8 for frame in frames):
+            raise InputError(f"rows.{label}: frames must be uint8 sRGB values")
+    height, width, _ = next(iter(shapes))
+    return height, width
+
+
+def _enlarged(frame: np.ndarray) -> Image.Image:
+    return Image.fromarray(frame.repeat(SCALE, axis=0).repeat(SCALE, axis=1))
+
+
+def _font() -> ImageFont.FreeTypeFont:
+    fonts = Path(matplotlib.get_data_path(), "fonts", "ttf")
+    return ImageFont.truetype(fonts / "DejaVuSans.ttf", FONT_PX)
+
+
+def _text_width(font: ImageFont.FreeTypeFont, label: str) -> int:
+    return max(int(np.ceil(font.getlength(line))) for line in label.split("\n"))

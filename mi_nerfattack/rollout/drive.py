@@ -1,0 +1,139 @@
+"""Recorded drives and when they leave the lane."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.route.route import Route
+
+#: In the order of documents and plots; others follow, by name. `metrics.json` has the
+#: first two alone.
+ENVIRONMENTS = (
+    "surrogate",
+    "deployment",
+    "mitsuba",
+    "mujoco",
+    "mujoco_gl",
+    "replay",
+    "carla",
+)
+
+
+CASES = ("unperturbed", "random", "gradient", "clean", "random_objects")
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One closed-loop drive of T >= 1 steps; its arrays are read-only float64 copies.
+
+    Args:
+        environment: its name, one of `ENVIRONMENTS` or your own.
+        route: name of the reference route.
+        case: one of `CASES`.
+        run: index among the drives of one route, environment and case, from 0.
+        seed: seed of this drive.
+        states: (T+1, 3), x and y in metres and heading in radians, initial state
+            included.
+        controls: (T,), the control that led from state t to state t+1.
+        cross_track_m: (T,), signed cross-track error of `states[1:]`, metres.
+        time_s: (T,), time of `states[1:]`, seconds, increasing.
+
+    Raises:
+        InputError: for an unknown case, an empty name, a wrong shape or a value that is
+            not finite.
+    """
+
+    environment: str
+    route: str
+    case: str
+    run: int
+    seed: int
+    states: np.ndarray
+    controls: np.ndarray
+    cross_track_m: np.ndarray
+    time_s: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.case not in CASES:
+            raise InputError(
+                f"Drive.case: {self.case!r}; must be one of {', '.join(CASES)}"
+            )
+        for name in ("environment", "route"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value:
+                raise InputError(f"Drive.{name}: {value!r}; a non-empty name is needed")
+        for name in ("run", "seed"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise InputError(f"Drive.{name}: {value!r}; an integer is needed")
+            if value < 0:
+                raise InputError(f"Drive.{name}: {value}; must not be negative")
+            object.__setattr__(self, name, int(value))
+        steps = np.shape(self.controls)[0] if np.ndim(self.controls) else 0
+        if steps < 1:
+            raise InputError("Drive.controls: no step; a drive has at least one")
+        self._freeze("states", (steps + 1, 3))
+        for name in ("controls", "cross_track_m", "time_s"):
+            self._freeze(name, (steps,))
+        if np.any(np.diff(self.time_s) <= 0):
+            raise InputError("Drive.time_s: not increasing; give seconds step by step")
+
+    def _freeze(self, name: str, shape: tuple[int, ...]) -> None:
+        array = np.array(getattr(self, name), dtype=np.float64)
+        if array.shape != shape:
+            raise InputError(f"Drive.{name}: shape {array.shape}; must be {shape}")
+        if not np.all(np.isfinite(array)):
+            step = np.argwhere(~np.isfinite(array))[0][0]
+            raise InputError(
+                f"Drive.{name}: value at index {step} is not finite; the drive diverged"
+            )
+        array.flags.writeable = False
+        object.__setattr__(self, name, array)
+
+    @property
+    def distance_m(self) -> np.ndarray:
+        """Return the distance from the lane centre at each step, (T,), metres."""
+        return np.abs(self.cross_track_m)
+
+    def departed(self, limit: float) -> np.ndarray:
+        """Return a boolean per step, (T,): whether the distance exceeds the limit."""
+        return self.distance_m > limit
+
+
+def departure_limit(lane_width_m: float, car_width_m: float) -> float:
+    """Return the distance from the lane centre beyond which a step departs.
+
+    Half a lane width less half a car width, metres.
+
+    Raises:
+        InputError: unless 0 < car_width_m < lane_width_m, both finite.
+    """
+    if not 0 < car_width_m < lane_width_m < float("inf"):
+        raise InputError(
+            f"car_width_m, lane_width_m: {car_width_m!r}, {lane_width_m!r}; both must "
+            "be positive metres and the car narrower than the lane"
+        )
+    return (lane_width_m - car_width_m) / 2
+
+
+def departure_limits(routes: Iterable[Route], car_width_m: float) -> dict[str, float]:
+    """Return the departure limit of each route by its name, metres.
+
+    Raises:
+        InputError: a lane is no wider than the car, or a width is not positive.
+    """
+    limits = {}
+    for route in routes:
+        try:
+            limits[route.name] = departure_limit(route.lane_width_m, car_width_m)
+        except InputError as error:
+            raise InputError(
+                f"route {route.name!r}: its lane is {route.lane_width_m} m wide, the "
+                f"vehicle {car_width_m} m; give the vehicle's width in metres, or take "
+                "a wider lane"
+            ) from error
+    return limits

@@ -1,0 +1,89 @@
+"""Offsets of an object's pose: a shift and a rotation vector about its origin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.posed import PosedField
+
+
+def offset_pose(pose: Pose, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Move a pose.
+
+    Args:
+        pose: field to world.
+        offset: (6,), shift in metres and rotation vector in radians, world axes.
+
+    Returns:
+        rotation (3, 3) and translation (3,), field to world.
+    """
+    turn = Rotation.from_rotvec(offset[3:]).as_matrix()
+    return turn @ pose.rotation, pose.translation + offset[:3]
+
+
+def offset_gradient(wrench: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Turn what rays see of a motion into the derivative by the offset.
+
+    Args:
+        wrench: (6,): sums over rays of ``g_o`` and of ``v x g_o + d x g_d``, with g
+            the objective's derivatives by origin and direction d of a ray as the
+            object sees it, v from the object's origin to the ray's.
+        offset: (6,), where the derivative is taken.
+
+    Returns:
+        (6,), per metre and per radian.
+
+    Source: Chirikjian 2012, "Stochastic Models, Information Theory, and Lie Groups",
+    vol. 2, section 10.6 (the left Jacobian of the rotation vector).
+    """
+    return np.concatenate([-wrench[:3], -left_jacobian(offset[3:]).T @ wrench[3:]])
+
+
+def left_jacobian(vector: np.ndarray) -> np.ndarray:
+    """Return (3, 3) J with ``d exp([w]) = [J dw] exp([w])`` for a rotation vector."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-4:
+        return np.eye(3) + cross / 2 + cross @ cross / 6
+    first = (1 - np.cos(angle)) / angle**2
+    second = (angle - np.sin(angle)) / angle**3
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def wrench_of(posed: PosedField, rays: Any, seen_as: Any) -> list[Any]:
+    """Sum the derivatives by rays into the six numbers of :func:`offset_gradient`.
+
+    Args:
+        posed: the object where it is.
+        rays: n rays.
+        seen_as: derivatives by origin and direction, (3, n) each.
+    """
+    by_origin, by_direction = seen_as
+    arm = mi.Vector3f(rays.origin - posed.origin)
+    torque = dr.cross(arm, by_origin) + dr.cross(rays.direction, by_direction)
+    double = dr.float64_array_t(mi.Float)
+    return [dr.sum(double(row)) for row in (*by_origin, *torque)]
+
+
+def offset_on_tape(posed: PosedField, pose: Pose, offset: Any) -> PosedField:
+    """Return the field moved by an offset, (6,), that is on Dr.Jit's tape."""
+    shift, w = mi.Vector3f(*offset[:3]), mi.Vector3f(*offset[3:])
+    square = dr.squared_norm(w)
+    angle = dr.sqrt(dr.maximum(square, 1e-12))
+    small = square < 1e-6
+    first = dr.select(small, 1 - square / 6, dr.sin(angle) / angle)
+    second = dr.select(small, 0.5 - square / 24, (1 - dr.cos(angle)) / dr.square(angle))
+    columns = []
+    for column in np.asarray(pose.rotation, np.float32).T:
+        v = mi.Vector3f(*map(float, column))
+        columns.append(
+            v + first * dr.cross(w, v) + second * dr.cross(w, dr.cross(w, v))
+        )
+    return posed.at(columns, mi.Point3f(*map(float, pose.translation)) + shift)

@@ -1,0 +1,217 @@
+"""Build what a scenario describes: fields, sensors, loops, routes, initial poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.path_traced_sensor import PathTracedSensor
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import GridField, load_field, load_grid
+from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.render.backdrop import Layer
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.interleaved import COMPOSITES
+from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.objective import AbstractObjective
+from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.scenario.build.camera import build_camera
+from mi_nerfattack.scenario.build.objective import build_objective
+from mi_nerfattack.scenario.build.vehicle import build_dynamics, build_integrator
+from mi_nerfattack.scenario.scenario import Scenario, resolve
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics
+from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """How all objects look, and where they stand.
+
+    Attributes:
+        textures: (n_vertices, 3) raw colours an object.
+        offsets: (k, 6), shift (metres) and rotation vector (radians) of each object
+            from where the scenario puts it.
+    """
+
+    textures: list[np.ndarray]
+    offsets: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A scenario brought to life.
+
+    Attributes:
+        scenario: what it was built from.
+        route: the lane centre.
+        fields: grid fields of the objects, in the scenario's order.
+        surrogate: sensor in the scene's field.
+        deployment: sensor in the path-traced scene.
+        policy: a policy.AbstractPolicy.
+        dynamics: the vehicle.
+        objective: what an attack makes smaller.
+        initial: (runs, 3) initial states, the first one nominal.
+    """
+
+    scenario: Scenario
+    route: Route
+    fields: list[GridField]
+    surrogate: FieldSensor
+    deployment: PathTracedSensor
+    policy: Any
+    dynamics: AbstractDynamics
+    objective: AbstractObjective
+    initial: np.ndarray
+
+    def loop(self, sensor: AbstractSensor) -> ClosedLoop:
+        """Close the loop through a sensor."""
+        vehicle = self.scenario.vehicle
+        return ClosedLoop(
+            sensor,
+            self.policy,
+            self.route.goal,
+            self.dynamics,
+            build_integrator(vehicle),
+            vehicle.dt_s,
+            vehicle.substeps,
+            vehicle.delay_steps,
+        )
+
+    def appearance(self) -> Appearance:
+        """Return how the objects look, and where they stand."""
+        textures = [grid.texture.numpy().copy() for grid in self.fields]
+        return Appearance(textures, self.surrogate.offsets())
+
+    def show(self, appearance: Appearance) -> None:
+        """Give the objects their textures and places, in both environments."""
+        self.set_textures(appearance.textures)
+        self.surrogate.set_offsets(appearance.offsets)
+
+    def set_textures(self, textures: list[np.ndarray]) -> None:
+        """Give each object a texture, (n_vertices, 3) raw colours."""
+        for field, texture in zip(self.fields, textures, strict=True):
+            field.set_parameter("texture", texture)
+
+
+def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
+    """Load all files of a scenario.
+
+    Args:
+        scenario: from :func:`scenario.load_scenario`.
+        base: folder that relative paths start from.
+        policy: the policy under test.
+
+    Raises:
+        InputError: a file is missing or wrong.
+    """
+    scene = _load_surrogate(scenario, base)
+    fields = [load_grid(resolve(item.field, base)) for item in scenario.objects]
+    posed = [
+        PosedField(
+            field, Pose.upright(item.position_m, np.radians(item.yaw_deg), item.scale)
+        )
+        for field, item in zip(fields, scenario.objects, strict=True)
+    ]
+    camera, mount = build_camera(scenario.camera)
+    route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
+    dynamics = build_dynamics(scenario.vehicle, base)
+    objective = build_objective(scenario, route, dynamics, base)
+    xml = load_scene(resolve(scenario.scene.deployment, base))
+    jitter = scenario.seed if scenario.attack.jitter else None
+    return World(
+        scenario,
+        route,
+        fields,
+        FieldSensor(
+            scene,
+            posed,
+            camera,
+            mount,
+            jitter,
+            composite=COMPOSITES[scenario.scene.composite](),
+        ),
+        PathTracedSensor(
+            xml, posed, camera, mount, scenario.deployment.spp, scenario.seed
+        ),
+        policy,
+        dynamics,
+        objective,
+        initial_states(scenario, route, scenario.drive.runs, 0),
+    )
+
+
+def _load_surrogate(scenario: Scenario, base: str | Path) -> Layer:
+    """Load the scene: a field, or splats, which are told by the suffix .ply."""
+    path, matrix = resolve(scenario.scene.field, base), scenario.scene.to_world
+    try:
+        pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
+    except ValueError as err:
+        raise InputError(
+            f"scene.to_world: {err}; give rotation, uniform scale and translation"
+        ) from err
+    if path.suffix.lower() != ".ply":
+        return PosedField(load_field(path), pose)
+    if scenario.attack.attached:
+        raise InputError(
+            f"{path}: splats have no derivative by the camera; set attack.attached to "
+            "false, or fit a field to the scene"
+        )
+    return SplatBackground(read_splats(path), pose)
+
+
+def initial_states(
+    scenario: Scenario, route: Route, count: int, stream: int
+) -> np.ndarray:
+    """Draw initial states normally around the route's start.
+
+    Args:
+        scenario: gives seed, and standard deviations or covariance.
+        route: its first point is the nominal pose.
+        count: number of states.
+        stream: different streams give independent states.
+
+    Returns:
+        (count, 3), metres and radians; the first is the nominal pose itself.
+
+    Source: appendix A.4.
+    """
+    rng = np.random.default_rng([scenario.seed, stream])
+    section, shifts = scenario.drive, np.zeros((3, count))
+    if section.covariance is None:
+        shifts[1] = rng.normal(0, section.lateral_sd_m, count)
+        shifts[2] = rng.normal(0, np.radians(section.heading_sd_deg), count)
+    else:  # which may be singular
+        values, vectors = np.linalg.eigh(section.covariance)
+        factor = vectors * np.sqrt(values.clip(min=0))
+        shifts[:] = factor @ rng.standard_normal((3, count))
+    shifts[:, 0] = 0.0
+    return route.pose_at(*shifts)
+
+
+def object_footprints(world: World) -> list[np.ndarray]:
+    """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
+    outlines = []
+    for posed in world.surrogate.objects:
+        low, high = posed.field.lower, posed.field.upper
+        corners = np.array(
+            [
+                [x, y, 0.0]
+                for x, y in (
+                    (low[0], low[1]),
+                    (high[0], low[1]),
+                    (high[0], high[1]),
+                    (low[0], high[1]),
+                )
+            ]
+        )
+        pose = posed.placed
+        world_corners = pose.scale * corners @ pose.rotation.T
+        outlines.append((world_corners + pose.translation)[:, :2])
+    return outlines

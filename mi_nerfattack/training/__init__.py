@@ -1,0 +1,1 @@
+"""Collecting frames, imitation, DAgger."""

@@ -1,0 +1,350 @@
+"""Driving frames with the expert's controls, rendered and written to shards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.placement import Roadside, Scatter
+from mi_nerfattack.deploy.sites import AbstractSite, as_json, expert_of, probe_expert
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.random_textures import random_texture
+from mi_nerfattack.io import files
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
+from mi_nerfattack.training.dataset import write_shard
+from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Called with frames done, frames wanted, and the remaining time in seconds.
+OnFrames = Callable[[int, int, float], None]
+
+_DONE = "shard.json"
+_MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class CollectSettings:
+    """Choices of a collection; the same settings and site give the same frames.
+
+    Args:
+        frames: wanted.
+        seed: of everything random.
+        shard: frames that are written together, under the same conditions.
+        group: states that are drawn around one place, with the same object.
+        groups_a_texture: groups that share a texture.
+        object_share: share of the groups with an object.
+        original_share: share of these where it keeps its own texture.
+        spread_m: states of a group lie within this arc length of their centre.
+        ahead_m: arc length from a group's centre to its object, range.
+        margin_m: arc length before and after an open route, from where frames come
+            too.
+        scatter: deviations of the states from the route.
+        roadside: sizes and places of the objects.
+    """
+
+    frames: int = 9000
+    seed: int = 0
+    shard: int = 64
+    group: int = 8
+    groups_a_texture: int = 2
+    object_share: float = 0.75
+    original_share: float = 0.1
+    spread_m: float = 3.0
+    ahead_m: tuple[float, float] = (4.0, 20.0)
+    margin_m: float = 2.0
+    scatter: Scatter = field(default_factory=Scatter)
+    roadside: Roadside = field(default_factory=Roadside)
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "shard", "group", "groups_a_texture"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise InputError(f"CollectSettings.{name}: {value!r}; at least 1")
+        for name in ("object_share", "original_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(
+                    f"CollectSettings.{name}: {getattr(self, name)!r}; in [0, 1]"
+                )
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.frames // self.shard)
+
+    def size(self, index: int) -> int:
+        """Return the number of frames of a shard; the last one may have fewer."""
+        return min(self.shard, self.frames - index * self.shard)
+
+
+def collect(
+    site: AbstractSite,
+    routes: Sequence[Route],
+    source: AbstractSource,
+    settings: CollectSettings,
+    folder: str | Path,
+    workers: AbstractWorkers,
+    progress: OnFrames = lambda done, total, left_s: None,
+) -> list[Path]:
+    """Render what vehicles near the routes see, and label it by the expert.
+
+    Shards that are complete are kept; each has random numbers of its own. So the
+    frames depend neither on the number of workers nor on interruptions, however hard.
+
+    Args:
+        site: makes the environments, and gives objects and ground.
+        routes: they take turns by chance, longer ones more often.
+        source: of the states.
+        settings: see there.
+        folder: gets `<site.name>/shard_0000` and so on, and a manifest.
+        workers: who renders.
+        progress: called now and then; an exception from it stops the work.
+
+    Returns:
+        The folders of the shards, in order.
+
+    Raises:
+        InputError: the folder holds frames of other settings, files, routes or states;
+            a file cannot be written; a worker ended.
+    """
+    root = files.make_folder(Path(folder) / site.name)
+    about = {
+        "settings": asdict(settings),
+        "site": site.describe(),
+        "source": source.describe(),
+        "routes": _digest(routes),
+        "expert": {route.name: probe_expert(site, route) for route in routes},
+    }
+    _claim(root, about)
+    paths = [root / f"shard_{index:04d}" for index in range(settings.shards)]
+    missing = [i for i, path in enumerate(paths) if not _is_done(path)]
+    counter = _Counter(settings, missing, progress)
+    work = _Shards(site, tuple(routes), source, settings, root)
+    workers.run(work, missing, counter.add)
+    return paths
+
+
+@dataclass(frozen=True, eq=False)
+class _Shards(AbstractWork):
+    """The shards of a collection, as work for one or more processes."""
+
+    site: AbstractSite
+    routes: tuple[Route, ...]
+    source: AbstractSource
+    settings: CollectSettings
+    root: Path
+
+    def open(self) -> _Stage:
+        """Load objects, ground and what the source needs."""
+        return _Stage(self.site, self.settings, self.source.prepare())
+
+    def do(self, opened: _Stage, index: int, report: OnUnits) -> None:
+        """Render, label and write one shard."""
+        rng = np.random.default_rng(
+            [self.settings.seed, index, *self.site.name.encode()]
+        )
+        conditions = self.site.draw(rng)
+        environment = opened.environment(conditions)
+        wanted, rows = self.settings.size(index), []
+        images: list[np.ndarray] = []
+        for goal, (image, control) in self._rows(opened, environment, rng):
+            rows.append((goal, control))
+            images.append(image)
+            report(1)
+            if len(rows) == wanted:
+                break
+        goals, controls = (np.array(column) for column in zip(*rows, strict=True))
+        self._finish(index, np.stack(images), goals, controls, conditions)
+
+    def close(self, opened: _Stage) -> None:
+        """Close the environment."""
+        opened.close()
+
+    def _rows(
+        self, stage: _Stage, environment: AbstractEnvironment, rng: np.random.Generator
+    ) -> Iterator[tuple[int, Labelled]]:
+        """Yield goals and labelled frames without end."""
+        experts = {route.name: expert_of(self.site, route) for route in self.routes}
+        states = _draw_states(self.routes, self.settings, rng)
+        for number, (route, arc, poses) in enumerate(states):
+            stage.dress(environment, route, arc, number, rng)
+            scenery = Scenery(environment, route, experts[route.name], poses, rng)
+            for labelled in self.source.frames(stage.prepared, scenery):
+                yield route.goal, labelled
+
+    def _finish(
+        self,
+        index: int,
+        images: np.ndarray,
+        goals: np.ndarray,
+        controls: np.ndarray,
+        conditions: Any,
+    ) -> None:
+        """Write one shard and, last, the file that says that it is complete."""
+        shard = self.root / f"shard_{index:04d}"
+        write_shard(shard, images, goals, controls)
+        counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
+        about = {
+            "frames": len(goals),
+            "goals": counts,
+            "conditions": asdict(conditions),
+        }
+        files.write_json(shard / _DONE, about)
+
+
+class _Stage:
+    """What a worker keeps from shard to shard: one environment, objects, ground.
+
+    Args:
+        site: see `collect`.
+        settings: see `collect`.
+        prepared: what the source needs.
+    """
+
+    def __init__(
+        self, site: AbstractSite, settings: CollectSettings, prepared: Any
+    ) -> None:
+        self.site, self.settings, self.prepared = site, settings, prepared
+        self.objects = site.load_objects() if settings.object_share > 0 else []
+        self.own = [item.texture.numpy().copy() for item in self.objects]
+        self.ground = site.load_ground() if self.objects else None
+        self._open: tuple[Any, AbstractEnvironment] | None = None
+
+    def environment(self, conditions: Any) -> AbstractEnvironment:
+        """Return the environment under conditions; it is loaded where they differ."""
+        if self._open is None or self._open[0] != conditions:
+            self.close()
+            self._open = conditions, self.site.open(conditions)
+        return self._open[1]
+
+    def close(self) -> None:
+        """Close the environment."""
+        if self._open is not None:
+            self._open[1].close()
+        self._open = None
+
+    def dress(
+        self,
+        environment: AbstractEnvironment,
+        route: Route,
+        arc: float,
+        number: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Put an object beside the road, or none; change its texture now and then.
+
+        Args:
+            environment: shows it.
+            route: beside which it stands.
+            arc: arc length of the group's centre, metres.
+            number: of the group in its shard.
+            rng: source of all draws.
+        """
+        settings = self.settings
+        if self.ground is None:
+            environment.show([])
+            return
+        turn, rest = divmod(number, settings.groups_a_texture)
+        index = turn % len(self.objects)
+        chosen = self.objects[index]
+        if rest == 0:
+            keep = rng.uniform() < settings.original_share
+            texture = random_texture(chosen, "mixed", int(rng.integers(2**31)))
+            chosen.set_parameter("texture", self.own[index] if keep else texture)
+        posed = []
+        if rng.uniform() < settings.object_share:
+            reach = (arc + settings.ahead_m[0], arc + settings.ahead_m[1])
+            pose = settings.roadside.place(chosen, route, reach, self.ground, rng)
+            posed = [PosedField(chosen, pose)]
+        environment.show(posed)
+
+
+class _Counter:
+    """Adds up the frames of all workers, and tells how long the rest will take."""
+
+    def __init__(
+        self, settings: CollectSettings, missing: Sequence[int], progress: OnFrames
+    ) -> None:
+        self.total, self.progress = settings.frames, progress
+        self.done = self.total - sum(settings.size(index) for index in missing)
+        self.first, self.start = self.done, time.monotonic()
+        if missing:
+            progress(self.done, self.total, float("nan"))
+        else:
+            progress(self.total, self.total, 0.0)
+
+    def add(self, frames: int) -> None:
+        """Count frames that were just rendered."""
+        self.done += frames
+        pace = (time.monotonic() - self.start) / (self.done - self.first)
+        self.progress(self.done, self.total, pace * (self.total - self.done))
+
+
+def _draw_states(
+    routes: Sequence[Route], settings: CollectSettings, rng: np.random.Generator
+) -> Iterator[tuple[Route, float, np.ndarray]]:
+    """Draw groups without end: route, arc length of the centre, states (k, 3)."""
+    lengths = np.array([route.length for route in routes])
+    while True:
+        route = routes[rng.choice(len(routes), p=lengths / lengths.sum())]
+        margin = 0.0 if route.closed else settings.margin_m
+        centre = float(rng.uniform(-margin, route.length + margin))
+        spread = rng.uniform(-settings.spread_m, settings.spread_m, settings.group)
+        arc = np.clip(centre + spread, -margin, route.length + margin)
+        yield route, centre, settings.scatter.states(route, arc, rng)
+
+
+def find_shards(folder: str | Path) -> list[Path]:
+    """Return the complete shards anywhere below a folder, in order of their names.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = sorted(path.parent for path in Path(folder).rglob(_DONE))
+    if not found:
+        raise InputError(
+            f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
+        )
+    return found
+
+
+def _is_done(shard: Path) -> bool:
+    return (shard / _DONE).is_file()
+
+
+def _claim(root: Path, about: dict[str, Any]) -> None:
+    """Write the manifest, or compare it with that of the frames that are there."""
+    path, about = root / _MANIFEST, as_json(about)
+    if not any(_is_done(shard) for shard in root.glob("shard_*")):
+        files.write_json(path, about)
+        return
+    if not path.is_file():
+        raise InputError(
+            f"{root}: holds frames without {_MANIFEST}; choose another folder or "
+            "remove this one"
+        )
+    found = files.read_json(path)
+    if found != about:
+        keys = sorted(set(found) | set(about))
+        wrong = [key for key in keys if found.get(key) != about.get(key)]
+        raise InputError(
+            f"{path}: the frames there differ in {', '.join(wrong)}; "
+            "choose another folder or remove this one"
+        )
+
+
+def _digest(routes: Sequence[Route]) -> str:
+    """Return a checksum of names, goals, lanes' widths, speeds, points and shapes."""
+    about = [
+        [r.name, r.goal, r.lane_width_m, r.speed_ms, r.closed, r.points.tolist()]
+        for r in routes
+    ]
+    return hashlib.sha256(json.dumps(about).encode()).hexdigest()

@@ -1,0 +1,340 @@
+"""From a place to a policy: collect, train, let it drive, train again, validate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mi_nerfattack.deploy.sites import AbstractSite
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.evaluate import check_roadside
+from mi_nerfattack.io import files
+from mi_nerfattack.io.locks import exclusive, remove_partial
+from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
+from mi_nerfattack.rollout.drive import departure_limits
+from mi_nerfattack.system.workers import AbstractWorkers
+from mi_nerfattack.training.collect import OnFrames, collect
+from mi_nerfattack.training.dataset import FrameDataset, divide_shards
+from mi_nerfattack.training.settings import ImitationSettings
+from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
+from mi_nerfattack.training.train import Progress, check_labels, fit_policy
+from mi_nerfattack.training.validation import ClosedLoop, rank
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Called with the name of the stage, units done and wanted, and what to show.
+OnStage = Callable[[str, float, float, str], None]
+
+#: Number of the collection of held-out frames; more than there are rounds.
+_HELD_OUT = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Imitated:
+    """A trained policy, the history of each training, and its closed-loop card.
+
+    The policy is that of the best validation of all rounds; the shards are all that
+    were trained on or held out.
+    """
+
+    module: PilotNet
+    history: list[list[dict[str, Any]]]
+    best_round: int
+    card: dict[str, Any]
+    shards: list[Path]
+
+
+def imitate(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    folder: str | Path,
+    workers: AbstractWorkers,
+    progress: OnStage = lambda stage, done, total, state: None,
+    start: PilotNet | None = None,
+    more: Sequence[Path] = (),
+) -> Imitated:
+    """Train a policy to follow the lane, and measure it in the closed loop.
+
+    Everything slow is kept in the folder: the same call continues where it stopped.
+
+    Args:
+        sites: with different names; those of `settings`.
+        routes: to drive; their goals are those of the policy.
+        settings: see there.
+        folder: of frames and checkpoints.
+        workers: who collects.
+        progress: called often; an exception from it stops the work.
+        start: weights to begin with; None for random ones.
+        more: shards of earlier collections to train on, too.
+
+    Raises:
+        InputError: before the first frame, no frames wanted, an unknown site, one
+            that cannot be opened, a goal missing, a camera, a route, first weights or
+            frames of `more` that do not fit, or another process that works in the
+            folder; then, where the folder holds what was made with other settings.
+    """
+    _check(sites, routes, settings, more)
+    torch.manual_seed(settings.seed)
+    car = sites[0].car
+    module = PilotNet(len(routes), car.max_control, car.control_unit)
+    if start is not None:
+        _take_weights(module, start)
+    if more:
+        _check_frames(module, more)
+    with exclusive(files.make_folder(folder)):
+        remove_partial(folder)  # of killed writers
+        run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
+        return run.run(module, more)
+
+
+class _Imitation:
+    """What the stages of one imitation share."""
+
+    def __init__(
+        self,
+        sites: Sequence[AbstractSite],
+        routes: Sequence[Route],
+        settings: ImitationSettings,
+        folder: Path,
+        workers: AbstractWorkers,
+        progress: OnStage,
+    ) -> None:
+        self.sites, self.routes, self.settings = sites, routes, settings
+        self.folder, self.workers, self.progress = folder, workers, progress
+        self.training: list[Path] = []
+        self.held_out: list[Path] = []
+        self._loop: ClosedLoop | None = None
+
+    def run(self, module: PilotNet, more: Sequence[Path]) -> Imitated:
+        """Do all stages, beginning with the weights of `module`."""
+        settings = self.settings
+        self.take(
+            [*more, *self.collect("round_0", settings.frames, settings.cloning, 0)]
+        )
+        self.held_out += self.collect(
+            "held_out", settings.validation_frames, settings.cloning, _HELD_OUT
+        )
+        with self:
+            history = [self.train(module, 0)]
+            weights = [self.save(module, 0)]
+            for number in range(1, settings.dagger_rounds + 1):
+                drives = PolicyDrives(
+                    weights[-1], settings.horizon, settings.expert_share
+                )
+                wanted = settings.dagger_frames
+                self.take(self.collect(f"round_{number}", wanted, drives, number))
+                history.append(self.train(module, number))
+                weights.append(self.save(module, number))
+            ranks = [
+                min(rank(row) for row in rows if row["measured"]) for rows in history
+            ]
+            best = ranks.index(min(ranks))
+            module = PilotNet.load(weights[best])
+            card = self.card(module)
+        return Imitated(module, history, best, card, [*self.training, *self.held_out])
+
+    def __enter__(self) -> _Imitation:
+        """Load what validation drives in, after the workers have gone."""
+        site, settings = self.sites[0], self.settings
+        wanted = max(settings.validation.objects, settings.final.objects)
+        self._loop = ClosedLoop(
+            [site.open(site.typical()) for site in self._validated()],
+            self.routes,
+            site.load_objects(wanted),
+            site.load_ground(),
+            self.settings.validation,
+            self.settings.validate_every,
+            self._steps("validation"),
+        )
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the environments."""
+        for environment in self.loop.environments:
+            environment.close()
+
+    @property
+    def loop(self) -> ClosedLoop:
+        """Validation in the closed loop."""
+        assert self._loop is not None
+        return self._loop
+
+    def _validated(self) -> list[AbstractSite]:
+        chosen = self.settings.validate_in
+        return [site for site in self.sites if not chosen or site.name in chosen]
+
+    def collect(
+        self, name: str, frames: Mapping[str, int], source: AbstractSource, number: int
+    ) -> list[Path]:
+        """Collect frames of all sites; returns the shards."""
+        shards: list[Path] = []
+        for site in self.sites:
+            if not frames.get(site.name):
+                continue
+            settings = replace(
+                self.settings.collecting,
+                frames=frames[site.name],
+                seed=self._seed(number),
+            )
+            arguments = (settings, self.folder / name, self.workers)
+            show = self._frames(f"{name}, {site.name}")
+            shards += collect(site, self.routes, source, *arguments, show)
+        return shards
+
+    def take(self, shards: Sequence[Path]) -> None:
+        """Add shards to those of training, some to the held-out ones.
+
+        They stay there: a round starts from weights that have seen the former.
+        """
+        training = shards
+        if self.settings.holds_out_shards:
+            least = 0 if self.held_out else 1
+            fraction = self.settings.training.held_out
+            training, held_out = divide_shards(shards, fraction, least)
+            self.held_out += held_out
+        self.training += training
+
+    def train(self, module: PilotNet, number: int) -> list[dict[str, Any]]:
+        """Train once, with a checkpoint after each epoch."""
+        settings = replace(self.settings.training, seed=self._seed(number))
+        if number:
+            settings = replace(
+                settings,
+                epochs=self.settings.dagger_epochs,
+                learning_rate=self.settings.dagger_rate,
+            )
+
+        def step(at: Progress) -> None:
+            done = (at.epoch - 1) * at.steps + at.step
+            total = settings.epochs * at.steps
+            state = f"epoch {at.epoch}/{settings.epochs}  loss {at.loss:.4f}"
+            self.progress(f"training {number}", done, total, state)
+
+        # a quarter faster on a CPU; the values do not depend on it
+        layout: Any = {"memory_format": torch.channels_last}
+        module.to(**layout)
+        return fit_policy(
+            module,
+            FrameDataset.from_folders(self.training),
+            settings,
+            self.folder / f"checkpoint_{number}.safetensors",
+            progress=step,
+            held_out=FrameDataset.from_folders(self.held_out),
+            validation=self.loop,
+        )
+
+    def save(self, module: PilotNet, number: int) -> Path:
+        """Write the best weights of a round."""
+        path = self.folder / f"policy_{number}.safetensors"
+        module.save(path)
+        return path
+
+    def card(self, module: PilotNet) -> dict[str, Any]:
+        """Drive a policy for its final figures, in the environments of validation."""
+        final = replace(
+            self.loop, settings=self.settings.final, progress=self._steps("card")
+        )
+        return final.card(module)
+
+    def _seed(self, number: int) -> int:
+        """Return the seed of a round: those of other seeds' rounds are others."""
+        entropy = [self.settings.seed, number]
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+    def _frames(self, stage: str) -> OnFrames:
+        def show(done: int, total: int, left_s: float) -> None:
+            left = "" if left_s != left_s else f"  {_clock(left_s)} left"
+            self.progress(stage, done, total, f"{done}/{total} frames{left}")
+
+        return show
+
+    def _steps(self, stage: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.progress(
+            stage, done, total, f"step {done}/{total}"
+        )
+
+
+def _check(
+    sites: Sequence[AbstractSite],
+    routes: Sequence[Route],
+    settings: ImitationSettings,
+    more: Sequence[Path],
+) -> None:
+    """Raise `InputError` for what cannot be trained."""
+    names = [site.name for site in sites]
+    if unknown := sorted(set(settings.sites) - set(names)):
+        raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
+    goals = sorted(route.goal for route in routes)
+    frames = sum(settings.frames.values())
+    if not sites or not (frames or more) or goals != list(range(len(routes))):
+        raise InputError(
+            f"imitate: {frames} frames of {names}, goals {goals}; at least one frame, "
+            "and goals 0, 1, 2, ..."
+        )
+    for site in sites:
+        check_camera(site)
+    size = settings.collecting.shard
+    count = len(more) + sum(-(-n // size) for n in settings.frames.values())
+    if settings.holds_out_shards and count < 2:
+        raise InputError(
+            f"frames: {frames}, one shard of up to {size}; at least two, of which one "
+            "is held out, or give validation_frames"
+        )
+    measured = (settings.validation, settings.final)
+    found = len(sites[0].load_objects(max(drives.objects for drives in measured)))
+    for drives in measured:
+        departure_limits(routes, drives.car_width_m)
+        if drives.objects and found:
+            check_roadside(routes, drives, found)
+    # what cannot be made is told now, not after the hours of those before it
+    for site in sites:
+        site.open(site.typical()).close()
+
+
+def check_camera(site: AbstractSite) -> None:
+    """Raise `InputError` unless PilotNet takes the images of a site's camera."""
+    height, width = IMAGE_SHAPE
+    camera = site.camera
+    if (camera.width, camera.height) != (width, height):
+        raise InputError(
+            f"camera of {site.name!r}: {camera.width} x {camera.height} px; PilotNet "
+            f"takes {width} x {height}"
+        )
+
+
+def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
+    """Raise `InputError` unless a policy can be trained on shards."""
+    for shard in shards:
+        data = FrameDataset.from_folders([shard])
+        height, width = data.frames[0].shape[1:3]
+        if (height, width) != IMAGE_SHAPE:
+            raise InputError(
+                f"{shard}: frames of {width} x {height} px; PilotNet takes "
+                f"{IMAGE_SHAPE[1]} x {IMAGE_SHAPE[0]}"
+            )
+        try:
+            check_labels(module, data)
+        except InputError as error:
+            raise InputError(f"{shard}: {error}") from error
+
+
+def _take_weights(module: PilotNet, start: PilotNet) -> None:
+    """Copy weights from a policy for the same goals and controls."""
+    mine, theirs = ((m.goals, m.max_control, m.unit) for m in (module, start))
+    if mine != theirs:
+        raise InputError(
+            f"start: a policy of goals, largest control and unit {theirs}; {mine} "
+            "are needed here"
+        )
+    module.load_state_dict(start.state_dict())
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"

@@ -1,0 +1,103 @@
+"""Named sizes of a training: how many frames of what, and how long."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mi_nerfattack.deploy.car import SMALL_CAR
+from mi_nerfattack.deploy.placement import Roadside, Scatter
+from mi_nerfattack.deploy.sites import ANY_WEATHER, Weather
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+from mi_nerfattack.training.collect import CollectSettings
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Choices of a training that belong together.
+
+    Args:
+        place: key of `deploy.registry.bundled_place`.
+        frames: of the first collection, by environment.
+        validation_frames: of the collection that the held-out loss is measured on, by
+            environment; none: about a tenth of the others.
+        dagger_rounds: in which the policy drives and the expert labels.
+        dagger_frames: of each round, by environment.
+        epochs: passes over the frames.
+        dagger_epochs: passes over all frames after each round.
+        weather: conditions of the frames.
+        collecting: how states, objects and their places are drawn.
+    """
+
+    place: str
+    frames: Mapping[str, int]
+    validation_frames: Mapping[str, int] = field(default_factory=dict)
+    dagger_rounds: int = 0
+    dagger_frames: Mapping[str, int] = field(default_factory=dict)
+    epochs: int = 8
+    dagger_epochs: int = 3
+    weather: Weather = ANY_WEATHER
+    collecting: CollectSettings = field(default_factory=CollectSettings)
+
+
+#: Beside the small car's track. Places are cleared for half a full-size car, 0.9 m,
+#: 0.75 m more than half of the small one: 5 cm are left beside it.
+_ROOM_ROADSIDE = Roadside((0.15, 0.4), (0.4, 0.9), clearance_m=0.05 - 0.75)
+
+#: The small car's track: a tenth of the lengths of the intersection.
+_ROOM = CollectSettings(
+    spread_m=0.3,
+    ahead_m=(0.8, 2.5),
+    margin_m=0.2,
+    scatter=Scatter(lateral_sd_m=0.08, lateral_max_m=0.2),
+    roadside=_ROOM_ROADSIDE,
+)
+
+#: Presets by name. "intersection" and "room" have the figures of appendix B.3 and B.4;
+#: the room's 9,584 frames of the real car are path-traced ones here.
+PRESETS: Mapping[str, Preset] = {
+    "laptop": Preset(
+        "intersection",
+        {"surrogate": 2048, "mitsuba": 4096, "mujoco": 1024},
+        dagger_rounds=2,
+        dagger_frames={"surrogate": 512, "mitsuba": 512, "mujoco": 512},
+    ),
+    "intersection": Preset(
+        "intersection",
+        {"mitsuba": 120_000, "surrogate": 60_000},
+        {"surrogate": 12_000},
+        epochs=10,
+    ),
+    "room": Preset(
+        "room",
+        {"mitsuba": 9_584, "surrogate": 12_000},
+        epochs=10,
+        weather=Weather(exposures_ev=ANY_WEATHER.exposures_ev),
+        collecting=_ROOM,
+    ),
+}
+
+#: Starts, objects and widths of closed-loop drives, by bundled place.
+EVALUATIONS: Mapping[str, EvaluateSettings] = {
+    "intersection": EvaluateSettings(),
+    "room": EvaluateSettings(
+        scatter=Scatter(0.03, 0.09, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0),
+        ahead_m=(0.8, 0.5),
+        car_width_m=SMALL_CAR.width,
+        roadside=_ROOM_ROADSIDE,
+    ),
+}
+
+
+def find_preset(name: str) -> Preset:
+    """Return a preset by its name.
+
+    Raises:
+        InputError: there is none of the name.
+    """
+    if name not in PRESETS:
+        raise InputError(f"preset: {name!r}; one of {', '.join(PRESETS)}")
+    return PRESETS[name]

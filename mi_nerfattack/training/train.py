@@ -1,0 +1,335 @@
+"""Imitation of an expert by supervised learning."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.pilotnet import PilotNet, load_checked
+from mi_nerfattack.training.augment import Augmentation
+from mi_nerfattack.training.dataset import FrameDataset
+from mi_nerfattack.training.validation import AbstractValidation, LossAlone, rank
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Choices of a training run; the same settings and data give the same policy.
+
+    Args:
+        epochs: passes over the training rows.
+        batch: images a step.
+        learning_rate: largest rate; warms up linearly over a twentieth of the steps,
+            then falls along a cosine to a hundredth.
+        weight_decay: of AdamW.
+        held_out: fraction of rows kept for validation, unless there are others.
+        seed: of the split, the order and the augmentation.
+        augmentation: changes of the training images.
+    """
+
+    epochs: int = 10
+    batch: int = 128
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    held_out: float = 0.1
+    seed: int = 0
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise InputError(f"TrainSettings.{name}: {value!r}; at least 1")
+        if not 0 < self.learning_rate < 1:
+            raise InputError(
+                f"TrainSettings.learning_rate: {self.learning_rate!r}; in (0, 1)"
+            )
+        if not 0 < self.held_out < 1:
+            raise InputError(f"TrainSettings.held_out: {self.held_out!r}; in (0, 1)")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is known after a step: epoch and step from 1, loss of the step."""
+
+    epoch: int
+    step: int
+    steps: int
+    loss: float
+
+
+def fit_policy(
+    module: PilotNet,
+    data: FrameDataset,
+    settings: TrainSettings,
+    checkpoint: str | Path | None = None,
+    device: str = "cpu",
+    progress: Callable[[Progress], None] | None = None,
+    held_out: FrameDataset | None = None,
+    validation: AbstractValidation | None = None,
+) -> list[dict[str, Any]]:
+    """Train a policy and leave the weights of its best epoch in it.
+
+    Best is the epoch with the fewest departures in the closed loop, among these that of
+    the least mean error to a millimetre, among these that of the least held-out loss.
+    Without a validation in the closed loop the loss alone decides.
+
+    The loss is the mean squared difference of control divided by the largest
+    control. With a checkpoint, each epoch ends by writing it atomically, and a run
+    with the same settings, data and first weights continues after the last whole epoch.
+
+    Args:
+        module: changed in place; ends on the CPU in evaluation mode.
+        data: frames, goals, expert controls (rad/s).
+        settings: see there.
+        checkpoint: safetensors file of the whole state, or None.
+        device: torch device of the computation.
+        progress: called after each step; an exception from it ends the training.
+        held_out: frames of another collection for the loss, in place of a part of
+            `data`.
+        validation: in the closed loop; None for none.
+
+    Returns:
+        A row for each epoch: `train_loss`, `held_out_loss`, `held_out_error` (the mean
+        absolute error in rad/s), and what the validation measured.
+
+    Raises:
+        InputError: goals or controls out of the policy's range; a checkpoint of
+            other settings, data or first weights; a loss that is not finite.
+    """
+    check_labels(module, data)
+    if held_out is None:
+        train_rows, held_rows = data.split(settings.held_out, settings.seed)
+        held = Part(data, held_rows)
+    else:
+        check_labels(module, held_out)
+        train_rows, held = np.arange(len(data)), Part.of_all(held_out)
+    module.to(device).requires_grad_(True)
+    parts = Part(data, train_rows), held
+    run = _Run(module, parts, settings, device, validation or LossAlone())
+    if checkpoint is not None and Path(checkpoint).exists():
+        run.restore(checkpoint)
+    for epoch in range(len(run.history), settings.epochs):
+        train_loss = run.epoch(epoch, progress)
+        held_loss, held_error = run.validate()
+        run.record(train_loss, held_loss, held_error)
+        if checkpoint is not None:
+            run.save(checkpoint)
+    module.load_state_dict(run.best)
+    module.to("cpu").eval()
+    return run.history
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Rows (k,) of a dataset."""
+
+    data: FrameDataset
+    rows: np.ndarray
+
+    @classmethod
+    def of_all(cls, data: FrameDataset) -> Part:
+        """Take all rows of a dataset."""
+        return cls(data, np.arange(len(data)))
+
+    def describe(self) -> list[Any]:
+        """Return what tells parts apart: number of rows, checksum of the data."""
+        return [len(self.rows), self.data.digest]
+
+
+class _Run:
+    """State of a training run: weights, best weights, optimiser, history."""
+
+    def __init__(
+        self,
+        module: PilotNet,
+        parts: tuple[Part, Part],
+        settings: TrainSettings,
+        device: str,
+        validation: AbstractValidation,
+    ) -> None:
+        self.module, self.settings, self.validation = module, settings, validation
+        self.part, self.held = parts
+        self.device = torch.device(device)
+        self.steps = -(-len(self.part.rows) // settings.batch)
+        self.optimiser = torch.optim.AdamW(
+            module.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+        )
+        self.best = copy.deepcopy(module.state_dict())
+        self.start = _digest_weights(module)
+        self.history: list[dict[str, Any]] = []
+
+    def epoch(self, epoch: int, progress: Callable[[Progress], None] | None) -> float:
+        """Pass over the rows once, in an order that depends on seed and epoch."""
+        entropy = [self.settings.seed, epoch]
+        order = np.random.default_rng(entropy).permutation(self.part.rows)
+        generator = torch.Generator(self.device)
+        generator.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+        self.module.train()
+        losses = []
+        for step in range(self.steps):
+            chosen = order[step * self.settings.batch :][: self.settings.batch]
+            self._set_rate(epoch * self.steps + step)
+            frames, goal, control = self._batch(self.part.data, chosen)
+            image = self.settings.augmentation.apply(frames, generator)
+            loss = self._error(image, goal, control).square().mean()
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            losses.append(loss.item())
+            if not np.isfinite(losses[-1]):
+                raise InputError(
+                    f"epoch {epoch + 1}, step {step + 1}: the loss is {losses[-1]}; "
+                    f"lower learning_rate = {self.settings.learning_rate}"
+                )
+            if progress is not None:
+                progress(Progress(epoch + 1, step + 1, self.steps, losses[-1]))
+        return float(np.mean(losses))
+
+    @torch.no_grad()
+    def validate(self) -> tuple[float, float]:
+        """Compute the held-out loss and the mean absolute error in rad/s."""
+        self.module.eval()
+        rows, parts = self.held.rows, []
+        for start in range(0, len(rows), 256):
+            chosen = rows[start : start + 256]
+            frames, goal, control = self._batch(self.held.data, chosen)
+            image = frames.permute(0, 3, 1, 2).float().div_(255)
+            parts.append(self._error(image, goal, control))
+        error = torch.cat(parts)
+        mean = error.abs().mean() * self.module.max_control
+        return error.square().mean().item(), mean.item()
+
+    def record(self, train_loss: float, held_loss: float, held_error: float) -> None:
+        """Append an epoch to the history and keep its weights if they are best.
+
+        Only epochs that are measured can be best.
+        """
+        row: dict[str, Any] = {
+            "train_loss": train_loss,
+            "held_out_loss": held_loss,
+            "held_out_error": held_error,
+        }
+        number, every = len(self.history) + 1, self.validation.every
+        if number % every == 0 or number == self.settings.epochs:
+            row |= self.validation.measure(self.module)
+            previous = [rank(older) for older in self.history if older["measured"]]
+            if not previous or rank(row) < min(previous):
+                self.best = copy.deepcopy(self.module.state_dict())
+            row["measured"] = True
+        else:
+            row["measured"] = False
+        self.history.append(row)
+
+    def save(self, path: str | Path) -> None:
+        """Write the state after a whole epoch."""
+        tensors = {f"last.{k}": v for k, v in self.module.state_dict().items()}
+        tensors |= {f"best.{k}": v for k, v in self.best.items()}
+        names = [name for name, _ in self.module.named_parameters()]
+        for index, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{names[index]}.{k}": v for k, v in state.items()}
+        arrays = {name: value.cpu().numpy() for name, value in tensors.items()}
+        metadata = {"run": self._fingerprint(), "history": json.dumps(self.history)}
+        files.write_safetensors(path, arrays, metadata)
+
+    def restore(self, path: str | Path) -> None:
+        """Read what `save` wrote for the same settings, data and first weights."""
+        arrays, metadata = files.read_safetensors(path)
+        if metadata.get("run") != self._fingerprint():
+            raise InputError(
+                f"{path}: written with other settings or data "
+                f"({self._differences(metadata.get('run', '{}'))}); remove it or "
+                "restore them"
+            )
+        groups: dict[str, dict[str, np.ndarray]] = {"last": {}, "best": {}, "adam": {}}
+        for name, value in arrays.items():
+            group, _, rest = name.partition(".")
+            groups.setdefault(group, {})[rest] = value
+        load_checked(self.module, groups["best"], f"{path} (best)")
+        self.best = copy.deepcopy(self.module.state_dict())
+        load_checked(self.module, groups["last"], f"{path} (last)")
+        state = self.optimiser.state_dict()
+        for index, (name, value) in enumerate(self.module.named_parameters()):
+            shapes = {"step": (), "exp_avg": value.shape, "exp_avg_sq": value.shape}
+            slots = {key: groups["adam"].get(f"{name}.{key}") for key in shapes}
+            for key, array in slots.items():
+                if array is None or array.shape != tuple(shapes[key]):
+                    raise InputError(f"{path}: adam.{name}.{key} is missing or damaged")
+            state["state"][index] = {
+                key: torch.from_numpy(np.array(array)) for key, array in slots.items()
+            }
+        self.optimiser.load_state_dict(state)
+        self.history = json.loads(metadata["history"])
+
+    def _fingerprint(self) -> str:
+        """Describe all on which a continued run must agree."""
+        return json.dumps(
+            {
+                "settings": asdict(self.settings),
+                "validation": self.validation.describe(),
+                "rows": self.part.describe(),
+                "held_out": self.held.describe(),
+                "start": self.start,
+                "goals": self.module.goals,
+                "max_control": self.module.max_control,
+            }
+        )
+
+    def _differences(self, found: str) -> str:
+        """Name the parts of a checkpoint's fingerprint that differ from this run's."""
+        theirs, mine = json.loads(found), json.loads(self._fingerprint())
+        return ", ".join(key for key in mine if theirs.get(key) != mine[key])
+
+    def _batch(self, data: FrameDataset, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
+        """Read frames (uint8), goals and controls in [-1, 1] onto the device."""
+        frames = torch.from_numpy(data.read_frames(rows)).to(self.device)
+        goal = torch.from_numpy(data.goals[rows]).to(self.device)
+        control = torch.from_numpy(data.controls[rows]).to(self.device)
+        return frames, goal, control / self.module.max_control
+
+    def _error(
+        self, image: torch.Tensor, goal: torch.Tensor, control: torch.Tensor
+    ) -> torch.Tensor:
+        """Compute the difference from the expert, (n,), in units of max_control."""
+        return self.module(image, goal) / self.module.max_control - control
+
+    def _set_rate(self, step: int) -> None:
+        """Set the learning rate of a step counted from the run's beginning."""
+        total = self.steps * self.settings.epochs
+        warm = min(1.0, (step + 1) / max(1, total // 20))
+        fall = 0.505 + 0.495 * np.cos(np.pi * step / total)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.settings.learning_rate * warm * fall
+
+
+def _digest_weights(module: PilotNet) -> str:
+    """Return the SHA-256 of a policy's weights."""
+    total = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        total.update(name.encode())
+        total.update(value.cpu().contiguous().view(-1).numpy())
+    return total.hexdigest()
+
+
+def check_labels(module: PilotNet, data: FrameDataset) -> None:
+    """Raise `InputError` for goals or controls that the policy cannot express."""
+    low, high = int(data.goals.min()), int(data.goals.max())
+    if low < 0 or high >= module.goals:
+        raise InputError(f"goals: {low} to {high}; at least 0 and below {module.goals}")
+    largest: Any = np.abs(data.controls).max()
+    # rounded alike: NumPy 1 compares in double precision
+    if largest > np.float32(module.max_control):
+        raise InputError(
+            f"controls: up to {largest:.3g} rad/s; at most {module.max_control}"
+        )

@@ -1,0 +1,137 @@
+"""Validation of a policy in training: what decides which of its epochs is best."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.placement import Ground
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings, evaluate
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Keys of a row of a training's history.
+ERROR, DEPARTURES = "closed_loop_error_m", "closed_loop_departures"
+
+
+class AbstractValidation(ABC):
+    """Measurement of a policy beside its loss.
+
+    Attributes:
+        every: epochs from one measurement to the next; the last is always measured.
+    """
+
+    every: int
+
+    @abstractmethod
+    def measure(self, module: PilotNet) -> dict[str, Any]:
+        """Return what is known, for the history: JSON, with `ERROR` and `DEPARTURES`.
+
+        Args:
+            module: in evaluation mode; left unchanged.
+        """
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return all that decides about the measurement, as JSON."""
+
+
+@dataclass(frozen=True)
+class LossAlone(AbstractValidation):
+    """Measures nothing: the loss on held-out frames decides."""
+
+    every: int = 1
+
+    def measure(self, module: PilotNet) -> dict[str, Any]:
+        """Measure nothing."""
+        del module
+        return {}
+
+    def describe(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop(AbstractValidation):
+    """Lets the policy drive every route in some environments, from random starts.
+
+    Starts, places and textures are those of the settings' seed, the same each time.
+
+    Args:
+        environments: with different names.
+        routes: to drive.
+        objects: stand beside the road; may be empty.
+        ground: of the world.
+        settings: number of drives, starts, cases.
+        every: epochs from one measurement to the next.
+        progress: called with steps done and wanted.
+    """
+
+    environments: Sequence[AbstractEnvironment]
+    routes: Sequence[Route]
+    objects: Sequence[GridField]
+    ground: Ground
+    settings: EvaluateSettings = field(default_factory=EvaluateSettings)
+    every: int = 4
+    progress: Callable[[int, int], None] = lambda done, total: None
+
+    def measure(self, module: PilotNet) -> dict[str, Any]:
+        """Drive, and return mean error, departures, and the error of each route."""
+        card = self.card(module)
+        errors = route_errors(card)
+        return {
+            ERROR: float(np.mean(list(errors.values()))),
+            DEPARTURES: count_departures(card),
+            "routes": errors,
+        }
+
+    def card(self, module: PilotNet) -> dict[str, Any]:
+        """Drive, and return all figures; see `policy.evaluate.evaluate`."""
+        # the parameters of a policy that drives are frozen
+        policy = TorchPolicy(copy.deepcopy(module))
+        arguments = (self.routes, self.objects, self.ground, self.settings)
+        return evaluate(policy, self.environments, *arguments, self.progress)
+
+    def describe(self) -> dict[str, Any]:
+        """Return names and settings."""
+        return {
+            "environments": [item.name for item in self.environments],
+            "routes": [route.name for route in self.routes],
+            "settings": asdict(self.settings),
+            "every": self.every,
+        }
+
+
+def rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Return what is smaller for better epochs: departures, error in mm, loss."""
+    error = round(row.get(ERROR, 0.0), 3)
+    return row.get(DEPARTURES, 0), error, row["held_out_loss"]
+
+
+def route_errors(card: Mapping[str, Any]) -> dict[str, float]:
+    """Return mean cross-track errors, metres, by "ENVIRONMENT ROUTE CASE"."""
+    return {
+        f"{environment} {route} {case}": figures["cross_track_mean_m"]
+        for environment, routes in card.items()
+        for route, cases in routes.items()
+        for case, figures in cases.items()
+    }
+
+
+def count_departures(card: Mapping[str, Any]) -> int:
+    """Return the number of drives of a card that left their lane."""
+    return sum(
+        figures["departures"]
+        for routes in card.values()
+        for cases in routes.values()
+        for figures in cases.values()
+    )

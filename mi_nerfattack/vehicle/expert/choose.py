@@ -1,0 +1,83 @@
+"""The right expert for a route and a vehicle."""
+
+from __future__ import annotations
+
+import math
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.vehicle.expert.base import AbstractExpert
+from mi_nerfattack.vehicle.expert.lane_follower import LaneFollower, SteeringFollower
+from mi_nerfattack.vehicle.expert.pid import PIDExpert
+from mi_nerfattack.vehicle.route.route import Route
+
+__all__ = [
+    "AbstractExpert",
+    "LaneFollower",
+    "PIDExpert",
+    "SteeringFollower",
+    "expert_for",
+]
+
+#: Time in which a vehicle passes the look-ahead distance, seconds. With less than half
+#: a second, a car whose wheels answer late needs long to recover from large deviations.
+LOOK_AHEAD_S = 0.55
+
+#: Time in which it passes what the curvature is averaged over, seconds.
+WINDOW_S = 0.2
+
+
+def expert_for(
+    control_unit: str,
+    route: Route,
+    period: float,
+    max_control: float = 1.5,
+    wheelbase: float = 2.7,
+    lag: float = 0.1,
+) -> AbstractExpert:
+    """Make the expert of a route for a vehicle.
+
+    A heading rate is given by `LaneFollower`; a steering angle by `SteeringFollower`
+    on an open route and by `PIDExpert` on a closed one. Distances grow with the
+    route's speed.
+
+    The lag only moves the place where the curvature is read. One policy for cars with
+    and without lag cannot know which it drives: label its frames with the lag in
+    between that is the default, which costs some centimetres in bends.
+
+    Args:
+        control_unit: "rad/s" or "rad", as of the environment.
+        route: with the speed of the vehicle.
+        period: seconds that a control is held.
+        max_control: limit of the control, in its unit, as of the environment.
+        wheelbase: of the car, metres; has no effect on heading rates.
+        lag: seconds from a control to the vehicle's answer: 0 of kinematic models,
+            otherwise its steering's time constants and delay.
+
+    Raises:
+        InputError: unknown unit, or a number out of range.
+    """
+    if control_unit not in ("rad/s", "rad"):
+        raise InputError(f"expert: control unit {control_unit!r}; 'rad/s' or 'rad'")
+    require_positive(
+        "expert", period=period, max_control=max_control, wheelbase=wheelbase
+    )
+    if control_unit == "rad":
+        require_steer("expert", max_control)
+    if not 0 <= lag < math.inf:
+        raise InputError(f"expert.lag: {lag!r}; at least 0 seconds")
+    speed = float(route.speed_ms)
+    look_ahead = speed * LOOK_AHEAD_S
+    preview, window = speed * (period / 2 + lag), speed * WINDOW_S
+    if control_unit == "rad" and route.closed:
+        return PIDExpert(
+            route, period, wheelbase, max_control, look_ahead, preview, window_m=window
+        )
+
+    def follower(limit: float) -> LaneFollower:
+        return LaneFollower(route, speed, look_ahead, preview, 0.0, limit, window)
+
+    if control_unit == "rad":
+        fastest = speed * math.tan(max_control) / wheelbase
+        return SteeringFollower(follower(fastest), wheelbase, max_control)
+    return follower(max_control)

@@ -1,0 +1,102 @@
+"""Lane follower: the expert of vehicles that take a heading rate, and its steering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.vehicle.expert.base import AbstractExpert
+from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True, eq=False)
+class LaneFollower(AbstractExpert):
+    """Feed-forward of the route's curvature with feedback of both errors.
+
+    Heading rate `v (kappa - e / d^2 - 2 sin(psi) / d)` for cross-track error e,
+    heading error psi and look-ahead distance d. Linearised, deviations decay as
+    `(1 + s/d) exp(-s/d)` over the arc length s: critically damped, which wheels that
+    answer late turn into a little overshoot. The feed-forward does not cut corners,
+    which allows gains low enough to be imitated.
+
+    Args:
+        route: lane centre to follow.
+        speed: v, metres per second; the route's nominal speed unless given.
+        look_ahead_m: d, metres. Longer is smoother and slower to recover.
+        preview_m: arc length ahead of the vehicle at which the curvature is read,
+            metres; half of what it travels during one step, and what it travels
+            until its wheels have answered.
+        heading_preview_m: the same for the heading: 0 for an accurate integrator,
+            half a step for explicit Euler, which moves along the chord.
+        max_heading_rate: limit of the result, radians per second.
+        window_m: arc length over which the polyline's curvature is averaged, metres.
+    """
+
+    route: Route
+    speed: float | None = None
+    look_ahead_m: float = 2.75
+    preview_m: float = 0.25
+    heading_preview_m: float = 0.0
+    max_heading_rate: float = 1.5
+    window_m: float = 1.0
+
+    control_unit: ClassVar[str] = "rad/s"
+
+    def __post_init__(self) -> None:
+        if self.speed is None:
+            object.__setattr__(self, "speed", float(self.route.speed_ms))
+        require_positive(
+            "LaneFollower",
+            speed=float(self.speed or 0),
+            look_ahead_m=self.look_ahead_m,
+            max_heading_rate=self.max_heading_rate,
+            window_m=self.window_m,
+        )
+
+    def control(self, states: Any) -> np.ndarray:
+        """Compute the heading rate of a Dubins vehicle.
+
+        Args:
+            states: (n, m) or (m,), metres and radians.
+
+        Returns:
+            (n,), radians per second, positive to the left, clipped to the limit.
+        """
+        states = np.atleast_2d(np.asarray(states, np.float64))
+        arc, cross_track, _ = self.route.project_numpy(states)
+        heading = self.route.heading_at(arc + self.heading_preview_m)
+        curvature = self.route.curvature_at(arc + self.preview_m, self.window_m)
+        feedback = 2 / self.look_ahead_m * np.sin(states[:, 2] - heading)
+        feedback += cross_track / self.look_ahead_m**2
+        rate = float(self.speed or 0) * (curvature - feedback)
+        return np.clip(rate, -self.max_heading_rate, self.max_heading_rate)
+
+
+@dataclass(frozen=True, eq=False)
+class SteeringFollower(AbstractExpert):
+    """Lane follower of a car: the steering angle `atan(l w / v)` of a heading rate w.
+
+    Args:
+        follower: gives the heading rate; its limit applies as well.
+        wheelbase: l, metres.
+        max_control: limit of the steering angle, radians, below pi/2.
+    """
+
+    follower: LaneFollower
+    wheelbase: float = 2.7
+    max_control: float = 0.6
+
+    control_unit: ClassVar[str] = "rad"
+
+    def __post_init__(self) -> None:
+        require_positive("SteeringFollower", wheelbase=self.wheelbase)
+        require_steer("SteeringFollower", self.max_control)
+
+    def control(self, states: Any) -> np.ndarray:
+        """Compute steering angles (n,), radians, of states (n, m) or (m,)."""
+        rate = self.follower.control(states)
+        angle = np.arctan(self.wheelbase * rate / float(self.follower.speed or 0))
+        return np.clip(angle, -self.max_control, self.max_control)

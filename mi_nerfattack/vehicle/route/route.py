@@ -1,0 +1,327 @@
+"""Reference path: the centre of the lane to follow, and the distance from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.vehicle.route.files import read_entry, read_table
+from mi_nerfattack.vehicle.route.polyline import (
+    Measures,
+    Operations,
+    Segment,
+    checked_points,
+    edges_of,
+    measure,
+    segment_rows,
+    square_distance,
+)
+
+_NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, lambda x: x)
+_DRJIT = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """Polyline of the lane centre in the direction of travel.
+
+    The cross-track error is the distance to the nearest point of the polyline,
+    positive on its left. Before the first and beyond the last point it is measured
+    from the straight prolongation, so that overshooting costs nothing. A closed route
+    leads from the last point to the first and has no ends: its arc length wraps.
+
+    Args:
+        name: as in the routes file.
+        goal: index of the policy's one-hot goal.
+        points: (n, 2), metres, consecutive points differ; n >= 2, of a closed route
+            n >= 3, and the first is not repeated.
+        lane_width_m: metres.
+        speed_ms: nominal speed, metres per second.
+        closed: whether it is a loop.
+    """
+
+    name: str
+    goal: int
+    points: np.ndarray
+    lane_width_m: float = 3.5
+    speed_ms: float = 5.0
+    closed: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.closed, bool):
+            raise InputError(
+                f"route {self.name!r}: closed {self.closed!r}; true or false"
+            )
+        points = checked_points(f"route {self.name!r}", self.points, self.closed)
+        points.setflags(write=False)
+        object.__setattr__(self, "points", points)
+        if isinstance(self.goal, bool) or not isinstance(self.goal, int):
+            raise InputError(f"route {self.name!r}: goal {self.goal!r}; an integer")
+        if self.goal < 0:
+            raise InputError(f"route {self.name!r}: goal {self.goal}; at least 0")
+        for key in ("lane_width_m", "speed_ms"):
+            value = getattr(self, key)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not 0 < value < float("inf"):
+                raise InputError(
+                    f"route {self.name!r}: {key} {value!r}; a positive number"
+                )
+
+    @classmethod
+    def from_file(cls, path: str | Path, name: str) -> Route:
+        """Read one route of a routes file (JSON).
+
+        Args:
+            path: file `{NAME: {"goal", "points_m", "lane_width_m", "speed_ms"}}`,
+                optionally with `"closed": true`.
+            name: key of the route.
+
+        Raises:
+            InputError: unreadable file, missing route or key, unusable value.
+        """
+        entry = read_entry(path, name)
+        try:
+            return cls(
+                name,
+                entry["goal"],
+                entry["points_m"],
+                entry["lane_width_m"],
+                entry["speed_ms"],
+                entry["closed"],
+            )
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    @classmethod
+    def all_from_file(cls, path: str | Path) -> list[Route]:
+        """Read all routes of a file, in its order; raises as `from_file`."""
+        return [cls.from_file(path, name) for name in read_table(path)]
+
+    @cached_property
+    def segments(self) -> np.ndarray:
+        """Numbers of the k segments, (k, 13), read-only; see `polyline.Segment`."""
+        rows = segment_rows(self.points, self.closed)
+        rows.setflags(write=False)
+        return rows
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Vectors from each point to the next, (k, 2), metres."""
+        return edges_of(self.points, self.closed)
+
+    @property
+    def edge_lengths(self) -> np.ndarray:
+        """Lengths of the segments, (k,), metres."""
+        return np.array(Segment(*self.segments.T).length)
+
+    @property
+    def length(self) -> float:
+        """Arc length from the first to the last point, or around, metres."""
+        return float(self.edge_lengths.sum())
+
+    def pose_at(self, s: Any, lateral: Any = 0.0, heading: Any = 0.0) -> np.ndarray:
+        """Place a vehicle relative to the route.
+
+        Args:
+            s: arc length in metres, scalar or (n,); outside [0, length] on the
+                prolongation of the first or last segment, or on another lap.
+            lateral: offset to the left of the segment, metres.
+            heading: angle to the segment's direction, radians.
+
+        Returns:
+            (3,) or (n, 3) state.
+        """
+        s, lateral, heading = np.broadcast_arrays(
+            *(np.asarray(value, np.float64) for value in (s, lateral, heading))
+        )
+        s = s % self.length if self.closed else s
+        starts = Segment(*self.segments.T).arc
+        index = np.maximum(np.searchsorted(starts, s, side="right") - 1, 0)
+        at = Segment(*np.moveaxis(self.segments[index], -1, 0))
+        along = s - at.arc
+        x = at.x + along * at.tangent_x - lateral * at.tangent_y
+        y = at.y + along * at.tangent_y + lateral * at.tangent_x
+        theta = np.arctan2(at.tangent_y, at.tangent_x) + heading
+        return np.stack([x, y, theta], axis=-1)
+
+    def heading_at(self, s: Any) -> np.ndarray:
+        """Interpolate the direction of the route between segment centres.
+
+        Args:
+            s: arc length, metres, any shape.
+
+        Returns:
+            Radians, same shape, continuous along the route and not wrapped: each lap
+            of a closed one adds its whole turn.
+        """
+        s, edges, lengths = np.asarray(s, np.float64), self.edges, self.edge_lengths
+        centres = np.cumsum(lengths) - lengths / 2
+        direction = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
+        if not self.closed:
+            return np.interp(s, centres, direction)
+        around = np.unwrap([direction[-1], direction[0]])[1] - direction[0]
+        laps = np.floor(s / self.length)
+        return laps * around + np.interp(
+            s - laps * self.length,
+            [centres[-1] - self.length, *centres, centres[0] + self.length],
+            [direction[-1] - around, *direction, direction[0] + around],
+        )
+
+    def curvature_at(self, s: Any, window: float) -> np.ndarray:
+        """Average the curvature of the route, positive to the left.
+
+        Args:
+            s: arc length, metres, any shape.
+            window: arc length around `s` that counts, metres.
+
+        Returns:
+            1 / metres, same shape.
+        """
+        start = np.asarray(s, np.float64) - window / 2
+        return (self.heading_at(start + window) - self.heading_at(start)) / window
+
+    def project_numpy(self, states: Any) -> Measures:
+        """Find the nearest point of the route.
+
+        Args:
+            states: (n, m) or (m,), m >= 3, metres and radians.
+
+        Returns:
+            Arc length (m, beyond [0, length] on the prolongations, in [0, length) of
+            a closed route), signed cross-track error (m) and heading error (radians,
+            in [-pi, pi]), each (n,).
+        """
+        x, y, theta = np.atleast_2d(np.asarray(states, np.float64)).T[:3]
+        every = Segment(*self.segments.T)
+        square = square_distance(_NUMPY, every, x[:, None], y[:, None])
+        nearest = Segment(*self.segments[np.argmin(square, axis=1)].T)
+        return measure(_NUMPY, nearest, x, y, theta)
+
+    def cross_track_numpy(self, states: Any) -> np.ndarray:
+        """Signed cross-track error (n,) in metres of states (n, m)."""
+        return self.project_numpy(states).cross_track
+
+    def heading_error_numpy(self, states: Any) -> np.ndarray:
+        """Heading (n,) relative to the route at its nearest point, in [-pi, pi]."""
+        return self.project_numpy(states).heading_error
+
+    def project(self, state: Any) -> Measures:
+        """Find the nearest point of the route, differentiably.
+
+        The nearest segment is selected with the state detached, by a recorded loop
+        over segments in device memory: one kernel for every route and state. On a
+        medial axis, where they jump, derivatives are those of the selected side.
+
+        Args:
+            state: Dr.Jit array (m, n), m >= 3, metres and radians.
+
+        Returns:
+            Rows (n,), as those of `project_numpy`.
+        """
+        path = _DevicePath(self, state[0])
+        nearest = path.segment(path.nearest(dr.detach(state)))
+        return measure(_DRJIT, nearest, state[0], state[1], state[2])
+
+    def arc_length(self, state: Any) -> Any:
+        """Arc length of the nearest point, differentiable in the position.
+
+        Args:
+            state: Dr.Jit array (m, n), metres and radians.
+
+        Returns:
+            Row (n,), metres; its derivative is the route's direction, and zero where
+            a bend's vertex is nearest.
+        """
+        return self.project(state).arc_length
+
+    def cross_track(self, state: Any) -> Any:
+        """Signed cross-track error, differentiable in the position.
+
+        Args:
+            state: Dr.Jit array (m, n), metres and radians.
+
+        Returns:
+            Row (n,), metres, positive to the left; its derivative is the unit vector
+            from the route to the vehicle.
+        """
+        return self.project(state).cross_track
+
+    def heading_error(self, state: Any) -> Any:
+        """Heading relative to the route at its nearest point.
+
+        Args:
+            state: Dr.Jit array (m, n), metres and radians.
+
+        Returns:
+            Row (n,), radians in [-pi, pi], differentiable in the heading.
+        """
+        return self.project(state).heading_error
+
+
+class _DevicePath:
+    """The segments of a route in the memory of a Dr.Jit backend."""
+
+    def __init__(self, route: Route, like: Any) -> None:
+        """Upload `route` as arrays of the type of the row `like`."""
+        self.real: Any = dr.detached_t(type(like))
+        self.integer: Any = dr.uint32_array_t(self.real)
+        # a list: memory from NumPy has an alignment of its own, and so its own kernels
+        self.rows = self.real(route.segments.ravel().tolist())
+        self.count = dr.opaque(self.integer, len(route.segments))
+
+    def segment(self, index: Any) -> Segment:
+        """Look up segments."""
+        start = len(Segment._fields) * self.integer(index)
+        columns = range(len(Segment._fields))
+        return Segment(*(dr.gather(self.real, self.rows, start + i) for i in columns))
+
+    def nearest(self, state: Any) -> Any:
+        """Find for each vehicle the first of the nearest segments, (n,)."""
+        px, py = self.real(state[0]), self.real(state[1])
+
+        def measure_one(i: Any, best: Any, shortest: Any) -> tuple[Any, Any, Any]:
+            square = square_distance(_DRJIT, self.segment(i), px, py)
+            closer = square < shortest
+            return (
+                i + 1,
+                dr.select(closer, i, best),
+                dr.select(closer, square, shortest),
+            )
+
+        start = dr.zeros(self.integer, dr.width(px))
+        _, best, _ = dr.while_loop(
+            (start, dr.zeros_like(start), dr.full(self.real, dr.inf, dr.width(px))),
+            lambda i, best, shortest: i < self.count,
+            measure_one,
+            labels=("segment", "nearest", "square_distance"),
+            mode="symbolic",
+        )
+        return best
+
+
+def smooth_absolute(error: Any, width: float = 0.05) -> Any:
+    """Absolute value that is differentiable at zero: `sqrt(e^2 + w^2) - w`.
+
+    Args:
+        error: (n,), metres.
+        width: w, metres, radius of the rounded corner.
+
+    Returns:
+        (n,), metres, between |e| - w and |e|.
+    """
+    return dr.sqrt(dr.square(error) + width**2) - width
+
+
+def load_routes(path: str | Path) -> list[Route]:
+    """Read all routes of a file."""
+    table = files.read_json(path)
+    if not isinstance(table, dict) or not table:
+        raise InputError(f"{path}: needs an object with one key per route")
+    return [Route.from_file(path, name) for name in table]

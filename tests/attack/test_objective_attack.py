@@ -1,0 +1,74 @@
+"""Attacks on a toy loop make every kind of objective smaller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import toy_loop as toy
+
+from mi_nerfattack.attack.objectives import (
+    AbsoluteDeviation,
+    DepartureTime,
+    HeadingDeviation,
+    TargetDistance,
+)
+from mi_nerfattack.attack.user_cost import UserCost
+from mi_nerfattack.rollout.objective import StageSum, Terminal, WeightedSum
+from mi_nerfattack.rollout.reduction import CVaR, Mean, Worst
+from mi_nerfattack.vehicle.route.route import Route
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+HORIZON, ITERATIONS = 6, 5
+TARGET = Route("target", 0, toy.ROUTE.points + [0.0, 0.6])
+
+
+@pytest.fixture(scope="module")
+def loop():
+    """The toy loop, whose kernels all cases share."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    return toy.make_loop()
+
+
+def rightwards(state):
+    return state[1]
+
+
+CASES = {
+    "absolute": (StageSum(AbsoluteDeviation(toy.ROUTE)), Mean()),
+    "end": (Terminal(AbsoluteDeviation(toy.ROUTE)), Worst()),
+    "heading": (StageSum(HeadingDeviation(toy.ROUTE)), Mean()),
+    "target": (StageSum(TargetDistance(TARGET)), CVaR(0.5)),
+    "departure": (DepartureTime(toy.ROUTE, 0.4, 0.15), CVaR(0.6)),
+    "function": (StageSum(UserCost("rightwards", rightwards)), Mean()),
+    "sum": (
+        WeightedSum(
+            (
+                (1.0, DepartureTime(toy.ROUTE, 0.4, 0.15)),
+                (0.2, Terminal(HeadingDeviation(toy.ROUTE))),
+            )
+        ),
+        Worst(),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_attack_makes_it_smaller(loop, name):
+    from mi_nerfattack.attack.freedom import Freedom
+    from mi_nerfattack.attack.gradient import GradientAttack
+    from mi_nerfattack.rollout.function import Rollout
+
+    closed, grid = loop
+    texture = toy.texture_of(grid)
+    initial = closed.initial(np.array([[0.0, 0.1, 0.0], [0.0, 0.2, 0.05]]))
+    rollout = Rollout(closed, CASES[name][0], HORIZON, CASES[name][1])
+    attack = GradientAttack(rollout, toy.ROUTE, initial, Freedom(0.3))
+    for _ in range(ITERATIONS):
+        attack.step()
+    last = attack.measure().objective
+    grid.set_parameter("texture", texture)
+    first = attack.history[0].objective
+    assert last < first - 0.01 * abs(first)

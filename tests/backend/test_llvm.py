@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import drjit as dr
+import pytest
+
+from mi_nerfattack import variant
+from mi_nerfattack.backend import llvm
+from mi_nerfattack.errors import SetupError
+
+needs_package = pytest.mark.skipif(
+    not any(
+        name.lower() == llvm.PACKAGE
+        for item in importlib.metadata.distributions()
+        if (name := item.metadata["Name"])
+    ),
+    reason=f"{llvm.PACKAGE} is not for this platform",
+)
+
+
+def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a process without LLVM or variant settings of this one."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in (llvm.VARIABLE, variant.VARIABLE)
+    }
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=kept | variables,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture
+def without_variable(monkeypatch):
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+
+
+@needs_package
+def test_package_is_found_and_loaded_in_a_fresh_process():
+    done = run_python(
+        "import mi_nerfattack, mi_nerfattack.backend.llvm as llvm\n"
+        "print(llvm.locate().origin, *llvm.check_version())"
+    )
+    assert done.returncode == 0, done.stderr
+    origin, major, *_ = done.stdout.split()
+    assert origin == "package"
+    assert 19 <= int(major) < 24
+
+
+@needs_package
+def test_package_library_is_the_real_file(without_variable):
+    library = llvm.locate()
+    assert library.origin == "package"
+    assert library.path is not None
+    assert library.path.is_file() and not library.path.is_symlink()
+
+
+def test_users_variable_is_kept(monkeypatch):
+    monkeypatch.setenv(llvm.VARIABLE, "/opt/mine/libLLVM.so")
+    assert llvm.setup() == llvm.Library(Path("/opt/mine/libLLVM.so"), "variable")
+    assert os.environ[llvm.VARIABLE] == "/opt/mine/libLLVM.so"
+
+
+def test_wrong_variable_is_named_and_not_replaced():
+    done = run_python(
+        "import mi_nerfattack\n"
+        "try:\n    mi_nerfattack.backend.variant.ensure()\n"
+        "except mi_nerfattack.SetupError as err:\n    print(err)",
+        **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "cannot load /nowhere/libLLVM.so" in done.stdout
+
+
+def test_variable_is_left_alone_once_drjit_is_loaded(without_variable):
+    assert "drjit" in sys.modules
+    llvm.setup()
+    assert llvm.VARIABLE not in os.environ
+
+
+@pytest.mark.parametrize("found", [(14, 0, 6), (15, 0, 7), (16, 0, 0)])
+def test_old_version_is_refused(monkeypatch, found):
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: found)
+    with pytest.raises(SetupError, match=rf"LLVM {found[0]}\..*17 or newer"):
+        llvm.check_version()
+
+
+def test_missing_library_is_refused(monkeypatch, without_variable):
+    monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
+    monkeypatch.setattr(llvm, "_system_folders", lambda: [])
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (-1, -1, -1))
+    with pytest.raises(SetupError, match="no LLVM library found; install one"):
+        llvm.check_version()
+
+
+@needs_package
+def test_late_import_is_told_what_to_do(monkeypatch, without_variable):
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 7))
+    with pytest.raises(SetupError, match="import mi_nerfattack before drjit"):
+        llvm.check_version()
+
+
+def test_version_17_is_accepted(monkeypatch):
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (17, 0, 0))
+    assert llvm.check_version() == (17, 0, 0)
+
+
+def test_newest_system_library_is_taken(monkeypatch, tmp_path, without_variable):
+    for major in (14, 18, 19, 21):
+        folder = tmp_path / f"llvm-{major}" / "lib"
+        folder.mkdir(parents=True)
+        (folder / f"libLLVM-{major}.so.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to(tmp_path / "llvm-14" / "lib")  # a folder
+    monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
+    monkeypatch.setattr(
+        llvm, "_system_folders", lambda: [tmp_path, *tmp_path.glob("llvm-*/lib")]
+    )
+    newest = tmp_path / "llvm-21" / "lib" / "libLLVM-21.so.1"
+    assert llvm.locate() == llvm.Library(newest, "system")
+
+
+def test_old_system_library_is_not_taken(monkeypatch, tmp_path, without_variable):
+    (tmp_path / "libLLVM-18.so").touch()
+    monkeypatch.setattr(llvm, "_find_in_package", lambda: None)
+    monkeypatch.setattr(llvm, "_system_folders", lambda: [tmp_path])
+    assert llvm.locate() == llvm.Library(None, "dr.jit")
+
+
+@needs_package
+def test_runtime_is_loaded_where_the_links_are_missing(tmp_path):
+    """Copy the package's libraries without its links, as before its first start."""
+    done = run_python(
+        f"""
+import importlib.metadata, pathlib, shutil, sys
+top = pathlib.Path({str(tmp_path)!r})
+"""
+        + """
+class File:
+    def __init__(self, path):
+        self.name, self._path = path.name, path
+    def locate(self):
+        return self._path
+
+copies = []
+for file in importlib.metadata.files("karellen-llvm-core"):
+    source = pathlib.Path(file.locate())
+    if ".so" in file.name and not source.is_symlink() and file.name != "libc++.so":
+        sub = source.parent.name if "unknown" in source.parent.name else ""
+        (top / "lib" / sub).mkdir(parents=True, exist_ok=True)
+        copies.append(File(top / "lib" / sub / file.name))
+        shutil.copy(source, top / "lib" / sub / file.name)
+    elif ".so" in file.name:
+        copies.append(File(top / "lib" / file.name))
+importlib.metadata.files = lambda name: copies
+import mi_nerfattack
+import mi_nerfattack.backend.llvm as llvm
+print(llvm.locate().path)
+assert llvm.check_version()[0] >= 19
+maps = pathlib.Path("/proc/self/maps").read_text()
+print(str(top / "lib") in maps, "libc++.so.1.0" in maps)
+"""
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0].startswith(str(tmp_path))
+    assert done.stdout.splitlines()[1] == "True True"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("scalar_rgb", "derivatives"), ("llvm_ad_mono_polarized", "polarised")],
+)
+def test_variant_without_derivatives_is_refused(monkeypatch, name, reason):
+    monkeypatch.setattr(variant.mi, "variant", lambda: name)
+    with pytest.raises(SetupError, match=f"{reason}.*llvm_ad_rgb"):
+        variant.ensure()
+
+
+def test_unknown_variant_is_refused(monkeypatch):
+    monkeypatch.setattr(variant.mi, "variant", lambda: None)
+    monkeypatch.setenv(variant.VARIABLE, "llvm_rgb")
+    with pytest.raises(SetupError, match="unknown variant 'llvm_rgb'.*llvm_ad_rgb"):
+        variant.ensure()
+
+
+def test_variant_is_set_where_there_is_none():
+    code = (
+        "import mi_nerfattack, mitsuba as mi\n"
+        "print(mi_nerfattack.backend.variant.ensure(), mi.variant())"
+    )
+    assert run_python(code).stdout.split() == ["llvm_ad_rgb"] * 2
+    done = run_python(code, **{variant.VARIABLE: "llvm_ad_mono"})
+    assert done.stdout.split() == ["llvm_ad_mono"] * 2
+
+
+def test_a_set_variant_is_kept(no_variant_left):
+    variant.mi.set_variant("llvm_ad_mono")
+    assert variant.ensure() == "llvm_ad_mono"
+
+
+def test_failing_registration_does_not_stop_the_change(
+    monkeypatch, caplog, no_variant_left
+):
+    def fail() -> None:
+        raise ValueError("broken plugin")
+
+    monkeypatch.setattr(variant, "_register", fail)
+    variant.mi.set_variant("llvm_ad_mono")
+    variant.mi.set_variant("llvm_ad_rgb")
+    assert variant.mi.variant() == "llvm_ad_rgb"
+    assert "plugins not registered for llvm_ad_rgb" in caplog.text

@@ -1,0 +1,397 @@
+"""Poses from photographs: an analytic scene, a real one, and what cannot be used."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_nerfattack import cli
+from mi_nerfattack.capture.colmap.process import MARK
+from mi_nerfattack.capture.colmap.reconstruct import Structure, _Stages
+from mi_nerfattack.capture.photographs import PoseOptions, estimate_poses, upright
+from mi_nerfattack.capture.transforms import read_images
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+CAMERA = from_fov(240, 180, 60.0)
+COUNT = 8
+
+
+def noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Grey noise with detail at several scales, in [0, 1]."""
+    total = np.zeros_like(x)
+    for level in range(1, 6):
+        table = rng.random((64, 64))
+        u, v = x * 1.3 * 2**level, y * 1.3 * 2**level
+        i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+        a, b = u - i, v - j
+        at = lambda di, dj, t=table, i=i, j=j: t[(i + di) % 64, (j + dj) % 64]  # noqa: E731
+        total += (1 - a) * ((1 - b) * at(0, 0) + b * at(0, 1)) / 2**level
+        total += a * ((1 - b) * at(1, 0) + b * at(1, 1)) / 2**level
+    return np.clip((total - 0.2) / 0.6, 0, 1)
+
+
+def corner_photograph(pose: np.ndarray) -> np.ndarray:
+    """Trace a floor z = 0 and two walls x = 3, y = 3, seen from inside."""
+    u, v = np.meshgrid(np.arange(240) + 0.5, np.arange(180) + 0.5)
+    local = [(u - 120) / CAMERA.fx, (v - 90) / CAMERA.fy, np.ones_like(u)]
+    ray = np.stack(local, -1) @ pose[:3, :3].T
+    eye = pose[:3, 3]
+    with np.errstate(divide="ignore"):
+        t = (np.array([3.0, 3.0, 0.0]) - eye) / ray
+    t = np.where(t > 1e-9, t, np.inf)
+    face = t.argmin(-1)
+    point = eye + t.min(-1)[..., None] * ray
+    rng = np.random.default_rng(5)
+    grey = np.zeros(u.shape)
+    for axis in range(3):
+        a, b = np.delete(np.arange(3), axis)
+        grey += (face == axis) * noise(rng, point[..., a], point[..., b])
+    return np.repeat(np.round(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def corner_poses() -> np.ndarray:
+    angle = np.linspace(-0.5, 0.5, COUNT)
+    eyes = np.stack(
+        [2 - 4 * np.cos(angle + 0.785), 2 - 4 * np.sin(angle + 0.785), 1.6 + angle], 1
+    )
+    return np.stack([look_at(eye, np.array([2.2, 2.2, 1.2])) for eye in eyes])
+
+
+def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a similarity of points (n, 3); return it applied, and its rotation."""
+    centre, target = found.mean(0), given.mean(0)
+    u, s, vt = np.linalg.svd((given - target).T @ (found - centre))
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    turn = u @ sign @ vt
+    scale = np.trace(np.diag(s) @ sign) / ((found - centre) ** 2).sum()
+    return scale * (found - centre) @ turn.T + target, turn
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory):
+    """A folder of photographs of the corner, and the poses found for them."""
+    pytest.importorskip("pycolmap")
+    root = tmp_path_factory.mktemp("corner")
+    (root / "photographs").mkdir()
+    for i, pose in enumerate(corner_poses()):
+        files.write_image(root / "photographs" / f"{i}.png", corner_photograph(pose))
+    flat = np.full((180, 240, 3), 90, np.uint8)
+    files.write_image(root / "photographs" / "flat.png", flat)
+    stages = []
+    options = PoseOptions(lens="SIMPLE_PINHOLE", metres_per_unit=2.0)
+    result = estimate_poses(
+        root / "photographs", root / "out", options, lambda *call: stages.append(call)
+    )
+    return root, result, stages
+
+
+class TestCorner:
+    def test_cameras_stand_where_they_stood(self, corner):
+        root, result, _ = corner
+        assert result.left_out == ("flat.png",) and len(result.placed) == COUNT
+        given = corner_poses()[:, :3, 3]
+        posed = read_images(root / "out")
+        found, _ = aligned(posed.camera_to_world[:, :3, 3], given)
+        np.testing.assert_allclose(found, given, atol=0.05)
+        assert result.error_px < 1
+        assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.05)
+
+    def test_z_points_up(self, corner):
+        posed = read_images(corner[0] / "out")
+        given = corner_poses()
+        _, turn = aligned(posed.camera_to_world[:, :3, 3], given[:, :3, 3])
+        tilt = turn.T @ [0, 0, 1]  # of the true vertical, in the estimate's world
+        mean_up = -given[:, :3, 1].mean(0)
+        expected = mean_up[2] / np.linalg.norm(mean_up)
+        assert tilt[2] == pytest.approx(expected, abs=5e-3)
+        np.testing.assert_allclose(
+            posed.camera_to_world[:, :3, 3].mean(0), 0, atol=1e-9
+        )
+
+    def test_points_lie_on_the_corner(self, corner):
+        posed = read_images(corner[0] / "out")
+        given = corner_poses()[:, :3, 3]
+        eyes = posed.camera_to_world[:, :3, 3]
+        together = np.concatenate([eyes, posed.points])
+        # carry the points along with the similarity of the cameras
+        centre, target = eyes.mean(0), given.mean(0)
+        fitted, turn = aligned(eyes, given)
+        scale = np.linalg.norm(fitted - target) / np.linalg.norm(eyes - centre)
+        world = scale * (together - centre) @ turn.T + target
+        off = np.abs(world[COUNT:] - [3.0, 3.0, 0.0]).min(1)
+        assert np.median(off) < 0.03
+
+    def test_file_says_the_unit_and_what_is_left_out(self, corner):
+        root, result, _ = corner
+        table = json.loads((root / "out/transforms.json").read_text())
+        assert read_images(root / "out").unit == table["units"] == "metre"
+        assert table["left_out"] == ["flat.png"]
+        assert sorted(p.name for p in (root / "out/images").iterdir()) == list(
+            result.placed
+        )
+        copied = (root / "out/images/0.png").read_bytes()
+        assert copied == (root / "photographs/0.png").read_bytes()
+
+    def test_progress_ends_every_stage(self, corner):
+        _, _, stages = corner
+        ends = {stage: (done, total) for stage, done, total in stages}
+        n = COUNT + 1
+        assert ends == {
+            "photographs": (n, n),
+            "features": (n, n),
+            "matches": (n * (n - 1) // 2, n * (n - 1) // 2),
+            "poses": (n, n),
+        }
+
+    def test_command(self, corner, tmp_path, capsys):
+        arguments = ["--matching", "sequential", "--lens", "SIMPLE_PINHOLE"]
+        code = cli.main(
+            ["poses", str(corner[0] / "photographs"), "-o", str(tmp_path), *arguments]
+        )
+        out = capsys.readouterr().out
+        assert code == 0 and f"Placed {COUNT} of {COUNT + 1} photographs" in out
+        assert "Not placed: flat.png" in out and "--metres-per-unit" in out
+        table = json.loads((tmp_path / "transforms.json").read_text())
+        assert table["units"] == "arbitrary"
+
+
+class TestUpright:
+    def structure(self, poses) -> Structure:
+        names = tuple(str(i) for i in range(len(poses)))
+        return Structure(names, poses, CAMERA, np.zeros((0, 3)), 0.5)
+
+    @pytest.mark.parametrize(
+        "up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.3, -0.8, 0.2], [0, -1, 0]]
+    )
+    def test_any_up_becomes_z(self, up):
+        up = np.array(up, float) / np.linalg.norm(up)
+        side = np.cross(up, [0.36, 0.48, 0.8])
+        side /= np.linalg.norm(side)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([side, -up, np.cross(side, -up)], axis=1)
+        poses = np.stack([pose, pose])
+        poses[1, :3, 3] = [2, 4, 4]
+        result = upright(self.structure(poses), 0.5)
+        np.testing.assert_allclose(
+            result.camera_to_world[:, :3, 1], [[0, 0, -1]] * 2, atol=1e-12
+        )
+        eyes = result.camera_to_world[:, :3, 3]
+        np.testing.assert_allclose(eyes.sum(0), 0, atol=1e-12)
+        assert np.linalg.norm(eyes[1] - eyes[0]) == pytest.approx(3)  # half of 6
+        assert np.linalg.det(result.camera_to_world[0]) == pytest.approx(1)
+
+    def test_opposite_cameras_have_no_up(self):
+        poses = np.stack([np.eye(4), np.diag([1.0, -1, -1, 1])])
+        with pytest.raises(InputError, match="upward directions cancel"):
+            upright(self.structure(poses), 1.0)
+
+
+class TestUnusable:
+    def photographs(self, folder: Path, count: int) -> Path:
+        folder.mkdir()
+        for i in range(count):
+            image = np.full((60, 80, 3), 40 * i, np.uint8)
+            files.write_image(folder / f"{i}.jpg", image)
+        return folder
+
+    def refused(self, folder: Path, message: str, options=None) -> None:
+        out = folder.parent / "out"
+        with pytest.raises(InputError, match=message):
+            estimate_poses(folder, out, options)
+        assert not out.exists()
+
+    def test_too_few(self, tmp_path):
+        folder = self.photographs(tmp_path / "p", 2)
+        self.refused(folder, "p: 2 photographs .*at least 3")
+        self.refused(tmp_path / "none", "none: is not a folder")
+
+    def test_unreadable(self, tmp_path):
+        folder = self.photographs(tmp_path / "p", 3)
+        raw = (folder / "1.jpg").read_bytes()
+        (folder / "1.jpg").write_bytes(raw[: len(raw) // 2])
+        self.refused(folder, "1.jpg: damaged image")
+
+    def test_mixed_sizes(self, tmp_path):
+        folder = self.photographs(tmp_path / "p", 3)
+        files.write_image(folder / "1.jpg", np.zeros((80, 60, 3), np.uint8))
+        self.refused(folder, "1.jpg: 60 x 80 px, but .*0.jpg has 80 x 60")
+
+    def test_nothing_placed(self, tmp_path, monkeypatch):
+        pytest.importorskip("pycolmap")
+        temporary = tmp_path / "temporary"
+        temporary.mkdir()
+        monkeypatch.setenv("TMPDIR", str(temporary))
+        self.refused(self.photographs(tmp_path / "p", 3), "0 of 3 could be placed")
+        assert not list(temporary.iterdir())  # nor the log of COLMAP
+
+    def test_without_pycolmap(self, tmp_path, monkeypatch):
+        (tmp_path / "pycolmap.py").write_text("raise ImportError('gone')")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        folder = self.photographs(tmp_path / "p", 3)
+        self.refused(folder, "pycolmap: gone; .*pip install pycolmap")
+
+    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+    def test_scale(self, scale):
+        with pytest.raises(InputError, match="metres_per_unit: .*positive"):
+            PoseOptions(metres_per_unit=scale)
+
+    @pytest.mark.parametrize("seed", [-1, 1 << 31])
+    def test_seed(self, seed):
+        with pytest.raises(InputError, match=f"seed: {seed}; must be in"):
+            PoseOptions(seed=seed)
+
+    def test_output_that_is_a_file(self, tmp_path):
+        folder = self.photographs(tmp_path / "p", 3)
+        (tmp_path / "file").write_text("x")
+        with pytest.raises(InputError, match="file"):
+            estimate_poses(folder, tmp_path / "file" / "out")
+
+    def test_turned_photographs_are_not_replaced(self, tmp_path):
+        folder = self.photographs(tmp_path / "images", 3)
+        for i in range(3):
+            write_turned(folder / f"{i}.jpg", np.zeros((60, 80, 3), np.uint8))
+        before = (folder / "0.jpg").read_bytes()
+        with pytest.raises(InputError, match="0.jpg: its EXIF data turn it"):
+            estimate_poses(folder, tmp_path)
+        assert (folder / "0.jpg").read_bytes() == before
+
+
+class TestProcess:
+    """pycolmap's process, with modules of its name that fail on purpose."""
+
+    @pytest.fixture
+    def poses(self, tmp_path, monkeypatch):
+        """Estimate poses with a pycolmap whose extract_features is the given code."""
+        folder = TestUnusable().photographs(tmp_path / "p", 3)
+
+        def call(code: str, progress=lambda *_: None) -> None:
+            lines = [
+                "import os, pathlib, signal, sys, time",
+                "class CameraMode: SINGLE = 0",
+                "class logging: logtostderr = False",
+                "def set_random_seed(seed): pass",
+                "def extract_features(database, *_):",
+                *(f"    {line}" for line in code.splitlines()),
+            ]
+            (tmp_path / "pycolmap.py").write_text("\n".join(lines) + "\n")
+            monkeypatch.syspath_prepend(str(tmp_path))
+            estimate_poses(folder, tmp_path / "out", progress=progress)
+
+        return call
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+    @pytest.mark.parametrize("name", ["SIGBUS", "SIGKILL"])
+    def test_crash_is_a_message(self, poses, tmp_path, name):
+        code = f"print('E full', flush=True)\nos.kill(os.getpid(), signal.{name})"
+        message = f"ended by {name} at the stage 'features' .*E full.*--long-edge"
+        with pytest.raises(SetupError, match=message):
+            poses(code)
+        assert not (tmp_path / "out").exists()
+
+    def test_exception_is_a_message(self, poses):
+        with pytest.raises(SetupError, match="code 1 .*ZeroDivisionError: why"):
+            poses("raise ZeroDivisionError('why')")
+
+    def test_interrupt_ends_the_process(self, poses, tmp_path):
+        pid = tmp_path / "pid"
+        code = (
+            f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
+            "print('I Processed file [2/3]', flush=True)\n"
+            "time.sleep(100)"
+        )
+        seen = []
+
+        def interrupt(*call) -> None:
+            seen.append(call)
+            if call == ("features", 2, 3):
+                raise KeyboardInterrupt
+
+        start = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            poses(code, interrupt)
+        assert time.monotonic() - start < 50
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid.read_text()), 0)
+        assert ("features", 0, 3) in seen
+
+    def test_process_ends_with_its_parent(self, tmp_path):
+        (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
+        command = [sys.executable, "-m", "mi_nerfattack.capture.colmap.process"]
+        task = json.dumps({"work": "", "folder": "", "names": []})
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        result = subprocess.run(
+            command, input=task + "\n", text=True, timeout=50, env=environment
+        )
+        assert result.returncode == 1
+
+    @pytest.mark.parametrize(
+        ("line", "done"),
+        [
+            ("Processed file [3/4]", 45),
+            ("Processing image [3/4]", 30),
+            ("Processing block [1/3, 3/3]", 13),
+            ("Processing block [3/3, 1/3]", 40),
+        ],
+    )
+    def test_progress_of_a_log_line(self, line, done):
+        calls = []
+        stages = _Stages(lambda *call: calls.append(call))
+        told = MARK + json.dumps({"stage": "s", "total": 60})
+        stages.follow([told, f"I2026 7 pairing.cc:2] {line}\n"])
+        assert calls == [("s", 0, 60), ("s", done, 60)]
+
+
+def write_turned(path: Path, image: np.ndarray) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was held upright: turn clockwise to show
+    Image.fromarray(image).save(path, exif=exif, quality=95)
+
+
+def test_turned_photographs_are_stored_upright(tmp_path):
+    from mi_nerfattack.capture.photographs import _copy_upright
+
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[:, :40] = 255  # left, so on top when turned clockwise
+    write_turned(tmp_path / "a.jpg", image)
+    assert _copy_upright(tmp_path / "a.jpg", tmp_path / "b.jpg") == (60, 80)
+    shown = files.read_image(tmp_path / "b.jpg")
+    assert shown.shape == (80, 60, 3)
+    assert shown[:36].min() > 240 and shown[44:].max() < 15
+    with Image.open(tmp_path / "b.jpg") as stored:
+        assert stored.getexif().get(0x0112, 1) == 1
+
+
+@pytest.mark.slow
+def test_fox_stands_where_it_stood(data_folder, tmp_path):
+    """Twelve photographs of 480 px against the poses that come with them."""
+    pytest.importorskip("pycolmap")
+    given = read_images(data_folder / "fox", 480, skip_missing=True)
+    (tmp_path / "p").mkdir()
+    chosen = list(range(0, 24, 2))
+    for i in chosen:
+        name = Path(given.names[i]).stem
+        files.write_image(tmp_path / "p" / f"{name}.png", given.images[i])
+    result = estimate_poses(tmp_path / "p", tmp_path / "out")
+    assert len(result.placed) == len(chosen)
+    stems = [Path(name).stem for name in given.names]
+    index = [stems.index(Path(name).stem) for name in result.placed]
+    eyes = given.camera_to_world[index, :3, 3]
+    posed = read_images(result.path)
+    found, _ = aligned(posed.camera_to_world[:, :3, 3], eyes)
+    error = np.linalg.norm(found - eyes, axis=1)
+    extent = np.linalg.norm(eyes - eyes.mean(0), axis=1).max()
+    assert np.median(error) < 0.01 * extent
+    assert isinstance(posed.camera, Camera) and posed.images.shape[1:3] == (480, 270)
+    assert posed.camera.fx == pytest.approx(given.camera.fx, rel=0.02)

@@ -1,0 +1,221 @@
+"""What cannot be used, from the command line: code 2, one line, nothing written."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.foreign_folders import (
+    colmap,
+    instant_ngp,
+    nerfstudio,
+    picture,
+    poses,
+    write,
+)
+
+from mi_nerfattack import cli
+from mi_nerfattack.io import files
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def change_frame(**values: object) -> Callable[[Path], None]:
+    """Return a change of the second frame of a transforms.json."""
+
+    def change(folder: Path) -> None:
+        table = json.loads((folder / "transforms.json").read_text())
+        table["frames"][1].update(values)
+        write(folder, table)
+
+    return change
+
+
+def scaled(factors: list[float]) -> list[list[float]]:
+    return (np.array(poses(2)[1]) * [*factors, 1.0]).tolist()
+
+
+def with_nan() -> list[list[float]]:
+    matrix = poses(2)[1]
+    matrix[0][3] = float("nan")
+    return matrix
+
+
+def with_infinity(folder: Path) -> None:
+    change_frame(transform_matrix=scaled([1, 1, 12345]))(folder)
+    path = folder / "transforms.json"
+    matrix = json.loads(path.read_text())["frames"][1]["transform_matrix"]
+    path.write_text(path.read_text().replace(repr(matrix[0][2]), "1e999"))
+
+
+def cut(name: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        raw = (folder / name).read_bytes()
+        (folder / name).write_bytes(raw[: len(raw) // 2])
+
+    return change
+
+
+def garbage(name: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        (folder / name).write_bytes(np.random.default_rng(1).bytes(500))
+
+    return change
+
+
+def remove(*names: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        for name in names:
+            (folder / name).unlink()
+
+    return change
+
+
+def image_of_width(name: str, width: int) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        files.write_image(folder / name, picture(9, width=width))
+
+    return change
+
+
+MATRIX = r"transforms.json: frames\[1\].transform_matrix"
+IMAGES = tuple(f"images/{i}.png" for i in range(3))
+UNUSABLE = {
+    "missing image": (
+        instant_ngp,
+        remove("images/1.jpg"),
+        r"transforms.json: 1 of 3 frames have no image, first './images/1.jpg'",
+    ),
+    "truncated JPEG": (instant_ngp, cut("images/1.jpg"), "1.jpg: damaged image"),
+    "garbage JPEG": (instant_ngp, garbage("images/1.jpg"), "1.jpg: not an image"),
+    "scale zero": (
+        instant_ngp,
+        change_frame(transform_matrix=scaled([0, 0, 0])),
+        f"{MATRIX}: not a rigid pose",
+    ),
+    "reflection": (
+        instant_ngp,
+        change_frame(transform_matrix=scaled([1, 1, -1])),
+        f"{MATRIX}: the pose is a reflection",
+    ),
+    "NaN": (
+        instant_ngp,
+        change_frame(transform_matrix=with_nan()),
+        rf"{MATRIX}\[0\]\[3\]: NaN is not a JSON number",
+    ),
+    "infinity": (instant_ngp, with_infinity, f"{MATRIX}: .* NaN or infinity"),
+    "mixed sizes": (
+        instant_ngp,
+        image_of_width("images/1.jpg", 14),
+        "1.jpg: 14 x 8 px, but .*0.jpg has 12 x 8 px",
+    ),
+    "mixed sizes, each with its intrinsics": (
+        nerfstudio,
+        lambda folder: (
+            image_of_width("images/frame_00001.png", 14)(folder),
+            change_frame(w=14)(folder),
+        ),
+        "frame_00001.png: 14 x 8 px, but .*frame_00000.png has 12 x 8 px",
+    ),
+    "size against intrinsics": (
+        instant_ngp,
+        lambda folder: write(
+            folder,
+            {**json.loads((folder / "transforms.json").read_text()), "w": 1080},
+        ),
+        "transforms.json: w, h: 1080 x 8, but the first image has 12 x 8",
+    ),
+    "size against intrinsics of a frame": (
+        nerfstudio,
+        change_frame(w=1080),
+        r"frame_00001.png: 12 x 8 px, .*transforms.json are for 1080 x 8",
+    ),
+    "not JSON": (instant_ngp, garbage("transforms.json"), "transforms.json: .*UTF-8"),
+    "depth that is missing": (
+        nerfstudio,
+        remove("depths/frame_00001.png"),
+        "frame_00001.png: does not exist",
+    ),
+    "truncated cameras.bin": (
+        colmap,
+        cut("sparse/0/cameras.bin"),
+        "cameras.bin: byte 0: 1 cameras need 24 bytes, 20 are left",
+    ),
+    "truncated images.bin": (
+        colmap,
+        cut("sparse/0/images.bin"),
+        "images.bin: byte .*truncated",
+    ),
+    "garbage cameras.bin": (
+        colmap,
+        garbage("sparse/0/cameras.bin"),
+        "cameras.bin: byte 0: .* cameras need",
+    ),
+    "COLMAP without images": (
+        colmap,
+        remove(*IMAGES),
+        "sparse/0: none of the 3 images is there, first '0.png'; put them into",
+    ),
+    "empty folder": (
+        colmap,
+        remove("sparse/0/cameras.bin"),
+        "no posed images; looked for transforms.json.*3 photographs",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_fit_refuses(tmp_path, capsys, case):
+    make, spoil, message = UNUSABLE[case]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    make(folder)
+    spoil(folder)
+    before = sorted(tmp_path.rglob("*"))
+    code = cli.main(["fit", str(folder), "-o", str(tmp_path / "field.safetensors")])
+    check_refusal(code, capsys.readouterr(), message)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def check_refusal(code: int, captured, message: str) -> None:
+    lines = captured.err.strip().splitlines()
+    assert code == 2 and len(lines) == 1, captured.err
+    assert lines[0].startswith("mi-nerfattack: error: ")
+    assert re.search(message, lines[0]), lines[0]
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize("kind", ["zip", "pickle", "truncated"])
+def test_field_files_of_other_formats(tmp_path, capsys, kind):
+    """A scene that names a field file of another format, rendered."""
+    path = tmp_path / "field.safetensors"
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("data.pkl", pickle.dumps({"density": [1.0]}))
+    elif kind == "pickle":
+        path.write_bytes(pickle.dumps({"density": [1.0]}))
+    else:
+        path.write_bytes(struct.pack("<Q", 1000) + b"{")
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><sensor type="perspective"/>'
+        '<integrator type="field_integrator"><volume type="grid_field">'
+        '<string name="filename" value="field.safetensors"/></volume></integrator>'
+        "</scene>"
+    )
+    before = sorted(tmp_path.rglob("*"))
+    code = cli.main(["render", str(scene), "-o", str(tmp_path / "frame.exr")])
+    expected = {"zip": "is a zip archive", "pickle": "is a pickle"}
+    check_refusal(
+        code,
+        capsys.readouterr(),
+        f"field.safetensors: .*{expected.get(kind, 'truncated')}",
+    )
+    assert sorted(tmp_path.rglob("*")) == before

@@ -1,0 +1,200 @@
+"""CARLA's frames, units and depth codes, against vectors worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mi_nerfattack.deploy.carla import conventions
+from mi_nerfattack.deploy.carla.conventions import CarlaPose
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    from_fov,
+    mount_matrix,
+)
+
+FORWARD, LEFT, UP = np.eye(3)
+angles = st.floats(-179.0, 179.0)
+metres = st.floats(-1000.0, 1000.0)
+poses = st.builds(CarlaPose, metres, metres, metres, st.floats(-85, 85), angles, angles)
+
+
+def axes(pose: CarlaPose) -> np.ndarray:
+    """Forward, left and up of an actor in our world, one a row."""
+    return conventions.body_from_carla(pose)[:3, :3].T
+
+
+def test_y_changes_its_sign_and_centimetres_become_metres():
+    np.testing.assert_array_equal(
+        conventions.point_from_carla([10, 20, 3]), [10, -20, 3]
+    )
+    np.testing.assert_array_equal(
+        conventions.point_from_unreal([1000, 2000, 300]), [10, -20, 3]
+    )
+    np.testing.assert_array_equal(
+        conventions.point_to_unreal([10, -20, 3]), [1000, 2000, 300]
+    )
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "heading"),
+    [
+        (0, 0),
+        (90, -math.pi / 2),
+        (-90, math.pi / 2),
+        (45, -math.pi / 4),
+        (450, -1.5708),
+    ],
+)
+def test_yaw_is_clockwise(yaw_deg, heading):
+    assert conventions.heading_from_carla(yaw_deg) == pytest.approx(heading, abs=1e-5)
+
+
+def test_a_heading_of_a_quarter_left_is_a_yaw_of_minus_90():
+    assert conventions.heading_to_carla(math.pi / 2) == pytest.approx(-90)
+    assert conventions.heading_to_carla(2.5 * math.pi) == pytest.approx(-90)
+
+
+def test_axes_at_rest_and_turned():
+    np.testing.assert_allclose(axes(CarlaPose(0, 0, 0)), np.eye(3), atol=1e-12)
+    # yaw 90 looks along CARLA's +y, which is our -y; its left is then our +x
+    turned = axes(CarlaPose(0, 0, 0, yaw=90))
+    np.testing.assert_allclose(turned, [-LEFT, FORWARD, UP], atol=1e-12)
+    # pitch 90 looks up
+    nose_up = axes(CarlaPose(0, 0, 0, pitch=90))
+    np.testing.assert_allclose(nose_up, [UP, LEFT, -FORWARD], atol=1e-12)
+    # roll 90 leans to the right: the left side goes up
+    leaning = axes(CarlaPose(0, 0, 0, roll=90))
+    np.testing.assert_allclose(leaning, [FORWARD, UP, -LEFT], atol=1e-12)
+
+
+def test_a_camera_at_yaw_0_looks_along_x():
+    matrix = conventions.camera_from_carla(CarlaPose(1, 2, 3))
+    right, down, forward = matrix[:3, :3].T
+    np.testing.assert_allclose(forward, FORWARD, atol=1e-12)
+    np.testing.assert_allclose(right, -LEFT, atol=1e-12)
+    np.testing.assert_allclose(down, -UP, atol=1e-12)
+    np.testing.assert_allclose(matrix[:3, 3], [1, -2, 3])
+
+
+def test_a_mounted_camera_is_a_pitched_actor():
+    # 1.4 m up, 0.5 m ahead, 6 degrees down, on a car that drives to our left
+    matrix = mount_matrix(np.array([[4.0, 7.0, math.pi / 2]]), CameraMount())[0]
+    pose = conventions.camera_to_carla(matrix)
+    expected = CarlaPose(4.0, -7.5, 1.4, pitch=-6.0, yaw=-90.0, roll=0.0)
+    for name in ("x", "y", "z", "pitch", "yaw", "roll"):
+        assert getattr(pose, name) == pytest.approx(getattr(expected, name), abs=1e-9)
+
+
+@given(poses)
+def test_poses_round_trip(pose):
+    back = conventions.body_to_carla(conventions.body_from_carla(pose))
+    np.testing.assert_allclose(
+        [back.x, back.y, back.z], [pose.x, pose.y, pose.z], rtol=0, atol=1e-9
+    )
+    for name in ("pitch", "yaw", "roll"):
+        assert getattr(back, name) == pytest.approx(getattr(pose, name), abs=1e-7)
+
+
+@given(poses)
+def test_poses_are_proper_rotations(pose):
+    rotation = conventions.body_from_carla(pose)[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0])
+@given(yaw=angles)
+def test_straight_up_and_down_keep_their_matrix(pitch, yaw):
+    matrix = conventions.body_from_carla(CarlaPose(0, 0, 0, pitch=pitch, yaw=yaw))
+    again = conventions.body_from_carla(conventions.body_to_carla(matrix))
+    np.testing.assert_allclose(again, matrix, atol=1e-9)
+
+
+@given(poses)
+def test_matrices_are_those_of_the_client_mirrored(pose):
+    carla = pytest.importorskip("carla")
+    transform = carla.Transform(
+        carla.Location(pose.x, pose.y, pose.z),
+        carla.Rotation(pitch=pose.pitch, yaw=pose.yaw, roll=pose.roll),
+    )
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    expected = mirror @ np.array(transform.get_matrix()) @ mirror
+    # the client computes in 32 bits: 1000 m to 0.1 mm, angles to 1e-5
+    found = conventions.body_from_carla(pose)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(found[:3, :3], expected[:3, :3], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "distance"),
+    [
+        ((0, 0, 0), 0.0),
+        ((255, 255, 255), math.inf),
+        ((254, 255, 255), 1000 * 16777214 / 16777215),
+        ((0, 0, 128), 1000 * 8388608 / 16777215),  # 500.00003 m
+        ((0, 1, 0), 1000 * 256 / 16777215),  # 1.526 cm
+        ((1, 0, 0), 1000 / 16777215),  # 0.06 mm
+    ],
+)
+def test_depth_codes(rgb, distance):
+    pixel = np.array([[[*rgb[::-1], 255]]], np.uint8)
+    assert conventions.decode_depth(pixel)[0, 0] == pytest.approx(distance, rel=1e-12)
+
+
+@given(st.floats(0.0, 999.99))
+def test_depth_round_trips_to_half_a_step(distance):
+    decoded = conventions.decode_depth(
+        conventions.encode_depth(np.full((1, 1), distance))
+    )
+    assert decoded[0, 0] == pytest.approx(distance, abs=0.5001 * 1000 / 16777215)
+
+
+def test_depth_beyond_the_far_plane_is_infinite():
+    bgra = conventions.encode_depth(np.array([[1000.0, math.inf]]))
+    assert np.isposinf(conventions.decode_depth(bgra)).all()
+
+
+def test_distances_along_rays():
+    # 2 x 1 pixels, 90 degrees: focal length 1 px, centres half a pixel off the axis
+    camera = from_fov(2, 1, 90.0)
+    planar = np.array([[4.0, math.inf]])
+    found = conventions.along_rays(planar, camera)
+    assert found[0, 0] == pytest.approx(4 * math.sqrt(1.25), rel=1e-6)
+    assert np.isposinf(found[0, 1]) and found.dtype == np.float32
+
+
+def test_bgra_becomes_rgb():
+    raw = bytes([10, 20, 30, 255, 40, 50, 60, 255])
+    bgra = conventions.read_bgra(raw, 2, 1)
+    np.testing.assert_array_equal(
+        conventions.decode_colour(bgra), [[[30, 20, 10], [60, 50, 40]]]
+    )
+
+
+def test_a_buffer_of_another_size_is_refused():
+    with pytest.raises(InputError, match="7 bytes; 2 x 1 pixels of BGRA are 8"):
+        conventions.read_bgra(bytes(7), 2, 1)
+
+
+def test_the_field_of_view_is_horizontal():
+    assert conventions.field_of_view_deg(from_fov(366, 188, 75.0)) == pytest.approx(75)
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (Camera(8, 6, 5, 5, 4, 3, k1=0.01), "distortion"),
+        (Camera(8, 6, 5, 6, 4, 3), "not square, fx 5, fy 6"),
+        (Camera(8, 6, 5, 5, 4.5, 3), "principal point 0.5, 0 px off"),
+    ],
+)
+def test_cameras_that_carla_has_not_are_refused(camera, message):
+    with pytest.raises(InputError, match=message):
+        conventions.field_of_view_deg(camera)

@@ -1,0 +1,60 @@
+"""The stand-in for CARLA against the real client's classes, where it is installed."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+
+import pytest
+from helpers import carla_stand_in as stand_in
+from helpers.carla_stand_in import Waypoint
+
+
+def parameters(function) -> list[str]:
+    """Names of the parameters in the docstring of a function of the client."""
+    signature = function.__doc__.strip().splitlines()[0].split(" -> ")[0]
+    return re.findall(r"\(\w+\)(\w+)", signature)[1:]
+
+
+@pytest.mark.parametrize("mimic", stand_in.MIMICS, ids=lambda item: item.__name__)
+def test_the_stand_in_has_nothing_that_the_client_has_not(mimic):
+    carla = pytest.importorskip("carla")
+    real = getattr(carla, mimic.__name__)
+    names = {name for name in vars(mimic) if not name.startswith("_")}
+    if dataclasses.is_dataclass(mimic):
+        names |= {item.name for item in dataclasses.fields(mimic)}
+    names = {name for name in names if not name.startswith("_")}
+    assert names <= set(dir(real))
+    for name, value in vars(mimic).items():
+        if not inspect.isfunction(value) or name.startswith("_"):
+            continue
+        ours, theirs = list(inspect.signature(value).parameters)[1:], None
+        theirs = parameters(getattr(real, name))
+        assert len(ours) <= len(theirs), name
+        for mine, other in zip(ours, theirs, strict=False):
+            assert (
+                re.fullmatch(r"arg\d+", other)
+                or name == "apply_settings"
+                or (mine == other)
+            ), f"{mimic.__name__}.{name}: {mine} is called {other}"
+
+
+@pytest.mark.parametrize(
+    "name", ["Location", "Rotation", "VehicleControl", "WorldSettings"]
+)
+def test_the_stand_in_makes_values_as_the_client_does(name):
+    carla = pytest.importorskip("carla")
+    real, mimic = getattr(carla, name)(), getattr(stand_in, name)()
+    for item in dataclasses.fields(mimic):
+        value = getattr(mimic, item.name)
+        assert getattr(real, item.name) == pytest.approx(value), item.name
+        setattr(real, item.name, value)  # all of them can be written, too
+
+
+def test_waypoints_of_the_stand_in_meet():
+    """Guard the stand-in: its roads are continuous."""
+    end, begins = Waypoint(1, 50.0), [Waypoint(2, 0.0), Waypoint(3, 0.0)]
+    for begin in begins:
+        assert begin.transform.location.x == pytest.approx(end.transform.location.x)
+        assert begin.transform.location.y == pytest.approx(end.transform.location.y)

@@ -1,0 +1,376 @@
+"""Views, vehicles and the registry that pairs them, against geometry."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import sys
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.small_fields import blob, small_ngp
+from helpers.tiny_place import write_place
+
+from mi_nerfattack.deploy import CameraFrame
+from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
+from mi_nerfattack.deploy.place import Conditions, bundled_place
+from mi_nerfattack.deploy.registry import kinematic_vehicle, make_environment
+from mi_nerfattack.deploy.simulated import SimulatedEnvironment
+from mi_nerfattack.deploy.views.base import AbstractView
+from mi_nerfattack.deploy.views.field import FieldView
+from mi_nerfattack.deploy.views.mitsuba import MitsubaView, _parts
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import (
+    CameraMount,
+    from_fov,
+    look_at,
+    mount_matrix,
+)
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT, set_daylight
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.state import to_state
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+CAMERA = from_fov(16, 8, 90.0)
+LIGHT = 0.2
+WALL = """<scene version="3.0.0">
+  <integrator type="path"/>
+  <shape type="rectangle">
+    <transform name="to_world">
+      <scale value="2"/><rotate y="1" angle="-90"/><translate x="5"/>
+    </transform>
+    <emitter type="area"><rgb name="radiance" value="0.2"/></emitter>
+  </shape>
+</scene>"""
+SUN = """<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+  <emitter type="sunsky" id="light">
+    <vector name="sun_direction" value="0, 0.1, 1"/></emitter>
+  <shape type="rectangle"><transform name="to_world"><scale value="50"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.2"/></bsdf></shape>
+  <shape type="rectangle"><transform name="to_world">
+    <scale value="0.5"/><translate z="3"/></transform>
+    <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
+</scene>"""
+
+DOME = """<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="3"/></integrator>
+  <emitter type="constant"/><shape type="sphere"><bsdf type="diffuse"/></shape>
+</scene>"""
+
+
+class Recorder(AbstractView):
+    """A view that notes where from, and with which seeds, it was asked to render."""
+
+    def __init__(self) -> None:
+        self.camera, self.poses, self.seeds = CAMERA, [], []
+
+    def render(self, camera_to_world: np.ndarray, seed: int) -> CameraFrame:
+        self.poses.append(camera_to_world)
+        self.seeds.append(seed)
+        empty = np.full((8, 16), np.inf, np.float32)
+        return CameraFrame(np.zeros((8, 16, 3), np.uint8), empty, camera_to_world)
+
+    def show(self, objects) -> None:
+        self.shown = objects
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def recorded(mount: CameraMount | None = None) -> SimulatedEnvironment:
+    vehicle = kinematic_vehicle(CAR, 0.1)
+    return SimulatedEnvironment(
+        "recorded", vehicle, Recorder(), mount or CameraMount(), 0.1
+    )
+
+
+def a_route() -> Route:
+    return Route("straight", 0, np.array([[0.0, 0.0], [50.0, 0.0]]))
+
+
+def scene_of(text: str) -> mi.Scene:
+    return mi.load_string(text)
+
+
+def axis_lengths() -> np.ndarray:
+    """Return the length (8, 16) of rays to the plane one metre ahead."""
+    x = (np.arange(16) + 0.5 - CAMERA.cx) / CAMERA.fx
+    y = (np.arange(8) + 0.5 - CAMERA.cy) / CAMERA.fy
+    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+
+
+def test_camera_rides_on_the_vehicle():
+    environment = recorded(CameraMount(height_m=1.5, forward_m=2.0, pitch_deg=30.0))
+    frame = environment.reset(a_route(), np.array([3.0, 4.0, math.pi / 2]), 7)
+    down = math.radians(30)
+    expected = np.eye(4)
+    expected[:3, 0] = 1, 0, 0  # right of a vehicle that drives to +y
+    expected[:3, 1] = 0, -math.sin(down), -math.cos(down)
+    expected[:3, 2] = 0, math.cos(down), -math.sin(down)
+    expected[:3, 3] = 3, 6, 1.5
+    assert np.allclose(frame.camera_to_world, expected, atol=1e-12)
+    frame = environment.step(0.0)
+    expected[1, 3] += 0.5  # 5 m/s for 0.1 s
+    assert np.allclose(frame.camera_to_world, expected, atol=1e-6)
+
+
+def test_heading_rate_turns_as_long_as_it_is_held():
+    environment = recorded()
+    environment.reset(a_route())
+    for _ in range(10):
+        environment.step(0.5)
+    x, y, theta = environment.state
+    assert theta == pytest.approx(0.5, rel=1e-3)
+    assert x == pytest.approx(10 * math.sin(0.5), rel=1e-3)
+    assert y == pytest.approx(10 * (1 - math.cos(0.5)), rel=2e-3)
+
+
+def test_small_car_is_steered_by_an_angle():
+    vehicle = kinematic_vehicle(SMALL_CAR, 0.1)
+    vehicle.reset(np.zeros(3), 1.0)
+    for _ in range(10):
+        vehicle.advance(0.1)
+    assert vehicle.control_unit == "rad"
+    expected = math.tan(0.1) / SMALL_CAR.wheelbase
+    assert vehicle.state[2] == pytest.approx(expected, rel=1e-3)
+
+
+def test_every_frame_has_a_seed_of_its_own_that_follows_from_the_drives():
+    seeds = []
+    for drive in (3, 3, 4):
+        environment = recorded()
+        environment.reset(a_route(), None, drive)
+        for _ in range(5):
+            environment.step(0.0)
+        seeds.append(environment.view.seeds)
+    assert seeds[0] == seeds[1]
+    assert len(set(seeds[0]) | set(seeds[2])) == 12
+
+
+def test_steps_refuse_what_no_vehicle_can_do():
+    environment = recorded()
+    with pytest.raises(InputError, match="'recorded': step comes after reset"):
+        environment.step(0.0)
+    environment.reset(a_route())
+    with pytest.raises(InputError, match="control: nan; a policy must return finite"):
+        environment.step(math.nan)
+    with pytest.raises(InputError, match=r"pose: \[0.0, inf, 0.0\]; three finite"):
+        environment.reset(a_route(), np.array([0.0, math.inf, 0.0]))
+    with pytest.raises(InputError, match="pose: 'north'; three finite numbers"):
+        environment.reset(a_route(), "north")
+    with pytest.raises(InputError, match="seed: -1; at least 0"):
+        environment.reset(a_route(), None, -1)
+
+
+def test_surrogate_shows_what_the_sensor_of_attacks_sees():
+    mount, state = CameraMount(0.2, 0.0, 5.0), np.array([[-3.0, 0.4, -0.1]])
+    scene = PosedField(small_ngp())
+    objects = [PosedField(blob(np.random.default_rng(0)), Pose.upright((1, 0, 0), 0.3))]
+    view = FieldView(scene, CAMERA)
+    pose = mount_matrix(state, mount)[0]
+    for shown in ([], objects):
+        view.show(shown)
+        frame = view.render(pose, 0)
+        sensor = FieldSensor(scene, shown, CAMERA, mount)
+        expected = sensor.observe(to_state(state), 0).image.numpy()[0]
+        assert abs(frame.image / 255 - expected).max() < 0.51 / 255
+    assert frame.image.std() > 5
+
+
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_only_posed_fields_are_shown(name, tmp_path):
+    environment = make_environment(name, write_place(tmp_path), Conditions(spp=1))
+    field = blob(np.random.default_rng(0))
+    with pytest.raises(InputError, match="objects: GridField; only posed fields can"):
+        environment.show([field])
+    assert environment.reset(a_route()).image.any()  # shows what it showed before
+
+
+def test_surrogate_at_a_rolled_pose_is_upside_down():
+    view = FieldView(PosedField(small_ngp()), CAMERA)
+    pose = look_at((-3.0, 0.5, 0.8), (0.0, 0.0, 0.0))
+    upright = view.render(pose, 0)
+    turned = view.render(pose @ np.diag([-1.0, -1.0, 1.0, 1.0]), 0)
+    assert abs(turned.image[::-1, ::-1].astype(int) - upright.image).max() <= 1
+    assert np.isinf(turned.depth).any() and np.isfinite(turned.depth).any()
+    assert np.allclose(turned.depth[::-1, ::-1], upright.depth, atol=1e-3)
+
+
+def test_surrogate_takes_other_composites():
+    scene = PosedField(small_ngp())
+    pose = look_at((-3.0, 0.5, 0.8), (0.0, 0.0, 0.0))
+    one = FieldView(scene, CAMERA).render(pose, 0)
+    other = FieldView(scene, CAMERA, InterleavedComposite()).render(pose, 0)
+    assert abs(one.image.astype(int) - other.image).max() <= 1
+
+
+@pytest.mark.parametrize("exposure_ev", [0.0, 1.0, -2.0])
+def test_wall_of_known_radiance_at_known_distance(exposure_ev):
+    view = MitsubaView(scene_of(WALL), CAMERA, 4, exposure_ev)
+    frame = view.render(look_at((0, 0, 0), (1, 0, 0)), 3)
+    linear = LIGHT * 2.0**exposure_ev
+    level = round(255 * (1.055 * linear ** (1 / 2.4) - 0.055))
+    lengths = 5 * axis_lengths()
+    x = (np.arange(16) + 0.5 - 8) / 8 * 5  # metres on the wall, which is 4 m wide
+    y = (np.arange(8) + 0.5 - 4) / 8 * 5
+    on_wall = (abs(x)[None] < 2) & (abs(y)[:, None] < 2)
+    assert np.isinf(frame.depth[~on_wall]).all()
+    assert np.allclose(frame.depth[on_wall], lengths[on_wall], rtol=1e-5)
+    inner = on_wall[1:-1, 1:-1] & on_wall[1:-1, 2:] & on_wall[1:-1, :-2]
+    assert (abs(frame.image[1:-1, 1:-1][inner].astype(int) - level) <= 1).all()
+    assert (frame.image[:, 0] == 0).all()
+
+
+def test_any_number_of_samples_is_split_into_powers_of_two():
+    for spp in range(1, 70):
+        parts = _parts(spp)
+        assert sum(parts) == spp
+        assert set(parts) <= {16, 8, 4, 2, 1}
+
+
+def test_path_traced_frames_repeat_to_the_last_bit():
+    camera, pose, spp = from_fov(61, 33, 70.0), look_at((4, 3, 2), (0, 0, 0.5)), 20
+    view = MitsubaView(scene_of(DOME), camera, spp)
+    first = view.linear(pose, 11)[0]
+    other = MitsubaView(scene_of(DOME), camera, spp)
+    for _ in range(5):
+        assert (view.linear(pose, 11)[0] == first).all()
+        assert (other.linear(pose, 11)[0] == first).all()
+    assert (view.linear(pose, 12)[0] != first).any()
+
+
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_no_kernel_is_compiled_after_the_first_step(name, tmp_path):
+    environment = make_environment(name, write_place(tmp_path), Conditions(spp=4))
+    environment.reset(a_route(), None, 0)
+    environment.show([PosedField(blob(np.random.default_rng(0)))])
+    environment.step(0.1)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for control in (-0.3, 0.2):
+            frame = environment.step(control)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert history and all(kernel["cache_hit"] for kernel in history)
+    assert frame.image.max() > 20
+    environment.close()
+
+
+@pytest.mark.parametrize("sky", ["noon", "evening", "overcast"])
+def test_shadow_lies_opposite_to_the_sun(sky):
+    scene = scene_of(SUN)
+    set_daylight(scene, sky)
+    daylight = DAYLIGHT[sky]
+    camera = from_fov(64, 64, 2 * math.degrees(math.atan(0.5)))  # 20 m at 20 m
+    view = MitsubaView(scene, camera, 4)
+    image = view.render(look_at((0, 0, 20), (0, 0, 0)), 0).image.astype(float).mean(-1)
+    x, y, z = daylight.sun_direction
+    shift = np.array([-x, -y]) * 3.0 / z  # the board floats at 3 m
+    column, row = (32 + 3.2 * shift * [1, -1]).astype(int)
+    shadow = image[row - 1 : row + 2, column - 1 : column + 2].mean()
+    lit = np.median(image)
+    assert 20 < lit < 250
+    if daylight.sun:
+        assert abs(shift).max() > 1.1  # aside of the board, 1 m wide
+        assert shadow < 0.8 * lit
+    else:
+        board = image[31:33, 31:33].mean()
+        assert board > 20 and abs(image[2:10].mean() - lit) < 10
+
+
+def test_scene_without_a_sun_has_one_time_of_day():
+    scene = scene_of(WALL)
+    set_daylight(scene, "day")
+    with pytest.raises(InputError, match="'noon' needs a scene with a `sunsky`"):
+        set_daylight(scene, "noon")
+    timed = scene_of('<scene version="3.0.0"><emitter type="sunsky"/></scene>')
+    with pytest.raises(InputError, match="'noon': the sun of .* give it a sun_dir"):
+        set_daylight(timed, "noon")
+    with pytest.raises(InputError, match="sky: 'night'; one of day, morning"):
+        Conditions(sky="night")
+
+
+def test_conditions_and_place_are_checked(tmp_path):
+    place = write_place(tmp_path)
+    for change, message in (
+        ({"spp": 0}, "spp: 0; at least 1"),
+        ({"spp": 2.5}, "spp: 2.5; at least 1 sample per pixel, whole"),
+        ({"exposure_ev": math.inf}, "exposure_ev: inf; must be finite"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Conditions(**change)
+    with pytest.raises(InputError, match="place.period: 0; a positive time"):
+        replace(place, period=0)
+    with pytest.raises(InputError, match="camera.width: 0; must be positive"):
+        replace(place, camera=replace(place.camera, width=0))
+    with pytest.raises(InputError, match="car.max_steer: 2 rad; below pi / 2"):
+        Car(max_steer=2)
+    with pytest.raises(InputError, match="car.control_unit: 'deg'"):
+        Car(control_unit="deg")
+    with pytest.raises(InputError, match="max_control: 1.5 rad; .* max_steer, 0.75"):
+        Car(control_unit="rad")
+
+
+def test_places_and_conditions_travel_to_workers(tmp_path):
+    place = write_place(tmp_path)
+    assert pickle.loads(pickle.dumps(place)) == place
+    conditions = Conditions("noon", 0.5, 4)
+    assert pickle.loads(pickle.dumps(conditions)) == conditions
+
+
+def test_environments_that_cannot_be_made(tmp_path, monkeypatch):
+    place = write_place(tmp_path)
+    with pytest.raises(InputError, match="environment: 'gazebo'; one of surrogate, "):
+        make_environment("gazebo", place)
+    with pytest.raises(InputError, match="'surrogate': the place has no field"):
+        make_environment("surrogate", replace(place, field=None))
+    with pytest.raises(InputError, match="'replay': the place has no recording"):
+        make_environment("replay", place)
+    for name in ("surrogate", "replay"):
+        built_in = Conditions(built_in=(object(),))
+        with pytest.raises(InputError, match=f"'{name}': takes no built-in objects"):
+            make_environment(name, replace(place, recording=tmp_path), built_in)
+    monkeypatch.setitem(sys.modules, "carla", None)
+    with pytest.raises(InputError, match=r"'carla': its client .*pip .*\[carla\]'"):
+        make_environment("carla", place)
+    missing = replace(place, scene=tmp_path / "none.xml")
+    with pytest.raises(InputError, match=r"none.xml: does not exist"):
+        make_environment("mitsuba", missing)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mujoco_gl"])
+def test_mujoco_that_cannot_be_imported(name, tmp_path, monkeypatch):
+    place = write_place(tmp_path)
+    for loaded in list(sys.modules):
+        if loaded.startswith(
+            ("mi_nerfattack.deploy.mujoco", "mi_nerfattack.deploy.mj")
+        ):
+            monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match="mujoco is not installed; pip install mujoco"):
+        make_environment(name, place)
+    monkeypatch.delitem(sys.modules, "mujoco")
+    (tmp_path / "mujoco.py").write_text("raise RuntimeError('invalid value')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "bogus")
+    with pytest.raises(InputError, match="MUJOCO_GL=bogus .invalid value.; unset it"):
+        make_environment(name, place)
+
+
+def test_bundled_places():
+    crossing, room = bundled_place(), bundled_place("room")
+    assert crossing.car == CAR and crossing.field is not None
+    assert room.car.control_unit == "rad"
+    for place in (crossing, room):
+        assert place.scene.is_file()
+        assert Route.all_from_file(place.routes)
+    with pytest.raises(InputError, match="place: 'moon'; one of intersection, room"):
+        bundled_place("moon")

@@ -1,0 +1,219 @@
+"""The attack: ascent, checkpoints, run folder, interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from helpers.attack_folder import SCENARIO, run
+
+from mi_nerfattack.scenes import bundled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.mark.slow
+def test_attack_writes_a_complete_run_folder(folder, tmp_path):
+    from mi_nerfattack.evaluation.metrics import validate
+    from mi_nerfattack.fields import load_grid
+    from mi_nerfattack.io.exr import read_layers
+
+    output = tmp_path / "run"
+    result = run(
+        "attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
+    )
+    assert "gradient" in result.stdout and str(output) in result.stdout
+    document = json.loads((output / "metrics.json").read_text())
+    validate(document)
+    route = document["routes"]["line"]
+    counts = {"unperturbed": 2, "random": 3, "gradient": 2}
+    for environment in ("surrogate", "deployment"):
+        for case, count in counts.items():
+            assert route[environment][case]["n"] == count
+    # frames driven: two batches of 2, 3 random, 3 attacked forward and back; transfer
+    assert document["cost"]["renders"] >= 4 * (2 + 2 + 3 + 6 + 2 + 2 + 3)
+    rows = (output / "steps.csv").read_text().splitlines()
+    assert len(rows) == 1 + 4 * 2 * (2 + 3 + 2)
+    attacked = load_grid(output / "objects" / "ball.safetensors")
+    original = load_grid(folder / "object.safetensors")
+    change = attacked.texture.numpy() - original.texture.numpy()
+    assert np.abs(change).max() > 0.1
+    density = attacked.parameters()["density"].numpy()
+    assert np.array_equal(density, original.parameters()["density"].numpy())
+    for environment in ("surrogate", "deployment"):
+        layers, metadata = read_layers(
+            output / "frames" / f"{environment}_gradient_0000.exr"
+        )
+        assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
+        assert metadata["scenario"] == "toy"
+    plots = ("overhead", "errors", "convergence", "strip")
+    for name in (*plots, "attribution", "attribution_object"):
+        assert (output / f"{name}.png").stat().st_size > 5000
+    assert "<html" in (output / "report.html").read_text()
+    # a second run into the same folder is refused and changes nothing
+    before = (output / "metrics.json").read_bytes()
+    again = run("attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=2)
+    assert "not an empty folder" in again.stderr
+    assert (output / "metrics.json").read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_attack_resumes(folder, tmp_path, number):
+    output = tmp_path / "run"
+    text = SCENARIO.replace("iterations = 3", "iterations = 10")
+    text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
+    path = folder / f"long_{number}.toml"
+    path.write_text(text)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mi_nerfattack.cli", "attack", path, "-o", output],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    checkpoint = output / "checkpoint.safetensors"
+    deadline = time.monotonic() + 300
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(process.pid, number)
+    _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 130, stderr
+    assert "Traceback" not in stderr and "interrupted" in stderr
+    assert not list(output.glob("*.tmp*")) and not list(output.glob(".*"))
+    assert not (output / "metrics.json").exists()
+    # another scenario may not continue it, and changes nothing
+    kept = (output / "scenario.toml").read_text()
+    other = folder / "scenario.toml"
+    refused = run("attack", other, "-o", output, "--resume", cwd=tmp_path, check=2)
+    assert "checkpoint.safetensors" in refused.stderr
+    assert (output / "scenario.toml").read_text() == kept
+    # the text in the run folder replays the scenario
+    again = output / "scenario.toml"
+    run("attack", again, "-o", output, "--resume", cwd=tmp_path, check=0)
+    history = json.loads((output / "attack.json").read_text())
+    assert [record["iteration"] for record in history] == list(range(10))
+    assert (output / "metrics.json").exists()
+
+
+def test_attack_raises_its_objective(folder):
+    attack = make_attack(folder)
+    for _ in range(8):
+        attack.step()
+    last = attack.measure()
+    first = attack.history[0]
+    assert last.objective < first.objective - 0.01 * abs(first.objective)
+    assert attack.best_mean_m >= last.cross_track_mean_m
+
+
+def make_attack(folder):
+    from mi_nerfattack.policy.pilotnet import PilotNet
+    from mi_nerfattack.policy.torch_policy import TorchPolicy
+    from mi_nerfattack.scenario.build.attack import build_attack
+    from mi_nerfattack.scenario.build.world import build_world
+    from mi_nerfattack.scenario.scenario import load_scenario
+
+    scenario, _ = load_scenario(folder / "scenario.toml")
+    policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
+    return build_attack(build_world(scenario, folder, policy))
+
+
+def test_a_checkpoint_continues_bit_for_bit(folder, tmp_path, single_thread):
+    from mi_nerfattack.attack.checkpoint import CheckpointFile
+
+    whole = make_attack(folder)
+    for _ in range(4):
+        whole.step()
+    half = make_attack(folder)
+    for _ in range(2):
+        half.step()
+    path = tmp_path / "checkpoint.safetensors"
+    CheckpointFile(path, {}).save(half, {})
+    resumed, kept = make_attack(folder), CheckpointFile(path, {})
+    kept.read()
+    kept.restore(resumed)
+    for _ in range(2):
+        resumed.step()
+    assert resumed.history == whole.history
+    for name, value in whole.tensors().items():
+        assert np.array_equal(value, resumed.tensors()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("scene.safetensors", "absent.safetensors"), ["absent.safetensors"]),
+        (("iterations = 3", "iteratons = 3"), ["iteratons", ":19"]),
+        (('route = "line"', 'route = "loop"'), ["loop", "line"]),
+        (("object.safetensors", "truncated.safetensors"), ["truncated.safetensors"]),
+        (("object.safetensors", "nan.safetensors"), ["nan.safetensors", "texture"]),
+        (("policy.safetensors", "object.safetensors"), ["object.safetensors"]),
+        (
+            ("[drive]", '[objective]\nkind="function"\nfunction="a.py:f"\n[drive]'),
+            ["a.py", "does not exist"],
+        ),
+    ],
+)
+def test_bad_input_is_named(folder, tmp_path, capsys, change, words):
+    from mi_nerfattack import cli
+    from mi_nerfattack.io import files
+
+    raw = (folder / "object.safetensors").read_bytes()
+    (folder / "truncated.safetensors").write_bytes(raw[: len(raw) // 2])
+    tensors, metadata = files.read_safetensors(folder / "object.safetensors")
+    tensors["texture"] = np.full_like(tensors["texture"], np.nan)
+    files.write_safetensors(folder / "nan.safetensors", tensors, metadata)
+    path = folder / "bad.toml"
+    path.write_text(SCENARIO.replace(*change))
+    assert cli.main(["attack", str(path), "-o", str(tmp_path / "run")]) == 2
+    message = capsys.readouterr().err
+    for word in words:
+        assert word in message
+    assert "Traceback" not in message
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupt_inside_a_recorded_loop_is_one(monkeypatch, capsys):
+    from mi_nerfattack import cli
+
+    def interrupted(arguments):
+        del arguments
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as err:
+            raise RuntimeError("dr.while_loop(): encountered an exception") from err
+
+    monkeypatch.setattr(cli, "_run", interrupted)
+    assert cli.main(["doctor"]) == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_pasting_follows_depth_and_opacity():
+    import mitsuba as mi
+
+    from mi_nerfattack.deploy import paste_layer
+    from mi_nerfattack.render.march import March
+
+    rgb = np.zeros((1, 4, 3), np.float32)
+    depth = np.array([[5.0, 5.0, 1.0, np.inf]])
+    opacity = np.array([1.0, 0.4, 1.0, 0.5], np.float32)
+    layer = March(
+        mi.Color3f(*[mi.Float(0.5 * opacity)] * 3),
+        mi.Float(opacity),
+        mi.Float(2.0 * opacity),
+    )
+    pasted = paste_layer(rgb, depth, layer)[0, :, 0]
+    assert np.allclose(pasted, [0.5, 0.0, 0.0, 0.5])
+
+
+def test_bundled_demo_scenario_is_valid():
+    from mi_nerfattack.scenario.scenario import load_scenario
+
+    scenario, _ = load_scenario(bundled("demo.toml"))
+    assert scenario.scene.route in ("straight", "right", "left")

@@ -1,0 +1,184 @@
+"""Run folders that are new, foreign, damaged, or on a full disk."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+
+import pytest
+from helpers.attack_jobs import checkpoint_of, interrupt, job, stop_at
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import locks
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize("left", ["nothing", "folder", "partial", "scenario", "drives"])
+def test_run_killed_early_starts_from_the_beginning(folder, tmp_path, left):
+    output, notices = tmp_path / "run", []
+    partial = output / ".scenario.toml.0123456789ab.tmp"
+    if left != "nothing":
+        output.mkdir()
+    if left in ("partial", "scenario"):
+        partial.write_text("half of")
+    if left in ("scenario", "drives"):
+        whole = tmp_path / "whole"
+        job(folder, whole).run()
+        text = (whole / "scenario.toml").read_text()
+        (output / "scenario.toml").write_text(text)
+    if left == "drives":
+        interrupt(folder, tmp_path / "cut", "surrogate: unperturbed", 1)
+        shutil.copy(tmp_path / "cut" / "drives.safetensors", output)
+    job(folder, output, notices=notices).run(resume=True)
+    assert (output / "metrics.json").exists() and not partial.exists()
+    begins = any("starts from the beginning" in notice for notice in notices)
+    assert begins == (left in ("nothing", "folder", "partial"))
+
+
+@pytest.mark.usefixtures("no_results")
+def test_folder_of_something_else_is_left_alone(folder, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is no run folder"):
+        job(folder, tmp_path).run(resume=True)
+    (tmp_path / "scenario.toml").write_text("# a scenario of my own")
+    with pytest.raises(InputError, match=r"scenario\.toml: is another scenario"):
+        job(folder, tmp_path).run(resume=True)
+    with pytest.raises(InputError, match="is not a folder"):
+        job(folder, tmp_path / "notes.txt").run(resume=True)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert (tmp_path / "scenario.toml").read_text() == "# a scenario of my own"
+
+
+@pytest.mark.usefixtures("no_results")
+def test_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_path):
+    (tmp_path / "scenario.toml").write_text("# a scenario of a run killed early")
+    notices = []
+    job(folder, tmp_path, notices=notices).run(resume=True, force=True)
+    assert any("replaced, as told" in notice for notice in notices)
+    assert 'name = "kill"' in (tmp_path / "scenario.toml").read_text()
+    assert (tmp_path / "metrics.json").exists()
+
+
+@pytest.mark.usefixtures("no_results")
+def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
+    output = tmp_path / "run"
+    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
+    with locks.exclusive(output), pytest.raises(InputError, match="another process"):
+        job(folder, output).run(resume=True)
+    job(folder, output).run(resume=True)
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize("name", ["checkpoint.safetensors", "drives.safetensors"])
+@pytest.mark.parametrize("damage", ["cut", "bit", "foreign"])
+def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, damage):
+    output = tmp_path / "run"
+    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
+    raw = bytearray((output / name).read_bytes())
+    if damage == "foreign":
+        raw = (folder / "object.safetensors").read_bytes()
+    elif damage == "cut":
+        raw = raw[:-7]
+    else:
+        raw[-9] ^= 1
+    (output / name).write_bytes(raw)
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        job(folder, output).run(resume=True)
+    assert (output / name).read_bytes() == raw
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize(
+    ("call", "number"),
+    [
+        ("open", errno.EROFS),
+        ("write", errno.ENOSPC),
+        ("fsync", errno.ENOSPC),
+        ("replace", errno.EROFS),
+    ],
+)
+def test_failed_checkpoint_leaves_the_one_before(
+    folder, tmp_path, monkeypatch, call, number
+):
+    output = tmp_path / "run"
+    path = output / "checkpoint.safetensors"
+    original = getattr(os, call)
+    kept = {}
+
+    def fail(*arguments, **more):
+        if call == "open" and not str(arguments[0]).endswith(".tmp"):
+            return original(*arguments, **more)
+        raise OSError(number, os.strerror(number))
+
+    def fill():
+        kept.update({path: path.read_bytes() for path in output.iterdir()})
+        monkeypatch.setattr(os, call, fail)
+
+    # checkpoint_every = 3: the disk fills up after the first checkpoint
+    progress = stop_at("surrogate: attack", 4 * 4, fill)
+    with pytest.raises(InputError) as failed:
+        job(folder, output, on_progress=progress).run()
+    monkeypatch.undo()
+    message = str(failed.value)
+    assert str(path) in message and "--resume" in message
+    assert ("no space left" if number == errno.ENOSPC else "read-only") in message
+    assert "iteration 6 is not saved" in message
+    assert "checkpoint of iteration 3 is intact" in message
+    assert {path: path.read_bytes() for path in output.iterdir()} == kept
+    job(folder, output).run(resume=True)
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize("kind", ["full", "read-only"])
+def test_checkpoint_on_a_real_disk_that_is_full_or_read_only(folder, tmp_path, kind):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=256k", "none", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(command).returncode:
+        pytest.skip("this user may not mount a small disk")
+    try:
+        _fail_on(disk, folder, kind)
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def _fail_on(disk, folder, kind):
+    output = disk / "run"
+    path = output / "checkpoint.safetensors"
+
+    def spoil():
+        if kind == "full":
+            room = os.statvfs(disk)
+            (disk / "other").write_bytes(bytes(room.f_bavail * room.f_bsize))
+        else:
+            subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+
+    progress = stop_at("surrogate: attack", 4 * 4, spoil)
+    with pytest.raises(InputError) as failed:
+        job(folder, output, on_progress=progress).run()
+    assert str(path) in str(failed.value)
+    assert ("no space left" if kind == "full" else "read-only") in str(failed.value)
+    assert len(checkpoint_of(output)["history"]) == 3
+    if kind == "full":
+        (disk / "other").unlink()
+    else:
+        subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
+    job(folder, output).run(resume=True)
+    assert len(checkpoint_of(output)["history"]) == 6
+
+
+def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):
+    (tmp_path / "objects").mkdir()
+    mine = [tmp_path / ".hidden.tmp", tmp_path / "a.0123456789ab.tmp"]
+    stale = [
+        tmp_path / ".checkpoint.safetensors.0123456789ab.tmp",
+        tmp_path / "objects" / ".ball.safetensors.ba9876543210.tmp",
+    ]
+    for path in (*mine, *stale):
+        path.write_text("")
+    assert sorted(locks.remove_partial(tmp_path)) == sorted(stale)
+    assert all(path.exists() for path in mine)

@@ -1,0 +1,187 @@
+"""Field files: round trips, and what is said about damaged ones."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import small_fields as small
+
+from mi_nerfattack import InputError
+from mi_nerfattack.fields import (
+    GridField,
+    GridLayout,
+    NGPField,
+    Occupancy,
+    load_field,
+    load_grid,
+    save_field,
+)
+from mi_nerfattack.io import files
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_grid_file_keeps_all_within_half_precision(tmp_path, rng) -> None:
+    field = small.blob(rng)
+    cells = rng.random((3, 4, 5)) < 0.5
+    field = GridField(
+        field.layout,
+        np.array([-1.0, -2, 0]),
+        np.array([1.0, 2, 0.7]),
+        density=field.parameters()["density"].numpy(),
+        texture=field.texture.numpy(),
+        occupancy=Occupancy(cells),
+        density_scale=3.25,
+        step_m=0.0123,
+        info={"provenance": "test", "fit.psnr": "30.1"},
+    )
+    save_field(tmp_path / "a.safetensors", field)
+    found = load_grid(tmp_path / "a.safetensors")
+    half = field.texture.numpy().astype(np.float16).astype(np.float32)
+    np.testing.assert_array_equal(found.texture, half)
+    raw = field.parameters()["density"].numpy().astype(np.float16)
+    np.testing.assert_array_equal(found.parameters()["density"].numpy(), raw)
+    np.testing.assert_array_equal(found.occupancy.cells, cells)
+    assert found.metadata() == field.metadata()
+    assert (found.step_m, found.density_scale) == (0.0123, 3.25)
+    np.testing.assert_array_equal(found.upper, field.upper)
+    save_field(tmp_path / "b.safetensors", found)
+    first, second = [(tmp_path / f"{x}.safetensors").read_bytes() for x in "ab"]
+    assert first == second
+
+
+def test_ngp_file_evaluates_the_same(tmp_path: Path, rng: np.random.Generator) -> None:
+    field = small.small_ngp(cone=1 / 64)
+    table = field.parameters()["table"].numpy().astype(np.float16).astype(np.float32)
+    field.set_parameter("table", mi.Float(table))
+    save_field(tmp_path / "a.safetensors", field)
+    found = load_field(tmp_path / "a.safetensors")
+    assert isinstance(found, NGPField)
+    assert found.metadata() == field.metadata() and found.cone == 1 / 64
+    points = rng.uniform(-1, 1, (20, 3))
+    for a, b in zip(
+        small.evaluate(found, points), small.evaluate(field, points), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    direction = mi.Vector3f(0.6, 0, 0.8)
+    np.testing.assert_array_equal(
+        found.background(direction).numpy(), field.background(direction).numpy()
+    )
+    save_field(tmp_path / "b.safetensors", found)
+    first, second = [(tmp_path / f"{x}.safetensors").read_bytes() for x in "ab"]
+    assert first == second
+
+
+def test_load_grid_refuses_an_ngp(tmp_path: Path) -> None:
+    save_field(tmp_path / "n.safetensors", small.small_ngp())
+    with pytest.raises(InputError, match=r"n\.safetensors: is a ngp_field"):
+        load_grid(tmp_path / "n.safetensors")
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> tuple[Path, dict, dict]:
+    """A good grid field file, with its tensors and its header to spoil."""
+    path = tmp_path / "f.safetensors"
+    save_field(path, GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES))
+    return path, *files.read_safetensors(path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "message"),
+    [
+        ("format", "other 1", "'format' is 'other 1'; expected"),
+        ("kind", "mesh", "'kind' is 'mesh'; allowed: grid_field, ngp_field"),
+        ("levels", "two", "'levels' holds 'two'; expected int"),
+        ("levels", "0", "levels: 0; allowed"),
+        ("levels", "2", "density: shape"),
+        ("lower", "1 1", "bounding box"),
+        ("upper", "1 1 x", "'upper' holds 'x'; expected float"),
+        ("step_m", "0", "step_m: 0.0; must be positive"),
+        ("step_m", "nan", "step_m: nan; must be positive"),
+        ("density_scale", "-1", "density_scale: -1.0"),
+        ("occupancy_shape", "9 9 9", "occupancy: 1 bytes for a grid of"),
+        ("occupancy_shape", "-1 -1 1", "occupancy"),
+        ("occupancy_shape", "1 1", "occupancy: 1 bytes for a grid of"),
+    ],
+)
+def test_wrong_header_entries(stored, entry: str, value: str, message: str) -> None:
+    path, tensors, header = stored
+    files.write_safetensors(path, tensors, {**header, entry: value})
+    with pytest.raises(InputError, match=message) as caught:
+        load_field(path)
+    assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("entry", ["levels", "upper", "step_m", "occupancy_shape"])
+def test_missing_header_entries(stored, entry: str) -> None:
+    path, tensors, header = stored
+    del header[entry]
+    files.write_safetensors(path, tensors, header)
+    with pytest.raises(InputError, match=f"entry '{entry}' is missing") as caught:
+        load_field(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_texture_that_is_not_finite(stored, bad: float) -> None:
+    path, tensors, header = stored
+    texture = tensors["texture"].copy()
+    texture[5, 1] = bad
+    files.write_safetensors(path, {**tensors, "texture": texture}, header)
+    with pytest.raises(InputError, match=r"f\.safetensors: tensor 'texture' holds NaN"):
+        load_field(path)
+
+
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e5])
+def test_fields_that_no_file_can_hold_are_not_written(tmp_path, bad: float) -> None:
+    path = tmp_path / "f.safetensors"
+    field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
+    texture = np.zeros((field.n_vertices, 3), np.float32)
+    texture[5, 1] = bad
+    field.set_parameter("texture", texture)
+    with pytest.raises(InputError, match="tensor 'texture' holds NaN.*up to 65504"):
+        save_field(path, field)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["density", "texture", "occupancy"])
+def test_missing_tensors(stored, name: str) -> None:
+    path, tensors, header = stored
+    del tensors[name]
+    files.write_safetensors(path, tensors, header)
+    with pytest.raises(InputError, match=f"entry '{name}' is missing from the file"):
+        load_field(path)
+
+
+def test_ngp_matrix_of_another_shape(tmp_path: Path) -> None:
+    path = tmp_path / "n.safetensors"
+    save_field(path, small.small_ngp())
+    tensors, header = files.read_safetensors(path)
+    tensors["colour_net.1"] = np.zeros((3, 3), np.float32)
+    files.write_safetensors(path, tensors, header)
+    with pytest.raises(InputError, match=r"colour_net\.1: shape \(3, 3\); expected"):
+        load_field(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_truncated_file(stored, share: float) -> None:
+    path = stored[0]
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=r"f\.safetensors"):
+        load_field(path)
+
+
+def test_other_kinds_of_files_are_not_opened_as_fields(tmp_path: Path) -> None:
+    as_pickle, as_zip = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    as_pickle.write_bytes(pickle.dumps({"density": [0.0] * 100}))
+    with zipfile.ZipFile(as_zip, "w") as archive:
+        archive.writestr("data.pkl", "x" * 100)
+    for path in (as_pickle, as_zip):
+        with pytest.raises(InputError, match=path.name):
+            load_field(path)

@@ -1,0 +1,295 @@
+"""Images of fields through Mitsuba: integrator, emitter, surfaces, derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import small_fields as small
+
+from mi_nerfattack.fields import GridField, load_field, save_field
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+WIDTH, HEIGHT = 16, 12
+OUTSIDE, INSIDE = "3,1,.5", "-.4,.2,.1"
+BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
+LIGHT = '<emitter type="area"><rgb name="radiance" value="0,2,0"/></emitter>'
+VIEWS = pytest.mark.parametrize("eye", [OUTSIDE, INSIDE], ids=["outside", "inside"])
+
+
+def volume(path: Path, kind: str = "grid_field", name: str = "object") -> str:
+    """Write a volume as XML."""
+    filename = f'<string name="filename" value="{path}"/>'
+    return f'<volume type="{kind}" id="{name}">{filename}</volume>'
+
+
+def scene(integrator: str, world: str = "", eye: str = OUTSIDE) -> mi.Scene:
+    """Load a scene of 16 x 12 pixels that looks at the origin."""
+    return mi.load_string(
+        '<scene version="3.0.0"><sensor type="perspective">'
+        '<float name="fov" value="60"/><transform name="to_world">'
+        f'<lookat origin="{eye}" target="0,0,0" up="0,0,1"/></transform>'
+        f'<film type="hdrfilm"><integer name="width" value="{WIDTH}"/>'
+        f'<integer name="height" value="{HEIGHT}"/><rfilter type="box"/>'
+        '<string name="pixel_format" value="rgb"/></film></sensor>'
+        f"{integrator}{world}</scene>",
+        parallel=False,
+    )
+
+
+def fields(inside: str) -> str:
+    """Write a field_integrator as XML; stop 0 makes it exact."""
+    stop = '<float name="stop" value="0"/>'
+    return f'<integrator type="field_integrator">{stop}{inside}</integrator>'
+
+
+def emitter(inside: str) -> str:
+    """Write a cube with a field_emitter, a little larger than the fields' box."""
+    return (
+        '<shape type="cube"><transform name="to_world"><scale value="1.01"/>'
+        f'</transform>{BLACK}<emitter type="field_emitter"><float name="stop" '
+        f'value="0"/>{inside}</emitter></shape>'
+    )
+
+
+def rectangle(x: float, half: float = 9.0) -> str:
+    """Write a green light in the plane of one x that faces +x."""
+    return (
+        f'<shape type="rectangle"><transform name="to_world"><scale value="{half}"/>'
+        f'<rotate y="1" angle="90"/><translate x="{x}"/></transform>{LIGHT}{BLACK}'
+        "</shape>"
+    )
+
+
+def render(loaded: mi.Scene, spp: int = 1, seed: int = 0) -> np.ndarray:
+    """Render (height, width, channels)."""
+    return np.array(mi.render(loaded, spp=spp, seed=seed))
+
+
+def camera_rays(loaded: mi.Scene) -> mi.Ray3f:
+    """Return the rays that `render` traces with one sample and seed 0."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, WIDTH * HEIGHT)
+    pixel = dr.arange(mi.UInt32, WIDTH * HEIGHT)
+    corner = mi.Vector2f(pixel % WIDTH, pixel // WIDTH)
+    place = (corner + sampler.next_2d()) / mi.Vector2f(WIDTH, HEIGHT)
+    return loaded.sensors()[0].sample_ray(0, 0, place, mi.Point2f(0.5))[0]
+
+
+@pytest.fixture
+def grid(tmp_path: Path, variant: str, rng: np.random.Generator) -> Path:
+    path = tmp_path / "grid.safetensors"
+    save_field(path, small.blob(rng, step_m=0.03))
+    return path
+
+
+@pytest.fixture
+def ngp(tmp_path: Path, variant: str) -> Path:
+    path = tmp_path / "ngp.safetensors"
+    field = small.small_ngp()
+    field.step_m = 0.02
+    save_field(path, field)
+    return path
+
+
+# Values
+
+
+@VIEWS
+def test_integrator_shows_the_march(grid: Path, eye: str) -> None:
+    loaded = scene(fields(volume(grid)), eye=eye)
+    image = render(loaded)
+    ray = camera_rays(loaded)
+    posed = PosedField(load_field(grid))
+    seen = march(
+        posed, ray.o, ray.d, mi.Float(dr.inf), mi.Float(0.5), mi.Bool(True), 0.0
+    )
+    expected = [*seen.radiance, seen.opacity, seen.depth]
+    expected += [*seen.radiance, seen.opacity, seen.depth]
+    assert image.shape == (HEIGHT, WIDTH, 10)
+    for channel, values in enumerate(expected):
+        found = image[..., channel].ravel()
+        np.testing.assert_allclose(found, values.numpy(), rtol=1e-3, atol=1e-5)
+
+
+@VIEWS
+@pytest.mark.parametrize("integrator", ["path", "direct"])
+def test_emitter_shows_what_the_integrator_shows(grid, ngp, eye, integrator) -> None:
+    for inside in (volume(grid), volume(grid) + volume(ngp, "ngp_field", "scene")):
+        one = scene(fields(inside), eye=eye)
+        other = scene(f'<integrator type="{integrator}"/>', emitter(inside), eye)
+        a, b = render(one)[..., :3], render(other)[..., :3]
+        if "ngp" in inside:
+            # Rays that pass by the cube see the sky of the integrator alone.
+            met = b.sum(-1) > 0
+            a, b = a[met], b[met]
+        assert a.max() > 0.05
+        # From outside, the steps count from the surface instead of the camera.
+        error = 1e-4 if eye == INSIDE else 3e-3
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=error)
+
+
+def test_emitter_lights_other_surfaces(tmp_path: Path) -> None:
+    # An opaque homogeneous box is a lamp of one radiance, as an area light is.
+    path = tmp_path / "lamp.safetensors"
+    save_field(path, small.homogeneous(1e4))
+    radiance = float(small.sigmoid_to_linear(np.array(0.3)))
+    floor = (
+        '<shape type="rectangle"><transform name="to_world"><scale value="6"/>'
+        '<translate z="-2"/></transform><bsdf type="diffuse"/></shape>'
+    )
+    stock = (
+        f'<shape type="cube">{BLACK}<emitter type="area"><rgb name="radiance" '
+        f'value="{radiance}"/></emitter></shape>'
+    )
+    eye = "5,1,2"
+    own = emitter(volume(path)).replace('<scale value="1.01"/>', "")
+    images = [
+        render(scene('<integrator type="direct"/>', floor + lamp, eye), spp=64)
+        for lamp in (own, stock)
+    ]
+    lit = (images[1] > 0).any(-1) & (images[1] < 0.9 * radiance).all(-1)
+    assert lit.mean() > 0.3
+    expected = images[1][lit].mean()
+    np.testing.assert_allclose(images[0][lit].mean(), expected, rtol=0.03)
+
+
+def test_surface_in_front_hides_the_field(grid: Path) -> None:
+    image = render(scene(fields(volume(grid)), rectangle(2.0)))
+    assert (image[..., 3] == 0).all() and (image[..., 4] == np.inf).all()
+    assert (image[..., :3] == 0).all()  # without a nested integrator
+
+
+def test_surface_behind_is_seen_through_the_field(grid: Path) -> None:
+    inside = volume(grid) + '<integrator type="path"/>'
+    image = render(scene(fields(inside), rectangle(-2.0)))
+    alone = render(scene(fields(volume(grid))))
+    opacity = image[..., 3:4]
+    assert opacity.max() > 0.2
+    np.testing.assert_allclose(opacity, alone[..., 3:4], atol=1e-5)
+    expected = alone[..., :3] + (1 - opacity) * np.array([0.0, 2.0, 0.0])
+    np.testing.assert_allclose(image[..., :3], expected, atol=1e-4)
+
+
+def test_surface_within_cuts_the_field(tmp_path: Path) -> None:
+    path = tmp_path / "box.safetensors"
+    save_field(path, small.homogeneous(0.7))
+    loaded = scene(fields(volume(path)), rectangle(0.0), eye="4,0,0.001")
+    row, column = HEIGHT // 2, WIDTH // 2
+    # Half of the box, one metre, lies before the surface.
+    found = render(loaded)[row, column, 3]
+    assert found == pytest.approx(1 - np.exp(-0.7), rel=0.02)
+
+
+def test_sky_lies_behind_the_fields_but_not_behind_surfaces(ngp: Path) -> None:
+    inside = fields(volume(ngp, "ngp_field", "scene"))
+    open_air = scene(inside)
+    image = render(open_air)
+    sky = load_field(ngp).background(camera_rays(open_air).d).numpy().T
+    passed = 1 - image[..., 3:4]
+    expected = image[..., 5:8] + passed * sky.reshape(HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(image[..., :3], expected, atol=1e-4)
+    assert passed.max() == 1 and passed.min() < 0.9
+
+    walled = render(scene(inside, rectangle(-2.0, 99.0)))
+    np.testing.assert_allclose(walled[..., :3], walled[..., 5:8], atol=1e-5)
+    assert walled[..., 3].max() > 0.1
+
+
+def test_jitter_keeps_the_mean(grid: Path) -> None:
+    fixed = render(scene(fields(volume(grid))), spp=64)
+    jitter = '<boolean name="jitter" value="true"/>'
+    noisy = render(scene(fields(jitter + volume(grid))), spp=64)
+    assert not np.array_equal(fixed, noisy)
+    a, b = fixed[..., :4].mean((0, 1)), noisy[..., :4].mean((0, 1))
+    np.testing.assert_allclose(b, a, rtol=0.02)
+
+
+@pytest.mark.usefixtures("no_variant_left")
+def test_monochromatic_variant_shows_luminance(grid: Path) -> None:
+    colour = render(scene(fields(volume(grid))))
+    mi.set_variant("llvm_ad_mono")
+    mono = render(scene(fields(volume(grid))))
+    expected = colour[..., :3] @ [0.212671, 0.715160, 0.072169]
+    np.testing.assert_allclose(mono[..., 0], expected, rtol=1e-3, atol=1e-4)
+
+
+# Derivatives
+
+
+@pytest.fixture
+def attacked(grid: Path) -> tuple[mi.Scene, Callable[..., mi.Float], np.ndarray]:
+    """A scene of two fields, an objective of its image, and a tangent."""
+    rng = np.random.default_rng(1)
+    jitter = '<boolean name="jitter" value="true"/>'
+    loaded = scene(fields(jitter + volume(grid)), rectangle(-0.2, 0.5))
+    weight = mi.TensorXf(rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32))
+
+    def objective(image: mi.TensorXf) -> mi.Float:
+        return dr.sum(image[..., :3] * weight)
+
+    field: GridField = loaded.integrator().volumes[0].field
+    tangent = rng.normal(size=(field.n_vertices, 3)).astype(np.float32)
+    return loaded, objective, tangent
+
+
+def test_render_is_differentiable_in_both_modes(attacked) -> None:
+    loaded, objective, tangent = attacked
+    params = mi.traverse(loaded)
+    (name,) = [key for key in params.keys() if key.endswith("texture")]  # noqa: SIM118
+    base = params[name].numpy().copy()
+    seeds = {"spp": 2, "seed": 7, "seed_grad": 3}
+
+    def shifted(s: float) -> float:
+        params[name] = mi.TensorXf(base + s * tangent)
+        params.update()
+        # The derivative pass draws the samples of `seed_grad`.
+        return float(objective(mi.render(loaded, spp=2, seed=3)).array[0])
+
+    expected = (shifted(1e-2) - shifted(-1e-2)) / 2e-2
+
+    texture = mi.TensorXf(base)
+    dr.enable_grad(texture)
+    params[name] = texture
+    params.update()
+    dr.backward(objective(mi.render(loaded, params, **seeds)))
+    backward = float((dr.grad(params[name]).numpy().astype(float) * tangent).sum())
+
+    texture = mi.TensorXf(base)
+    dr.enable_grad(texture)
+    params[name] = texture
+    params.update()
+    dr.set_grad(params[name], mi.TensorXf(tangent))
+    dr.forward_from(params[name], dr.ADFlag.ClearEdges)
+    found = objective(mi.render(loaded, params, **seeds))
+    dr.forward_to(found)
+    forward = float(dr.grad(found).array[0])
+
+    assert forward == pytest.approx(backward, rel=1e-3)
+    assert backward == pytest.approx(expected, rel=1e-2)
+
+
+def test_gradient_descent_moves_only_the_texture(attacked) -> None:
+    loaded, objective, _ = attacked
+    params = mi.traverse(loaded)
+    (name,) = [key for key in params.keys() if key.endswith("texture")]  # noqa: SIM118
+    field = loaded.integrator().volumes[0].field
+    density = field.parameters()["density"].numpy().copy()
+    optimiser = mi.ad.SGD(lr=1.0)
+    optimiser[name] = params[name]
+    values = []
+    for _ in range(3):
+        params.update(optimiser)
+        value = objective(mi.render(loaded, params, spp=2, seed=0, seed_grad=0))
+        dr.backward(value)
+        optimiser.step()
+        values.append(float(value.array[0]))
+    assert values[2] < values[1] < values[0]
+    np.testing.assert_array_equal(field.parameters()["density"].numpy(), density)

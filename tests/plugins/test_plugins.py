@@ -1,0 +1,336 @@
+"""The Mitsuba plugins: loading, parameters, values, and what they refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import small_fields as small
+
+from mi_nerfattack.fields import GridField, NGPField, load_field, save_field
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+KINDS = ("grid_field", "ngp_field")
+
+
+@pytest.fixture
+def grid(tmp_path: Path, variant: str, rng: np.random.Generator) -> Path:
+    """A file with a coloured blob in [-1, 1]^3."""
+    path = tmp_path / "grid.safetensors"
+    save_field(path, small.blob(rng))
+    return path
+
+
+@pytest.fixture
+def ngp(tmp_path: Path, variant: str) -> Path:
+    """A file with an NGP in [-1, 1]^3."""
+    path = tmp_path / "ngp.safetensors"
+    save_field(path, small.small_ngp())
+    return path
+
+
+@pytest.fixture
+def paths(grid: Path, ngp: Path) -> dict[str, Path]:
+    """A file of each kind."""
+    return dict(zip(KINDS, (grid, ngp), strict=True))
+
+
+def volume(path: Path, kind: str = "grid_field", more: str = "", **names: str) -> str:
+    """Write a volume as XML; the id defaults to `object`."""
+    attributes = "".join(f' {k}="{v}"' for k, v in ({"id": "object"} | names).items())
+    return (
+        f'<volume type="{kind}"{attributes}>'
+        f'<string name="filename" value="{path}"/>{more}</volume>'
+    )
+
+
+def load(text: str) -> Any:
+    """Load an XML string whose root gets the version."""
+    head, tail = text.split(" ", 1)
+    return mi.load_string(f'{head} version="3.0.0" {tail}', parallel=False)
+
+
+def points(rng: np.random.Generator, count: int = 50) -> tuple[np.ndarray, Any]:
+    """Make positions in [-1.2, 1.2]^3, as an array and as interactions."""
+    place = rng.uniform(-1.2, 1.2, (count, 3)).astype(np.float32)
+    it = dr.zeros(mi.Interaction3f, count)
+    it.p = mi.Point3f(place.T.copy())
+    return place.astype(float), it
+
+
+# Loading
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_volumes_load_from_xml_and_dict(paths, kind: str) -> None:
+    from_xml = load(volume(paths[kind], kind))
+    from_dict = mi.load_dict({"type": kind, "filename": str(paths[kind])})
+    for loaded in (from_xml, from_dict):
+        assert isinstance(loaded, mi.Volume)
+        assert str(loaded).startswith(f"{kind}[") and "quantity=density" in str(loaded)
+
+
+def test_emitter_loads_from_xml_and_dict(grid: Path) -> None:
+    text = f'<emitter type="field_emitter">{volume(grid)}</emitter>'
+    from_xml = load(f'<shape type="cube">{text}</shape>')
+    nested = {"type": "grid_field", "filename": str(grid)}
+    emitter = {"type": "field_emitter", "object": nested}
+    from_dict = mi.load_dict({"type": "cube", "emitter": emitter}, parallel=False)
+    for loaded in (from_xml, from_dict):
+        assert "FieldEmitter[fields=(object), stop=0.001]" in str(loaded)
+
+
+def test_integrator_loads_from_xml_and_dict(paths) -> None:
+    both = volume(paths["ngp_field"], "ngp_field", id="scene")
+    both += volume(paths["grid_field"])
+    from_xml = load(f'<integrator type="field_integrator">{both}</integrator>')
+    nested = [{"type": kind, "filename": str(paths[kind])} for kind in KINDS]
+    from_dict = mi.load_dict(
+        {"type": "field_integrator", "scene": nested[1], "object": nested[0]}
+    )
+    for loaded in (from_xml, from_dict):
+        assert str(loaded) == (
+            "FieldIntegrator[fields=(scene, object), InterleavedComposite, stop=0.001]"
+        )
+        layers = [f"{name}.{c}" for name in ("scene", "object") for c in "RGBAZ"]
+        assert loaded.aov_names() == ["opacity", "depth", *layers]
+
+
+def test_relative_names_follow_mitsubas_file_resolver(grid: Path) -> None:
+    mi.file_resolver().append(str(grid.parent))
+    loaded = mi.load_dict({"type": "grid_field", "filename": grid.name})
+    assert isinstance(loaded, mi.Volume)
+
+
+def test_parameters_show_under_the_id_and_are_differentiable(paths) -> None:
+    both = volume(paths["ngp_field"], "ngp_field", id="scene")
+    both += volume(paths["grid_field"])
+    loaded = load(f'<integrator type="field_integrator">{both}</integrator>')
+    params = mi.traverse(loaded)
+    names = ("table", "density_weights", "colour_weights", "sky")
+    expected = {"object.texture", "object.density", *[f"scene.{n}" for n in names]}
+    assert set(params.keys()) == expected
+    for name in params.keys():  # noqa: SIM118  not a dict
+        assert not params.flags(name) & mi.ParamFlags.NonDifferentiable.value
+
+
+# Errors
+
+
+REFUSED = '<float name="foo" value="1"/>'
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        pytest.param(lambda p: volume(p, more=REFUSED), id="grid_field"),
+        pytest.param(
+            lambda p: (
+                f'<integrator type="field_integrator">{volume(p)}{REFUSED}</integrator>'
+            ),
+            id="field_integrator",
+        ),
+        pytest.param(
+            lambda p: (
+                '<shape type="cube"><emitter type="field_emitter">'
+                f"{volume(p)}{REFUSED}</emitter></shape>"
+            ),
+            id="field_emitter",
+        ),
+    ],
+)
+def test_unknown_parameters_are_named(grid: Path, wrap) -> None:
+    with pytest.raises(RuntimeError, match=r'(?s)1 unreferenced property.*"foo"'):
+        load(wrap(grid))
+
+
+def test_unknown_parameter_of_an_ngp(ngp: Path) -> None:
+    with pytest.raises(RuntimeError, match=r'(?s)1 unreferenced property.*"foo"'):
+        load(volume(ngp, "ngp_field", REFUSED))
+
+
+def refuse(text: str, message: str) -> None:
+    """Check that an XML string is refused with a message."""
+    with pytest.raises(Exception, match=message):
+        load(text)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (
+            '<string name="quantity" value="colour"/>',
+            "quantity: 'colour'; allowed: density, radiance",
+        ),
+        (
+            '<transform name="to_world"><scale x="2"/></transform>',
+            "to_world: .*fields take rotation, translation and uniform scale",
+        ),
+        (
+            '<transform name="to_world"><scale x="-1"/></transform>',
+            "to_world: .*fields take rotation, translation and uniform scale",
+        ),
+        (
+            '<transform name="to_world"><matrix value="1 .5 0 0 0 1 0 0 0 0 1 0 '
+            '0 0 0 1"/></transform>',
+            "to_world: .*fields take rotation, translation and uniform scale",
+        ),
+        (
+            '<transform name="to_world"><scale value="0"/></transform>',
+            "to_world: .*is singular",
+        ),
+    ],
+)
+def test_volumes_refuse_properties(grid: Path, more: str, message: str) -> None:
+    refuse(volume(grid, more=more), message)
+
+
+def test_volumes_refuse_files(paths, tmp_path: Path) -> None:
+    refuse(volume(paths["ngp_field"]), 'holds a ngp_field; use <volume type="ngp_field')
+    refuse(
+        volume(paths["grid_field"], "ngp_field"),
+        'holds a grid_field; use <volume type="grid_field',
+    )
+    refuse(volume(tmp_path / "none.safetensors"), "none.safetensors: does not exist")
+    refuse('<volume type="grid_field"/>', "filename")
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ("", "no nested grid_field or ngp_field; give one or more"),
+        ('<float name="stop" value="1"/>', "stop: 1.0; allowed is 0 <= stop < 1"),
+        ('<float name="stop" value="-0.1"/>', "stop: -0.1"),
+        ('<bsdf type="diffuse"/>', "cannot use the nested BSDF"),
+    ],
+)
+@pytest.mark.parametrize("plugin", ["field_emitter", "field_integrator"])
+def test_nesting_plugins_refuse(grid: Path, plugin: str, inside: str, message) -> None:
+    nested = inside + (volume(grid) if inside else "")
+    if plugin == "field_emitter":
+        text = f'<shape type="cube"><emitter type="{plugin}">{nested}</emitter></shape>'
+    else:
+        text = f'<integrator type="{plugin}">{nested}</integrator>'
+    refuse(text, message)
+
+
+def test_integrator_takes_one_sampling_integrator(grid: Path) -> None:
+    start = f'<integrator type="field_integrator">{volume(grid)}'
+    one = '<integrator type="path"/>'
+    assert load(f"{start}{one}</integrator>").behind is not None
+    refuse(
+        f"{start}{one}{one}</integrator>", "and one sampling integrator such as path"
+    )
+
+
+# Values
+
+
+def test_eval_equals_float64_interpolation(grid: Path, rng) -> None:
+    place, it = points(rng)
+    more = '<transform name="to_world"><scale value="1.5"/></transform>'
+    loaded = load(volume(grid, more=more))
+    density, radiance = small.eval_grid(load_field(grid), place / 1.5)
+    np.testing.assert_allclose(loaded.eval_1(it).numpy(), density / 1.5, rtol=1e-4)
+    spectrum = loaded.eval(it).numpy()
+    np.testing.assert_allclose(spectrum, np.tile(density / 1.5, (3, 1)), rtol=1e-4)
+    np.testing.assert_allclose(loaded.eval_3(it).numpy().T, radiance, atol=1e-5)
+
+
+def test_outside_of_the_box_is_empty(paths, rng) -> None:
+    place, it = points(rng)
+    outside = (np.abs(place) > 1).any(1)
+    assert outside.any() and not outside.all()
+    for kind, path in paths.items():
+        loaded = load(volume(path, kind))
+        assert ((loaded.eval_1(it).numpy() == 0) == outside).all()
+        assert (loaded.eval_3(it).numpy()[:, outside] == 0).all()
+
+
+def test_radiance_as_quantity(grid: Path, rng: np.random.Generator) -> None:
+    place, it = points(rng)
+    inside = (np.abs(place) < 1).all(1)
+    loaded = load(volume(grid, more='<string name="quantity" value="radiance"/>'))
+    _, radiance = small.eval_grid(load_field(grid), place)
+    np.testing.assert_allclose(
+        loaded.eval(it).numpy().T[inside], radiance[inside], atol=1e-5
+    )
+    luminance = radiance @ [0.212671, 0.715160, 0.072169]
+    np.testing.assert_allclose(
+        loaded.eval_1(it).numpy()[inside], luminance[inside], atol=1e-4
+    )
+    assert loaded.max() == 1
+
+
+def test_box_and_bound_in_the_world(paths, rng: np.random.Generator) -> None:
+    more = (
+        '<transform name="to_world"><rotate z="1" angle="45"/><scale value="2"/>'
+        '<translate x="5"/></transform>'
+    )
+    _, it = points(rng, 5000)
+    it.p = 2 * it.p + mi.Vector3f(5, 0, 0)
+    for kind, path in paths.items():
+        loaded = load(volume(path, kind, more))
+        box, reach = loaded.bbox(), 2 * np.sqrt(2)
+        np.testing.assert_allclose(box.min, [5 - reach, -reach, -2], rtol=1e-5)
+        np.testing.assert_allclose(box.max, [5 + reach, reach, 2], rtol=1e-5)
+        peak = loaded.eval_1(it).numpy().max()
+        assert 0 < peak <= loaded.max() < 10 * peak
+        assert loaded.max_per_channel() == [loaded.max()] * 3
+
+
+def test_updated_parameters_reach_the_field(paths, rng) -> None:
+    _, it = points(rng)
+    for kind, name in zip(KINDS, ("texture", "table"), strict=True):
+        loaded = load(volume(paths[kind], kind))
+        before = loaded.eval_3(it).numpy().copy()
+        params = mi.traverse(loaded)
+        params[name] = type(params[name])(params[name] + 1)
+        params.update()
+        assert np.abs(loaded.eval_3(it).numpy() - before).max() > 0.01
+
+
+def test_heterogeneous_medium_agrees_with_the_march(grid: Path) -> None:
+    # Nothing scatters: what arrives from behind is the transmittance.
+    medium = (
+        '<shape type="cube"><bsdf type="null"/>'
+        '<medium name="interior" type="heterogeneous">'
+        f"{volume(grid, name='sigma_t')}"
+        '<volume type="constvolume" name="albedo"><rgb name="value" value="0"/>'
+        "</volume></medium></shape>"
+    )
+    scene = load(
+        '<scene ><integrator type="volpath"/><sensor type="perspective">'
+        '<float name="fov" value="10"/><transform name="to_world">'
+        '<lookat origin="-3,.1,.2" target="0,.1,.2" up="0,0,1"/></transform>'
+        '<film type="hdrfilm"><integer name="width" value="1"/>'
+        '<integer name="height" value="1"/><rfilter type="box"/></film></sensor>'
+        f'{medium}<emitter type="constant"/></scene>'
+    )
+    count = 4096
+    sensor = scene.sensors()[0]
+    side = 64
+    u = mi.Point2f((np.mgrid[:side, :side].reshape(2, -1) + 0.5) / side)
+    ray, _ = sensor.sample_ray(0, 0, u, u)
+    pose = PosedField(load_field(grid), Pose.identity())
+    seen = march(
+        pose, ray.o, ray.d, mi.Float(dr.inf), mi.Float(0.5), mi.Bool(True), 0.0
+    )
+    expected = 1 - seen.opacity.numpy().astype(float).mean()
+    assert 0.1 < expected < 0.9
+    found = np.array(mi.render(scene, spp=count)).mean()
+    noise = np.sqrt(expected * (1 - expected) / count)
+    assert found == pytest.approx(expected, abs=4 * noise)
+
+
+def test_files_of_both_kinds_load_as_their_class(paths) -> None:
+    found = [type(load(volume(paths[k], k)).field) for k in KINDS]
+    assert found == [GridField, NGPField]

@@ -1,0 +1,308 @@
+"""Programs of torch.export and TorchScript as policies."""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+import zipfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenario.build.policy import load_policy
+from mi_nerfattack.scenario.sections import PolicySection
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def section(**keys):
+    return PolicySection.model_validate(keys)
+
+
+def camera(n, rng):
+    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
+
+
+def small(batch_norm=True):
+    network = nn.Sequential(
+        nn.Conv2d(3, 4, 5, stride=8),
+        nn.BatchNorm2d(4) if batch_norm else nn.Identity(),
+        nn.ELU(),
+        nn.Flatten(),
+        nn.Linear(4 * 8 * 25, 1),
+    )
+    network[0].weight.data.normal_()
+    return network.eval()
+
+
+def write_exported(network, path, count=2, free=True):
+    shapes = [{0: torch.export.Dim("n", min=1)}] if free else None
+    image = torch.zeros(count, 3, 66, 200)
+    program = torch.export.export(network, (image,), dynamic_shapes=shapes)
+    torch.export.save(program, path)
+
+
+def write_script(network, path):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+        torch.jit.save(torch.jit.script(network), path)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"), [("net.pt2", write_exported), ("net.pt", write_script)]
+)
+def test_programs_have_the_module_s_derivatives(name, write, tmp_path, rng):
+    network = small()
+    write(network, tmp_path / name)
+    policy = load_policy(section(file=name), tmp_path)
+    assert not any(p.requires_grad for p in policy.module.parameters())
+    image, weight = camera(3, rng), mi.Float(1, -2, 0.5)
+    leaf = torch.from_numpy(image.numpy()).double().requires_grad_(True)
+    expected = network.double()(leaf.permute(0, 3, 1, 2))[:, 0]
+    torch.autograd.backward(expected, torch.tensor([1, -2, 0.5]).double())
+    for _ in range(3):  # TorchScript optimises what it sees for the third time
+        control, gradient = policy.vjp(image, 0, weight)
+        np.testing.assert_allclose(control, expected.detach(), atol=1e-5)
+        np.testing.assert_allclose(gradient, leaf.grad, atol=1e-5)
+    tangent = rng.normal(size=(3, 66, 200, 3)).astype("f4")
+    t_control, _ = policy.step_jvp(image, 0, (), mi.TensorXf(tangent), ())
+    products = gradient.numpy().astype(float) * tangent
+    assert np.dot(t_control, weight) == pytest.approx(
+        products.sum(), abs=1e-5 * np.abs(products).sum()
+    )
+
+
+def test_programs_for_one_image_serve_several(tmp_path, rng):
+    network = small()
+    write_exported(network, tmp_path / "net.pt2", 1, free=False)
+    policy = load_policy(section(file="net.pt2"), tmp_path)
+    image = camera(3, rng)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))[:, 0]
+    np.testing.assert_allclose(policy.control(image, 0), expected, atol=1e-5)
+    write_exported(network, tmp_path / "two.pt2", 2, free=False)
+    with pytest.raises(InputError, match="two.pt2: takes exactly 2 images"):
+        load_policy(section(file="two.pt2"), tmp_path)
+
+
+def test_one_image_at_a_time_keeps_hidden_states_apart(tmp_path, rng):
+    (tmp_path / "net.py").write_text(
+        "import torch\n"
+        "class Net(torch.nn.Module):\n"
+        "    def forward(self, image, goal, hidden):\n"
+        "        new = image.mean((1, 2, 3)) + goal\n"
+        "        hidden = hidden + new[None, :, None]\n"
+        "        return hidden[0, :, 0], hidden\n"
+    )
+    keys = {
+        "file": "net.py:Net",
+        "recurrent": ((1, -1, 2),),
+        "goal": "integer",
+        "goals": 3,
+    }
+    image = camera(3, rng)
+    results = []
+    for extra in ({}, {"batch": 1}):
+        policy = load_policy(section(**keys, **extra), tmp_path)
+        memory = policy.initial_memory(3)
+        for _ in range(2):
+            control, memory = policy.step(image, 2, memory)
+        results.append((control.numpy(), memory[0].numpy()))
+    np.testing.assert_allclose(results[0][0], results[1][0])
+    np.testing.assert_allclose(results[0][1], results[1][1])
+
+
+@pytest.mark.parametrize("name", ["net.pt", "net.pt2"])
+def test_other_files_are_no_programs(name, tmp_path):
+    torch.save({"a": torch.zeros(2)}, tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: (is|holds) no"):
+        load_policy(section(file=name), tmp_path)
+    (tmp_path / name).write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match=f"{name}: is no"):
+        load_policy(section(file=name), tmp_path)
+
+
+class Marker:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_programs_with_pickled_objects_are_refused_unread(tmp_path):
+    write_exported(small(), tmp_path / "good.pt2")
+    buffer, mark = io.BytesIO(), tmp_path / "mark"
+    torch.save((Marker(mark), {}), buffer)
+    with (
+        zipfile.ZipFile(tmp_path / "good.pt2") as good,
+        zipfile.ZipFile(tmp_path / "bad.pt2", "w") as bad,
+    ):
+        for name in good.namelist():
+            sample = "sample_inputs" in name
+            bad.writestr(name, buffer.getvalue() if sample else good.read(name))
+    with pytest.raises(InputError, match="bad.pt2: .*sample_inputs.*pickled objects"):
+        load_policy(section(file="bad.pt2"), tmp_path)
+    assert not mark.exists()
+
+
+def change_model(path, change):
+    """Write a copy of a program with other JSON; return its path."""
+    bad = path.with_name("bad.pt2")
+    with zipfile.ZipFile(path) as good, zipfile.ZipFile(bad, "w") as file:
+        for name in good.namelist():
+            data = good.read(name)
+            if "/models/" in name:
+                model = json.loads(data)
+                change(model)
+                data = json.dumps(model).encode()
+            file.writestr(name, data)
+    return bad
+
+
+def guards(text):
+    return lambda model: model["guards_code"].append(text)
+
+
+def sizes(text):
+    """Replace every symbolic size."""
+
+    def visit(value):
+        for key, item in value.items() if isinstance(value, dict) else ():
+            if key == "expr_str":
+                value[key] = text
+            visit(item)
+        for item in value if isinstance(value, list) else ():
+            visit(item)
+
+    return visit
+
+
+def target(text):
+    return lambda model: model["graph_module"]["graph"]["nodes"][0].update(target=text)
+
+
+def tree(text):
+    def change(model):
+        call = model["graph_module"]["module_call_graph"][0]["signature"]
+        call["in_spec"] = call["in_spec"].replace("builtins.dict", text)
+
+    return change
+
+
+def input_name(text):
+    def change(model):
+        graph = model["graph_module"]["graph"]
+        graph["inputs"][0]["as_tensor"]["name"] = text
+
+    return change
+
+
+TOUCH = "__import__('pathlib').Path('mark').touch()"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (guards(f"{TOUCH} is None"), "guards_code"),
+        (guards(f"[{TOUCH}]"), "guards_code"),
+        (guards("(lambda: 1)() == 1"), "guards_code"),
+        (guards("L['image'].__class__ == 1"), "guards_code"),
+        (guards("L['image'].numpy()[0] == 1"), "guards_code"),
+        (guards("1 == 1 #"), "guards_code"),
+        (guards("math.__loader__ == 1"), "guards_code"),
+        (sizes(TOUCH), "expr_str"),
+        (sizes(f'Add("{TOUCH}")'), "expr_str"),
+        (sizes("Add('s0')"), "expr_str"),
+        (sizes("Symbol"), None),
+        (target("torch.serialization.os.system"), "target"),
+        (target("torch.ops.aten.from_file.default"), "target"),
+        (target("_operator.attrgetter"), "target"),
+        (target("torch.hub.load"), "target"),
+        (tree("collections.defaultdict"), "in_spec"),
+        (input_name(f"x={TOUCH}"), "name"),
+    ],
+)
+def test_programs_with_python_inside_are_refused(
+    change, message, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    write_exported(small(), tmp_path / "good.pt2")
+    bad = change_model(tmp_path / "good.pt2", change)
+    wanted = f"model.json: {message} .*not executed" if message else "cannot load"
+    with pytest.raises(InputError, match=f"(?s)bad.pt2: .*{wanted}"):
+        load_policy(section(file=bad.name), tmp_path)
+    assert not (tmp_path / "mark").exists()
+
+
+class Sizes(nn.Module):
+    """Reshapes by computed sizes: its program is full of expressions."""
+
+    def forward(self, image):
+        rows = nn.functional.avg_pool2d(image, 3, stride=4)
+        rows = rows[..., : image.shape[3] // 8]
+        return rows.reshape(image.shape[0] * 3, -1).reshape(image.shape[0], -1).mean(1)
+
+
+def test_programs_with_free_sizes_are_read(tmp_path, rng):
+    free = torch.export.Dim.AUTO
+    shapes = [{0: free, 2: free, 3: free}]
+    program = torch.export.export(
+        Sizes(), (torch.zeros(2, 3, 66, 200),), dynamic_shapes=shapes
+    )
+    torch.export.save(program, tmp_path / "net.pt2")
+    policy = load_policy(section(file="net.pt2"), tmp_path)
+    image = camera(3, rng)
+    expected = Sizes()(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))
+    np.testing.assert_allclose(policy.control(image, 0), expected, rtol=1e-5)
+
+
+class Writer(nn.Module):
+    def forward(self, image):
+        torch.ops.aten.save(image, "mark")
+        return image.mean((1, 2, 3))
+
+
+class Reader(nn.Module):
+    def forward(self, image):
+        return image.mean((1, 2, 3)) + torch.from_file("mark", size=1)
+
+
+@pytest.mark.parametrize(
+    ("network", "operator"), [(Writer, "save"), (Reader, "from_file")]
+)
+def test_scripts_that_open_files_are_refused(network, operator, tmp_path):
+    write_script(network(), tmp_path / "net.pt")
+    with pytest.raises(InputError, match=rf"net.pt: calls .*\.{operator}, which reads"):
+        load_policy(section(file="net.pt"), tmp_path)
+
+
+def test_programs_of_another_size_are_told(tmp_path, rng):
+    write_exported(small(), tmp_path / "net.pt2")
+    policy = load_policy(section(file="net.pt2"), tmp_path)
+    image = mi.TensorXf(rng.random((2, 30, 40, 3), dtype=np.float32))
+    with pytest.raises(InputError, match=r"(?s)net.pt2: fails on .*policy.preprocess"):
+        policy.control(image, 0)
+
+
+def test_programs_exported_in_training_mode_are_refused(tmp_path, rng):
+    norm = nn.Sequential(*small(), nn.Flatten())
+    drop = nn.Sequential(nn.Flatten(), nn.Dropout(0.5), nn.Linear(39600, 1))
+    write_exported(norm.train(), tmp_path / "norm.pt2")
+    write_exported(drop.train(), tmp_path / "drop.pt2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        trace = torch.jit.trace(norm, torch.zeros(2, 3, 66, 200), check_trace=False)
+        torch.jit.save(trace, tmp_path / "norm.pt")
+    for name in ("norm.pt2", "drop.pt2", "norm.pt"):
+        policy = load_policy(section(file=name), tmp_path)
+        with pytest.raises(InputError, match=f"{name}: .*export network.eval"):
+            policy.control(camera(2, rng), 0)

@@ -1,0 +1,348 @@
+"""The operators of the ONNX interpreter against onnxruntime."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("onnx", reason="the extra onnx is not installed")
+pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+
+from helpers.onnx_models import FLOAT, INT64, check, model  # noqa: E402
+from onnx import helper  # noqa: E402
+
+from mi_nerfattack.errors import InputError  # noqa: E402
+from mi_nerfattack.policy.onnx.network import OnnxNetwork  # noqa: E402
+
+
+def single(operator, x, constants=(), opset=17, extra=(), **attributes):
+    """Check one operator on an input x with constant further inputs."""
+    names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
+    values = dict(zip(names, constants, strict=True))
+    values.pop("", None)
+    node = helper.make_node(operator, ["x", *names], ["y", *extra], **attributes)
+    kind = helper.np_dtype_to_tensor_dtype(x.dtype)
+    outputs = {name: (kind, None) for name in ("y", *extra)}
+    check(model([node], {"x": (kind, x.shape)}, outputs, values, opset), x)
+
+
+def integers(*values):
+    return np.array(values, np.int64)
+
+
+UNARY = [
+    ("Relu", {}),
+    ("Elu", {"alpha": 0.7}),
+    ("LeakyRelu", {"alpha": 0.2}),
+    ("LeakyRelu", {}),
+    ("Selu", {}),
+    ("Sigmoid", {}),
+    ("HardSigmoid", {"alpha": 0.3}),
+    ("HardSwish", {}),
+    ("Tanh", {}),
+    ("Softplus", {}),
+    ("Softsign", {}),
+    ("Abs", {}),
+    ("Neg", {}),
+    ("Exp", {}),
+    ("Erf", {}),
+    ("Sin", {}),
+    ("Cos", {}),
+    ("Identity", {}),
+    ("Dropout", {}),
+    ("Flatten", {}),
+    ("Flatten", {"axis": 2}),
+    ("Flatten", {"axis": 0}),
+    ("Transpose", {"perm": [0, 2, 3, 1]}),
+    ("Transpose", {}),
+    ("Softmax", {}),
+    ("Softmax", {"axis": 1}),
+    ("ReduceMean", {"axes": [2, 3]}),
+    ("ReduceMean", {"keepdims": 0}),
+    ("ReduceMax", {"axes": [1], "keepdims": 0}),
+    ("GlobalAveragePool", {}),
+    ("GlobalMaxPool", {}),
+    ("MaxPool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
+    ("MaxPool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2], "dilations": [1, 2]}),
+    ("MaxPool", {"kernel_shape": [2, 2], "strides": [2, 2], "ceil_mode": 1}),
+    ("AveragePool", {"kernel_shape": [2, 3], "strides": [2, 1]}),
+    ("AveragePool", {"kernel_shape": [3, 3], "pads": [1, 0, 1, 2]}),
+    (
+        "AveragePool",
+        {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "count_include_pad": 1},
+    ),
+    (
+        "AveragePool",
+        {"kernel_shape": [2, 2], "strides": [2, 2], "auto_pad": "SAME_LOWER"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("operator", "attributes"), UNARY)
+def test_one_input(operator, attributes, rng):
+    single(operator, rng.normal(size=(2, 3, 5, 7)).astype("f4"), **attributes)
+
+
+@pytest.mark.parametrize(
+    ("operator", "opset", "attributes"),
+    [
+        ("Softmax", 11, {"axis": 1}),
+        ("Clip", 9, {"min": -0.5, "max": 0.25}),
+        ("Slice", 9, {"starts": [1, 0], "ends": [5, -1], "axes": [3, 2]}),
+        ("Pad", 9, {"pads": [0, 0, 1, 2, 0, 0, 0, 3], "value": 0.5}),
+        ("Unsqueeze", 11, {"axes": [0, 2]}),
+        ("Split", 11, {"axis": 3, "split": [3, 4], "extra": ["z"]}),
+        ("Split", 17, {"axis": 2, "extra": ["z", "a", "b", "c"]}),
+        ("ReduceSum", 11, {"axes": [1, 2]}),
+        ("Gelu", 20, {}),
+    ],
+)
+def test_other_versions(operator, opset, attributes, rng):
+    x = rng.normal(size=(2, 3, 5, 7)).astype("f4")
+    single(operator, x, opset=opset, **attributes)
+
+
+@pytest.mark.parametrize("operator", ["Add", "Sub", "Mul", "Div", "Max", "Min"])
+def test_two_inputs(operator, rng):
+    x = rng.normal(size=(2, 3, 5, 7)).astype("f4")
+    single(operator, x, [rng.normal(size=(3, 1, 7)).astype("f4")])
+    whole = rng.integers(-9, 9, (2, 5))
+    single(operator, whole, [integers(3)])
+
+
+@pytest.mark.parametrize("operator", ["Log", "Sqrt", "Reciprocal"])
+def test_positive_numbers(operator, rng):
+    single(operator, rng.uniform(0.5, 2, (2, 3)).astype("f4"))
+
+
+CONSTANTS = [
+    ("Pow", [np.float32(2.0)], {}),
+    ("PRelu", [np.full((3, 1, 1), 0.3, "f4")], {}),
+    ("Clip", [np.float32(-0.5), np.float32(0.25)], {}),
+    ("Clip", [None, np.float32(0.25)], {}),
+    ("Reshape", [integers(2, -1)], {}),
+    ("Reshape", [integers(0, 0, -1)], {}),
+    ("Squeeze", [integers(0)], {}),
+    ("Unsqueeze", [integers(-1, 1)], {}),
+    ("Expand", [integers(2, 1, 1, 1)], {}),
+    ("Gather", [integers(2, 0, -1)], {"axis": 1}),
+    ("Gather", [np.array(1)], {"axis": 3}),
+    ("Slice", [integers(1), integers(100), integers(2)], {}),
+    ("Slice", [integers(-1), integers(-9), integers(3), integers(-2)], {}),
+    ("Slice", [integers(0, 1), integers(1, -1)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1), np.float32(2.5)], {}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "reflect"}),
+    ("Pad", [integers(0, 0, 1, 2, 0, 0, 0, 1)], {"mode": "edge"}),
+    ("ReduceSum", [integers()], {"noop_with_empty_axes": 1}),
+    ("ReduceSum", [integers()], {"keepdims": 0}),
+    ("Split", [integers(2, 5)], {"axis": 3, "extra": ["z"]}),
+    (
+        "Resize",
+        [None, None, integers(2, 3, 9, 4)],
+        {"mode": "linear", "coordinate_transformation_mode": "half_pixel"},
+    ),
+    (
+        "Resize",
+        [None, np.array([1, 1, 2, 3], "f4")],
+        {"mode": "linear", "coordinate_transformation_mode": "align_corners"},
+    ),
+    (
+        "Resize",
+        [None, np.array([1, 1, 2, 3], "f4")],
+        {
+            "mode": "nearest",
+            "coordinate_transformation_mode": "asymmetric",
+            "nearest_mode": "floor",
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize(("operator", "constants", "attributes"), CONSTANTS)
+def test_constant_inputs(operator, constants, attributes, rng):
+    count = 1 if operator in ("Squeeze", "Expand") else 2
+    x = rng.normal(size=(count, 3, 5, 7)).astype("f4")
+    single(operator, x, constants, **attributes)
+
+
+HALF = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+FLOOR = {
+    "mode": "nearest",
+    "coordinate_transformation_mode": "asymmetric",
+    "nearest_mode": "floor",
+}
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.3, 0.7, 1.7, 3.0])
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        HALF,
+        FLOOR,
+        HALF | {"coordinate_transformation_mode": "align_corners"},
+        HALF | {"coordinate_transformation_mode": "asymmetric"},
+        HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
+    ],
+)
+def test_resize_by_scales_that_do_not_divide(attributes, scale, rng):
+    """The scale is used as given, and 10 times float32(0.7) is 7 in float32."""
+    x = rng.normal(size=(2, 3, 10, 33)).astype("f4")
+    scales = np.array([1, 1, scale, 0.9 * scale], "f4")
+    single("Resize", x, [None, scales], **attributes)
+
+
+@pytest.mark.parametrize("mode", ["nearest", "linear"])
+def test_upsample_reads_at_asymmetric_places(mode, rng):
+    x = rng.normal(size=(1, 2, 5, 7)).astype("f4")
+    scales = np.array([1, 1, 2, 3], "f4")
+    single("Upsample", x, [scales], opset=9, mode=mode)
+
+
+@pytest.mark.parametrize(
+    ("constants", "opset", "attributes", "message"),
+    [
+        (
+            [None, None, integers(1, 1, 1, 4)],
+            17,
+            HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
+            "Resize: to a size of 1 by pytorch_half_pixel",
+        ),
+        (
+            [None, None, integers(1, 1, 3, 4)],
+            18,
+            HALF | {"keep_aspect_ratio_policy": "not_larger"},
+            "keep_aspect_ratio_policy = 'not_larger' is not supported",
+        ),
+        ([np.ones(4, "f4")], 10, {}, "operator set 10.*with operator set 11"),
+    ],
+)
+def test_resizing_that_is_refused(constants, opset, attributes, message):
+    names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
+    values = {n: c for n, c in zip(names, constants, strict=True) if n}
+    node = helper.make_node("Resize", ["x", *names], ["y"], **attributes)
+    shape = [1, 1, 5, 7]
+    made = model([node], {"x": (FLOAT, shape)}, {"y": (FLOAT, None)}, values, opset)
+    with pytest.raises(InputError, match=message):
+        OnnxNetwork(made, "net.onnx")(torch.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {},
+        {"strides": [2, 1], "pads": [1, 0, 2, 3]},
+        {"dilations": [1, 2], "pads": [0, 1, 1, 0]},
+        {"strides": [3, 2], "auto_pad": "SAME_UPPER"},
+        {"strides": [2, 3], "auto_pad": "SAME_LOWER"},
+        {"auto_pad": "VALID"},
+    ],
+)
+def test_convolution(attributes, rng):
+    x = rng.normal(size=(2, 4, 8, 11)).astype("f4")
+    weight = rng.normal(size=(6, 4, 3, 3)).astype("f4")
+    single("Conv", x, [weight, np.arange(6, dtype="f4")], **attributes)
+    single("Conv", x, [weight[:, :2]], group=2, **attributes)
+    single("Conv", x[:, :, 0], [weight[:, :, 0]])
+
+
+@pytest.mark.parametrize("axis", [-1, 0, 1])
+def test_one_hot(axis):
+    goals = integers(2, 0, -1)
+    constants = [integers(3), np.array([0.5, 2.0], "f4")]
+    node = helper.make_node("OneHot", ["x", "depth", "values"], ["y"], axis=axis)
+    made = model(
+        [node],
+        {"x": (INT64, [3])},
+        {"y": (FLOAT, None)},
+        dict(zip(("depth", "values"), constants, strict=True)),
+    )
+    check(made, goals)
+
+
+def test_products_and_norms(rng):
+    x, b = rng.normal(size=(4, 5)).astype("f4"), rng.normal(size=(5, 3)).astype("f4")
+    c = rng.normal(size=3).astype("f4")
+    single("MatMul", x, [b])
+    single("MatMul", rng.normal(size=(2, 3, 4, 5)).astype("f4"), [b])
+    single("Gemm", x, [b, c])
+    single("Gemm", x, [b.T.copy(), c], transB=1, alpha=0.5, beta=2.0)
+    single("Gemm", x.T.copy(), [b], transA=1)
+    image = rng.normal(size=(2, 3, 4, 5)).astype("f4")
+    scale, bias, mean = (rng.normal(size=3).astype("f4") for _ in range(3))
+    variance = rng.uniform(0.5, 2, 3).astype("f4")
+    single("BatchNormalization", image, [scale, bias, mean, variance], epsilon=1e-3)
+    row = rng.normal(size=5).astype("f4")
+    single("LayerNormalization", image, [row, row[::-1].copy()], epsilon=1e-4)
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse", "bidirectional"])
+@pytest.mark.parametrize(
+    ("operator", "gates", "attributes"),
+    [
+        ("LSTM", 4, {}),
+        ("GRU", 3, {}),
+        ("GRU", 3, {"linear_before_reset": 1}),
+    ],
+)
+def test_recurrent_layers(operator, gates, attributes, direction, rng):
+    count, size = 2 if direction == "bidirectional" else 1, 3
+    x = rng.normal(size=(4, 2, 5)).astype("f4")
+    constants = [
+        rng.normal(size=(count, gates * size, 5)).astype("f4"),
+        rng.normal(size=(count, gates * size, size)).astype("f4"),
+        rng.normal(size=(count, 2 * gates * size)).astype("f4"),
+        None,
+        rng.normal(size=(count, 2, size)).astype("f4"),
+    ]
+    extra = ["h", "c"] if operator == "LSTM" else ["h"]
+    attributes = {"hidden_size": size, "direction": direction, **attributes}
+    single(operator, x, constants[:2], extra=extra, **attributes)
+    if operator == "LSTM":
+        constants.append(rng.normal(size=(count, 2, size)).astype("f4"))
+    single(operator, x, constants, extra=extra, **attributes)
+
+
+def test_shapes_computed_in_the_graph(rng):
+    """Flatten as exporters write it: Shape, Gather, Unsqueeze, Concat, Reshape."""
+    nodes = [
+        helper.make_node("Shape", ["x"], ["shape"]),
+        helper.make_node("Constant", [], ["zero"], value_int=0),
+        helper.make_node("Gather", ["shape", "zero"], ["count"]),
+        helper.make_node("Unsqueeze", ["count", "axis"], ["counts"]),
+        helper.make_node("Concat", ["counts", "rest"], ["target"], axis=0),
+        helper.make_node("Reshape", ["x", "target"], ["flat"]),
+        helper.make_node("ConstantOfShape", ["target2"], ["zeros"]),
+        helper.make_node("Cast", ["count"], ["factor"], to=FLOAT),
+        helper.make_node("Mul", ["flat", "factor"], ["scaled"]),
+        helper.make_node("Add", ["scaled", "zeros"], ["added"]),
+        helper.make_node("Less", ["added", "half"], ["below"]),
+        helper.make_node("Where", ["below", "half", "added"], ["y"]),
+    ]
+    constants = {
+        "axis": integers(0),
+        "rest": integers(-1),
+        "target2": integers(1, 12),
+        "half": np.float32(0.5),
+    }
+    made = model(nodes, {"x": (FLOAT, ["n", 3, 4])}, {"y": (FLOAT, None)}, constants)
+    check(made, rng.normal(size=(5, 3, 4)).astype("f4"))
+
+
+def test_constant_of_no_axes(rng):
+    nodes = [
+        helper.make_node("ConstantOfShape", ["empty"], ["zero"]),
+        helper.make_node("Add", ["x", "zero"], ["y"]),
+    ]
+    constants = {"empty": integers()}
+    made = model(nodes, {"x": (FLOAT, [2])}, {"y": (FLOAT, None)}, constants)
+    check(made, rng.normal(size=2).astype("f4"))
+
+
+def test_pools_that_reach_over_the_edge_are_refused():
+    keys = {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1}
+    node = helper.make_node("MaxPool", ["x"], ["y"], **keys)
+    made = model([node], {"x": (FLOAT, [1, 1, 5, 5])}, {"y": (FLOAT, None)})
+    with pytest.raises(InputError, match=r"ceil_mode with strides \[3, 3\]"):
+        OnnxNetwork(made, "net.onnx")(torch.zeros(1, 1, 5, 5))

@@ -1,0 +1,273 @@
+"""Policies without derivatives, and Dr.Jit networks, from a scenario."""
+
+from __future__ import annotations
+
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from helpers.policy_servers import serving
+from torch import nn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.http_policy import HttpPolicy
+from mi_nerfattack.scenario.build.policy import load_differentiable, load_policy
+from mi_nerfattack.scenario.sections import PolicySection
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def section(**keys):
+    return PolicySection.model_validate(keys)
+
+
+def camera(n, rng):
+    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
+
+
+@pytest.fixture
+def served(monkeypatch):
+    monkeypatch.setenv("no_proxy", "*")
+    with serving() as start:
+        yield start
+
+
+# --- black boxes ----------------------------------------------------------------------
+
+
+def test_black_boxes_refuse_gradients_by_name(tmp_path, rng):
+    (tmp_path / "mine.py").write_text(
+        "def drive(image, goal, step): return goal + step"
+    )
+    found = section(kind="callable", file="mine.py:drive", control_scale=0.5)
+    policy = load_policy(found, tmp_path)
+    image, memory = camera(2, rng), policy.initial_memory(2)
+    for step in range(3):
+        control, memory = policy.step(image, [0, 3], memory)
+        np.testing.assert_allclose(control, [0.5 * step, 0.5 * (3 + step)])
+    assert not policy.differentiable
+    calls = [
+        lambda: policy.vjp(image, 0, mi.Float(1)),
+        lambda: policy.step_vjp(image, 0, memory, mi.Float(1), ()),
+        lambda: policy.step_jvp(image, 0, memory, image, ()),
+        lambda: load_differentiable(found, tmp_path),
+    ]
+    for call in calls:
+        with pytest.raises(InputError, match="mine.py:drive: is a black box.*module, "):
+            call()
+
+
+def test_black_boxes_see_the_frame_stack(tmp_path, rng):
+    (tmp_path / "mine.py").write_text(
+        "def drive(image, goal, step):\n"
+        "    assert image.shape == (1, 4, 5, 2), image.shape\n"
+        "    return image[..., 0].mean((1, 2)) - image[..., 1].mean((1, 2))\n"
+    )
+    preprocess = {
+        "resize_px": (5, 4),
+        "colour": "grey",
+        "frames": 2,
+        "layout": "NHWC",
+    }
+    found = section(kind="callable", file="mine.py:drive", preprocess=preprocess)
+    policy = load_policy(found, tmp_path)
+    memory = policy.initial_memory(1)
+    expected = [0.0, -0.25, -0.25]
+    for level, control in zip((0.25, 0.5, 0.75), expected, strict=True):
+        image = mi.TensorXf(np.full((1, 66, 200, 3), level, "f4"))
+        seen, memory = policy.step(image, 0, memory)
+        assert seen.numpy() == pytest.approx(control, abs=1e-6)
+        assert policy.memory_bytes(memory) == 4 * 5 * 4
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("[1.0]", r"controls \(1,\) for 2 images"),
+        ("[1.0, float('nan')]", "control nan for image 1"),
+        ("'left'", "raises ValueError"),
+        ("1 / 0", "raises ZeroDivisionError on an image of shape"),
+    ],
+)
+def test_wrong_answers_of_functions(answer, message, tmp_path, rng):
+    (tmp_path / "mine.py").write_text(f"def drive(*_): return {answer}")
+    policy = load_policy(section(kind="callable", file="mine.py:drive"), tmp_path)
+    with pytest.raises(InputError, match=f"mine.py:drive: {message}"):
+        policy.control(camera(2, rng), 0)
+
+
+def handler(*answers):
+    """Make a handler that answers each request with the next status and body."""
+    queue, seen = list(answers), []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self):
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            seen.append((self.headers, body))
+            status, text, wait = queue.pop(0)
+            threading.Event().wait(wait)
+            try:
+                self.send_response(status)
+                self.end_headers()
+                self.wfile.write(text)
+            except OSError:
+                pass  # the client has gone
+
+    return Handler, seen
+
+
+GOOD = (200, b'{"control": [0.5, -0.25]}', 0)
+
+
+def test_http_protocol_and_retries(served, rng, monkeypatch):
+    monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
+    made, seen = handler((503, b"", 0), GOOD, (200, b"", 9), GOOD)
+    policy = HttpPolicy(served(made), timeout_s=3.0, retries=1, control_scale=2.0)
+    image, memory = camera(2, rng), policy.initial_memory(2)
+    for step in range(2):
+        control, memory = policy.step(image, [0, 2], memory)
+        np.testing.assert_array_equal(control, [1.0, -0.5])
+        headers, body = seen[-1]
+        assert (headers["X-Goal"], headers["X-Step"]) == ("0,2", str(step))
+    assert body == seen[-2][1] and body.startswith(b"\x93NUMPY") and len(seen) == 4
+    sent = np.frombuffer(body[-2 * 66 * 200 * 3 * 4 :], "f4").reshape(2, 3, 66, 200)
+    np.testing.assert_array_equal(sent, image.numpy().transpose(0, 3, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ([(404, b"", 0)], "status 404 Not Found, after 1 attempts"),
+        ([(302, b"", 0)], "status 302 Found, after 1 attempts"),
+        ([(500, b"", 0)] * 2, "status 500 Internal Server Error, after 2 attempts"),
+        ([(200, b"", 9)] * 2, "no answer in 0.5 s, after 2 attempts"),
+        ([(200, b"hello", 0)], "answers 'hello'.*must be JSON"),
+        ([(200, b'{"steer": [1]}', 0)], "answers.*KeyError"),
+        ([(200, b'{"control": "left"}', 0)], "answers.*must be JSON"),
+        ([(200, b'{"control": [1]}', 0)], r"controls \(1,\) for 2 images"),
+        ([(200, b'{"control": [1, NaN]}', 0)], "control nan for image 1"),
+    ],
+)
+def test_http_errors(answers, message, served, rng, monkeypatch):
+    monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
+    url = served(handler(*answers)[0])
+    slow = any(wait for _, _, wait in answers)
+    policy = HttpPolicy(url, timeout_s=0.5 if slow else 20.0, retries=1)
+    with pytest.raises(InputError, match=f"{url}: {message}"):
+        policy.control(camera(2, rng), 0)
+
+
+class Dripping(BaseHTTPRequestHandler):
+    """Sends a byte now and then, each in time."""
+
+    def do_POST(self):
+        self.send_response(200)
+        self.end_headers()
+        try:
+            for _ in range(100):
+                self.wfile.write(b" ")
+                threading.Event().wait(0.05)
+        except OSError:
+            pass
+
+
+def test_the_timeout_is_of_the_whole_answer(served, rng):
+    policy = HttpPolicy(served(Dripping), timeout_s=0.3, retries=0)
+    with pytest.raises(InputError, match="no answer in 0.3 s, after 1 attempts"):
+        policy.control(camera(1, rng), 0)
+
+
+def test_local_servers_are_asked_without_proxies(served, rng, monkeypatch):
+    url = served(handler(GOOD)[0])
+    monkeypatch.delenv("no_proxy")
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    np.testing.assert_array_equal(
+        HttpPolicy(url).control(camera(2, rng), 0), [0.5, -0.25]
+    )
+
+
+def test_functions_may_write_into_their_image(tmp_path, rng):
+    (tmp_path / "mine.py").write_text(
+        "def drive(image, goal, step):\n"
+        "    image *= 0; goal += 1\n"
+        "    return image.mean((1, 2, 3)) + goal\n"
+    )
+    policy = load_policy(section(kind="callable", file="mine.py:drive"), tmp_path)
+    for frames in (1, 2):
+        policy.preprocess.frames = frames
+        image = camera(2, rng)
+        before, memory = image.numpy().copy(), policy.initial_memory(2)
+        for _ in range(2):
+            control, memory = policy.step(image, [0, 3], memory)
+            np.testing.assert_array_equal(control, [1, 4])
+        np.testing.assert_array_equal(image.numpy(), before)
+        assert frames == 1 or memory[1].any()
+
+
+def test_no_server(served, rng, monkeypatch):
+    monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        url = f"http://127.0.0.1:{server.server_port}"
+    with pytest.raises(InputError, match="refused.*after 3 attempts; start the policy"):
+        HttpPolicy(url).control(camera(1, rng), 0)
+
+
+# --- Dr.Jit ---------------------------------------------------------------------------
+
+DRJIT = """
+import drjit.nn as nn
+import mitsuba as mi
+def make():
+    net = nn.Sequential(nn.Linear(-1, 8), nn.Tanh(), nn.Linear(-1, 2))
+    return net.alloc(mi.TensorXf, 3 * 4 * 5 + 3)
+"""
+
+
+def test_drjit_networks_are_torch_s_with_the_same_weights(tmp_path, rng):
+    (tmp_path / "net.py").write_text(DRJIT)
+    shapes = {"0.weights": (8, 63), "0.bias": 8, "2.weights": (2, 8), "2.bias": 2}
+    shapes = {f"layers.{name}": shape for name, shape in shapes.items()}
+    tensors = {k: rng.normal(0, 0.3, s).astype("f4") for k, s in shapes.items()}
+    files.write_safetensors(tmp_path / "w.safetensors", tensors)
+    found = section(
+        kind="drjit",
+        file="net.py:make",
+        weights_file="w.safetensors",
+        goal="one_hot",
+        goals=3,
+        output=1,
+        preprocess={"resize_px": (5, 4)},
+    )
+    policy = load_policy(found, tmp_path)
+    reference = nn.Sequential(nn.Linear(63, 8), nn.Tanh(), nn.Linear(8, 2)).double()
+    names = ("0.weight", "0.bias", "2.weight", "2.bias")
+    values = map(torch.from_numpy, tensors.values())
+    reference.load_state_dict(dict(zip(names, values, strict=True)))
+    image, weight = camera(3, rng), mi.Float(1, -2, 0.5)
+    control, gradient = policy.vjp(image, [0, 1, 2], weight)
+    leaf = torch.from_numpy(image.numpy()).double().requires_grad_(True)
+    planes = policy.preprocess.stage(leaf).flatten(1)
+    expected = reference(torch.cat([planes, torch.eye(3).double()], 1))[:, 1]
+    torch.autograd.backward(expected, torch.tensor([1, -2, 0.5]).double())
+    np.testing.assert_allclose(control, expected.detach(), atol=1e-5)
+    np.testing.assert_allclose(gradient, leaf.grad, atol=1e-6)
+    tangent = rng.normal(size=(3, 66, 200, 3)).astype("f4")
+    t_control, _ = policy.step_jvp(image, [0, 1, 2], (), mi.TensorXf(tangent), ())
+    products = leaf.grad.numpy() * tangent
+    assert np.dot(t_control, weight) == pytest.approx(
+        products.sum(), abs=1e-5 * np.abs(products).sum()
+    )
+
+
+def test_drjit_networks_that_do_not_fit(tmp_path, rng):
+    (tmp_path / "net.py").write_text(DRJIT)
+    files.write_safetensors(tmp_path / "w.safetensors", {"a": np.zeros(2, "f4")})
+    keys = {"kind": "drjit", "file": "net.py:make", "preprocess": {"resize_px": (5, 4)}}
+    with pytest.raises(InputError, match=r"\['a'\]; the network has \['layers.0.b"):
+        load_policy(section(weights_file="w.safetensors", **keys), tmp_path)
+    with pytest.raises(InputError, match="net.py:make: fails on an input of shape"):
+        load_policy(section(**keys), tmp_path).control(camera(1, rng), 0)

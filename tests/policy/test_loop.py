@@ -1,0 +1,220 @@
+"""Memory of policies in the loop's derivatives, against autograd through time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from helpers import analytic_loop as analytic
+from torch import nn
+
+from mi_nerfattack.policy.black_box import CallablePolicy
+from mi_nerfattack.policy.drjit_network import DrJitNetwork
+from mi_nerfattack.policy.goals import NoGoal, OneHotGoal
+from mi_nerfattack.policy.preprocess import Normalise, Preprocess, Resize, to_yuv
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import simulate
+from mi_nerfattack.rollout.objective import AbstractObjective
+from mi_nerfattack.rollout.tape import FullTape
+from mi_nerfattack.vehicle.state import to_state
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+HORIZON = 7
+ADJOINTS = {
+    "replay": Replay(),
+    "kept": KeptBackgrounds(),
+    "checkpointed": Checkpointed(3),
+}
+
+
+class Wave(AbstractObjective):
+    """A function of position and heading."""
+
+    def evaluate(self, states):
+        x, y, theta = (states.rows[i] for i in range(3))
+        return states.total(dr.sin(1.3 * y + 0.2 * x) + dr.square(theta) * dr.cos(x))
+
+
+def wave_in_torch(states):
+    x, y, theta = states[:, 1:, :3].unbind(2)
+    return (torch.sin(1.3 * y + 0.2 * x) + theta**2 * torch.cos(x)).sum(1)
+
+
+class Recurrent(nn.Module):
+    """A GRU of a one-hot goal and the image."""
+
+    def __init__(self):
+        super().__init__()
+        size = 3 * analytic.HEIGHT * analytic.WIDTH
+        self.cell = nn.GRUCell(size + 3, 6)
+        self.head = nn.Linear(6, 1)
+
+    def forward(self, image, goal, hidden):
+        hidden = self.cell(torch.cat([3 * image.flatten(1), goal], 1), hidden)
+        return 2 * torch.tanh(2 * self.head(hidden)), hidden
+
+
+class Stacked(nn.Module):
+    """A dense layer of three frames in YUV, two control periods apart."""
+
+    def __init__(self):
+        super().__init__()
+        self.head = nn.Linear(9 * 2 * 4, 1)
+
+    def forward(self, image):
+        return torch.tanh(2 * self.head(image.flatten(1)))
+
+
+def policies():
+    torch.manual_seed(4)
+    stages = [Resize(4, 2), to_yuv(), Normalise(2.0, (0.5,), (0.7,))]
+    return {
+        "recurrent": TorchPolicy(
+            Recurrent().double(), OneHotGoal(3), recurrent=[(-1, 6)]
+        ),
+        "stacked": TorchPolicy(
+            Stacked().double(), NoGoal(), Preprocess(stages, 3, 2), control_scale=-1.5
+        ),
+    }
+
+
+class Carried(nn.Module):
+    """A policy's network that keeps its memory itself, in the graph of a drive."""
+
+    def __init__(self, policy):
+        super().__init__()
+        self.policy, self.frames, self.hidden = policy, [], None
+
+    def forward(self, image, goal):
+        policy, preprocess = self.policy, self.policy.preprocess
+        frame = image.permute(0, 2, 3, 1)
+        self.frames.append(preprocess.stage(frame))
+        last, stride = len(self.frames) - 1, preprocess.stride
+        ages = [i * stride for i in reversed(range(preprocess.frames))]
+        stack = torch.cat([self.frames[max(0, last - age)] for age in ages], 1)
+        if self.hidden is None:
+            self.hidden = [torch.zeros(len(image), s[1]) for s in policy.recurrent]
+        hidden = [part.double() for part in self.hidden]
+        goals = policy.goal.arguments(goal, image)
+        result = policy.module(stack, *goals, *hidden)
+        result = result if isinstance(result, tuple) else (result,)
+        self.hidden = list(result[1:])
+        return policy.control_scale * result[0][:, 0]
+
+
+def expected(loop, twin, initial, attached):
+    """Differentiate the twin by its texture and its initial states."""
+    texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)
+    start = torch.tensor(initial, requires_grad=True)
+    states, _ = twin.drive(start, [texture], HORIZON, attached)
+    value = wave_in_torch(states).mean()
+    value.backward()
+    return float(value.detach()), texture.grad.numpy(), start.grad.numpy()
+
+
+def make(name):
+    policy = policies()[name]
+    loop, twin = analytic.make_pair("ackermann", substeps=2, delay=1)
+    loop = replace(loop, policy=policy)
+    twin = replace(twin, module=Carried(policy))
+    return loop, twin, loop.dynamics.extend(analytic.random_poses(3))
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS)
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize("name", ["recurrent", "stacked"])
+def test_gradients_go_through_the_memory(name, attached, adjoint):
+    loop, twin, initial = make(name)
+    value, by_texture, by_state = expected(loop, twin, initial, attached)
+    rollout = Rollout(loop, Wave(), HORIZON, adjoint=adjoint, attached=attached)
+    evaluation = rollout.run(to_state(initial))
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    found = rollout.gradient(evaluation)
+    for a, b in (
+        (found.textures[0].numpy(), by_texture),
+        (np.array(found.initial).T, by_state),
+    ):
+        assert np.linalg.norm(a - b) <= 1e-9 * np.linalg.norm(b)
+
+
+@pytest.mark.parametrize("name", ["recurrent", "stacked"])
+def test_forward_mode_goes_through_the_memory(name, rng):
+    loop, twin, initial = make(name)
+    _, by_texture, by_state = expected(loop, twin, initial, True)
+    tangents = rng.normal(size=by_texture.shape), rng.normal(size=by_state.shape)
+    rollout = Rollout(loop, Wave(), HORIZON, attached=True)
+    evaluation = rollout.run(to_state(initial))
+    textures = [analytic.tensor(tangents[0])]
+    found = rollout.tangent(evaluation, textures, to_state(tangents[1]))
+    right = (by_texture * tangents[0]).sum() + (by_state * tangents[1]).sum()
+    assert found == pytest.approx(right, rel=1e-9)
+
+
+def test_memory_matters_to_the_gradient(monkeypatch):
+    """Guard the tests above: cut the memory's derivative, and they would fail."""
+    loop, twin, initial = make("recurrent")
+    _, by_texture, _ = expected(loop, twin, initial, False)
+
+    whole = TorchPolicy.step_vjp
+
+    def forgetful(self, image, goal, memory, cotangent, d_memory):
+        return whole(self, image, goal, memory, cotangent, ())
+
+    monkeypatch.setattr(TorchPolicy, "step_vjp", forgetful)
+    rollout = Rollout(loop, Wave(), HORIZON)
+    found = rollout.gradient(rollout.run(to_state(initial))).textures[0].numpy()
+    assert np.linalg.norm(found - by_texture) > 0.05 * np.linalg.norm(by_texture)
+
+
+def test_the_full_tape_refuses_memory():
+    loop, _, initial = make("recurrent")
+    rollout = Rollout(loop, Wave(), HORIZON, adjoint=FullTape())
+    with pytest.raises(TypeError, match="memory of TorchPolicy"):
+        rollout.gradient(rollout.run(to_state(initial)))
+
+
+def test_black_boxes_drive_and_are_refused():
+    loop, _, initial = make("recurrent")
+    policy = CallablePolicy(lambda image, *_: image.mean((1, 2, 3)) - 0.5, "mine")
+    rollout = Rollout(replace(loop, policy=policy), Wave(), HORIZON)
+    evaluation = rollout.run(to_state(initial))
+    assert np.ptp(evaluation.trajectory.controls_numpy()) > 1e-3
+    with pytest.raises(TypeError, match="CallablePolicy: a black box"):
+        rollout.gradient(evaluation)
+
+
+def dense():
+    """Return a network of drjit.nn for the analytic images."""
+    import drjit.nn as drnn
+
+    layers = drnn.Sequential(drnn.Linear(-1, 8), drnn.Tanh(), drnn.Linear(-1, 1))
+    return layers.alloc(mi.TensorXf, 3 * analytic.HEIGHT * analytic.WIDTH)
+
+
+def test_drjit_networks_compile_nothing_after_the_first_step():
+    loop, _, initial = make("recurrent")
+    policy = TorchPolicy(DrJitNetwork(dense()), NoGoal())
+    loop = replace(loop, policy=policy)
+    rollout = Rollout(loop, Wave(), HORIZON)
+    compiled = []
+
+    def on_step(step):
+        history = dr.kernel_history((dr.KernelType.JIT,))
+        compiled.append(sum(not entry["cache_hit"] for entry in history))
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        rollout.run(to_state(initial))
+        dr.kernel_history_clear()
+        evaluation = rollout.run(to_state(initial), on_step)
+        rollout.gradient(evaluation)
+        dr.kernel_history_clear()
+        rollout.gradient(evaluation, on_step=on_step)
+    assert compiled == [0] * 2 * HORIZON
+    assert simulate(loop, to_state(initial), 2).horizon == 2

@@ -1,0 +1,278 @@
+"""Policies with memory: frame stacks and hidden states through both derivatives."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.goals import IntegerGoal, NoGoal, OneHotGoal
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.preprocess import Preprocess, Resize
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SIZE = (6, 8)
+TYPES = {
+    torch.float32: (
+        lambda a: mi.TensorXf(a.astype("f4")),
+        lambda a: mi.Float(a),
+        1e-5,
+    ),
+    torch.float64: (
+        lambda a: dr.llvm.ad.TensorXf64(a),
+        lambda a: dr.llvm.ad.Float64(a),
+        1e-10,
+    ),
+}
+
+
+class Linear(nn.Module):
+    """A fixed weight for each value of the input."""
+
+    def __init__(self, *shape):
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(shape) / 4)
+
+    def forward(self, image):
+        return (image * self.weight).flatten(1).sum(1)
+
+
+class Recurrent(nn.Module):
+    """Convolution, LSTM and a goal as a one-hot row; gives a column (n, 1)."""
+
+    def __init__(self):
+        super().__init__()
+        self.features = nn.Conv2d(3, 2, 3, stride=2)
+        self.memory = nn.LSTM(14, 5)
+        self.head = nn.Linear(5, 1)
+
+    def forward(self, image, goal, hidden, cell):
+        features = torch.tanh(self.features(image)).flatten(1)
+        features = torch.cat([features, goal], 1)[None]
+        out, (hidden, cell) = self.memory(features, (hidden, cell))
+        return self.head(out[0]), hidden, cell
+
+
+def recurrent(dtype=torch.float32):
+    shapes = [(1, -1, 5), (1, -1, 5)]
+    return TorchPolicy(
+        Recurrent().to(dtype), OneHotGoal(2), recurrent=shapes, control_scale=-0.5
+    )
+
+
+def stacked(dtype=torch.float32):
+    preprocess = Preprocess([Resize(5, 4)], frames=3, stride=2)
+    return TorchPolicy(Linear(9, 4, 5).to(dtype), NoGoal(), preprocess)
+
+
+def pilotnet(dtype=torch.float32):
+    preprocess = Preprocess([Resize(200, 66)])
+    return TorchPolicy(PilotNet().to(dtype), IntegerGoal(3), preprocess)
+
+
+def drive(policy, images, goal=1):
+    """Return the memories before each image, and the one after the last."""
+    memories = [policy.initial_memory(len(images[0]))]
+    controls = []
+    for image in images:
+        control, after = policy.step(image, goal, memories[-1])
+        controls.append(control.numpy())
+        memories.append(after)
+    return controls, memories
+
+
+@pytest.mark.parametrize("dtype", TYPES, ids=str)
+@pytest.mark.parametrize("make", [pilotnet, recurrent, stacked])
+def test_forward_and_reverse_mode_agree(make, dtype, rng):
+    tensor, row, tolerance = TYPES[dtype]
+    policy = make(dtype)
+    images = [tensor(rng.random((2, *SIZE, 3))) for _ in range(3)]
+    _, memories = drive(policy, images)
+    image, memory, after = images[-1], memories[-2], memories[-1]
+    t_image = rng.normal(size=(2, *SIZE, 3))
+    t_memory = tuple(torch.randn_like(part) for part in memory)
+    weight = rng.normal(size=2)
+    d_after = tuple(torch.randn_like(part) for part in after)
+    t_control, t_after = policy.step_jvp(image, 1, memory, tensor(t_image), t_memory)
+    d_image, d_memory = policy.step_vjp(image, 1, memory, row(weight), d_after)
+    assert type(d_image) is type(image) and type(t_control) is type(row([0.0]))
+    forward = [float(t_control.numpy() @ weight)]
+    forward += [float((t * d).sum()) for t, d in zip(t_after, d_after, strict=True)]
+    reverse = [float((d_image.numpy() * tensor(t_image).numpy()).sum())]
+    reverse += [float((t * d).sum()) for t, d in zip(t_memory, d_memory, strict=True)]
+    scale = sum(map(abs, forward))
+    assert sum(forward) == pytest.approx(sum(reverse), abs=tolerance * scale)
+
+
+@pytest.mark.parametrize("make", [recurrent, stacked])
+def test_reverse_mode_through_time_equals_differences(make, rng):
+    """Chain step_vjp over five steps; compare with differences of the whole chain."""
+    tensor, row, _ = TYPES[torch.float64]
+    policy = make(torch.float64)
+    values = [rng.random((2, *SIZE, 3)) for _ in range(5)]
+    directions = [rng.normal(size=(2, *SIZE, 3)) for _ in range(5)]
+    weights = rng.normal(size=(5, 2))
+
+    def objective(step):
+        images = [tensor(v + step * d) for v, d in zip(values, directions, strict=True)]
+        return float(np.sum(weights * drive(policy, images)[0]))
+
+    images = [tensor(v) for v in values]
+    _, memories = drive(policy, images)
+    d_memory, total = (), 0.0
+    for i in reversed(range(5)):
+        weight = row(weights[i])
+        d_image, d_memory = policy.step_vjp(images[i], 1, memories[i], weight, d_memory)
+        total += float((d_image.numpy() * directions[i]).sum())
+    numeric = (objective(1e-5) - objective(-1e-5)) / 2e-5
+    assert total == pytest.approx(numeric, rel=1e-7)
+
+
+def test_control_and_vjp_are_those_of_first_images(rng):
+    policy = recurrent()
+    image, weight = mi.TensorXf(rng.random((2, *SIZE, 3), "f4")), mi.Float(1, -1)
+    memory = policy.initial_memory(2)
+    control, d_image = policy.vjp(image, 0, weight)
+    # torch fuses the LSTM where it records no graph: the last bit may differ
+    np.testing.assert_allclose(control, policy.control(image, 0), atol=1e-6)
+    np.testing.assert_allclose(control, policy.step(image, 0, memory)[0], atol=1e-6)
+    expected, _ = policy.step_vjp(image, 0, memory, weight, ())
+    np.testing.assert_array_equal(d_image, expected)
+
+
+def test_frame_stack_repeats_the_first_image_and_keeps_the_stride(rng):
+    preprocess = Preprocess(frames=3, stride=2)
+    frames = torch.arange(7.0)[:, None, None, None, None].expand(-1, 1, 1, 1, 1)
+    past = torch.zeros(1, 0, 0, 0, 0)
+    seen = []
+    for frame in frames:
+        stacked, past = preprocess.stack(frame, past)
+        assert past.shape[1] <= preprocess.history == 4
+        seen.append(stacked.flatten().tolist())
+    assert seen == [
+        [0, 0, 0],
+        [0, 0, 1],
+        [0, 0, 2],
+        [0, 1, 3],
+        [0, 2, 4],
+        [1, 3, 5],
+        [2, 4, 6],
+    ]
+
+
+def test_memory_is_left_alone_and_counted(rng):
+    policy = recurrent()
+    images = [mi.TensorXf(rng.random((3, *SIZE, 3), "f4")) for _ in range(2)]
+    _, memories = drive(policy, images)
+    before = [part.clone() for part in memories[1]]
+    first, _ = policy.step(images[1], 1, memories[1])
+    policy.step_vjp(images[1], 1, memories[1], mi.Float(1, 1, 1), ())
+    again, _ = policy.step(images[1], 1, memories[1])
+    np.testing.assert_array_equal(first, again)
+    assert all(map(torch.equal, before, memories[1]))
+    assert policy.memory_bytes(memories[1]) == 2 * 3 * 5 * 4
+    assert stacked().memory_bytes(stacked().initial_memory(3)) == 0
+    assert TorchPolicy(Linear(3, *SIZE), NoGoal()).initial_memory(2) == ()
+
+
+def test_vehicles_do_not_mix(rng):
+    """A batch gives what its members give alone."""
+    policy = recurrent(torch.float64)
+    tensor = TYPES[torch.float64][0]
+    values = [rng.random((2, *SIZE, 3)) for _ in range(3)]
+    together, _ = drive(policy, [tensor(v) for v in values])
+    for i in range(2):
+        alone, _ = drive(policy, [tensor(v[i : i + 1]) for v in values])
+        np.testing.assert_allclose(
+            np.ravel(alone), np.array(together)[:, i], rtol=1e-12
+        )
+
+
+class Wrong(nn.Module):
+    """Returns what it is told to."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, image, *rest):
+        return self.answer(image, *rest)
+
+
+def first_step(answer, **arguments):
+    image = mi.TensorXf(np.full((2, *SIZE, 3), 0.5, "f4"))
+    policy = TorchPolicy(Wrong(answer), NoGoal(), name="mine.py", **arguments)
+    return policy.step(image, 0, policy.initial_memory(2))[0]
+
+
+@pytest.mark.parametrize(
+    ("answer", "arguments", "message"),
+    [
+        (lambda x: x.mean(), {}, r"controls \(\) for 2 images"),
+        (lambda x: x.mean((2, 3)), {}, r"controls \(2, 3\).*policy.output"),
+        (lambda x: x.mean((2, 3)), {"output": 3}, r"output \(is 3\)"),
+        (lambda x: x[:1].mean((1, 2, 3)), {}, r"\(1,\) for 2 images"),
+        (lambda x: x.mean((1, 2, 3)) / 0, {}, "mine.py: control inf for image 0"),
+        (lambda x: x @ x, {}, r"mine.py: fails on an input of shape \(2, 3, 6, 8\)"),
+        (lambda x, h: x.mean((1, 2, 3)), {}, "mine.py: fails.*argument"),
+        (
+            lambda x, h: (x.mean((1, 2, 3)), h[:1]),
+            {"recurrent": [(-1, 4)]},
+            r"\[\(1, 4\)\] come out where \[\(2, 4\)\]",
+        ),
+        (
+            lambda x, h: x.mean((1, 2, 3)),
+            {"recurrent": [(-1, 4)]},
+            r"hidden states \[\] come out",
+        ),
+        (
+            lambda x: (x.mean((1, 2, 3)), x),
+            {},
+            r"come out where \[\] went in.*policy.recurrent",
+        ),
+    ],
+)
+def test_wrong_answers_are_refused(answer, arguments, message):
+    with pytest.raises(InputError, match=message):
+        first_step(answer, **arguments)
+
+
+def test_column_scale_and_sign():
+    control = first_step(
+        lambda x: x.mean((2, 3)) * torch.tensor([1.0, 2.0, 3.0]),
+        output=2,
+        control_scale=-2.0,
+    )
+    np.testing.assert_allclose(control, -3.0)
+
+
+def test_a_module_that_detaches_the_image_is_refused(rng):
+    policy = TorchPolicy(Wrong(lambda x: x.detach().mean((1, 2, 3))), NoGoal())
+    image = mi.TensorXf(rng.random((1, *SIZE, 3), "f4"))
+    with pytest.raises(InputError, match="Wrong: its control has no derivative"):
+        policy.step_vjp(image, 0, (), mi.Float(1), ())
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (-1, -1), (-1, 0)])
+def test_hidden_shapes_need_one_place_for_the_vehicles(shape):
+    with pytest.raises(InputError, match="one -1"):
+        TorchPolicy(Recurrent(), NoGoal(), recurrent=[shape])
+
+
+def test_goals_as_networks_take_them():
+    goals, like = torch.tensor([2, 0]), torch.zeros(1, dtype=torch.float64)
+    assert torch.equal(IntegerGoal(3).arguments(goals, like)[0], goals)
+    (rows,) = OneHotGoal(3).arguments(goals, like)
+    assert rows.tolist() == [[0, 0, 1], [1, 0, 0]] and rows.dtype == torch.float64
+    assert NoGoal().arguments(goals, like) == ()
+    for kind in (IntegerGoal, OneHotGoal):
+        with pytest.raises(InputError, match="below 2"):
+            kind(2).arguments(goals, like)
+        with pytest.raises(InputError, match="at least 1"):
+            kind(0)

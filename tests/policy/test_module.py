@@ -1,0 +1,181 @@
+"""Torch modules of users: strides, writing in place, exceptions, answers."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.goals import NoGoal
+from mi_nerfattack.policy.one_image import OneImage
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SIZE = (6, 8)
+
+
+class Wrap(nn.Module):
+    """Call a function."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def forward(self, *arguments):
+        return self.function(*arguments)
+
+
+def policy(function, **arguments):
+    return TorchPolicy(Wrap(function), NoGoal(), name="mine.py", **arguments)
+
+
+def images(rng, n=2):
+    return mi.TensorXf(rng.random((n, *SIZE, 3), dtype=np.float32))
+
+
+def test_networks_may_view_what_they_convolve(rng):
+    """(n, 3, h, w) is contiguous, as in training: view and convolution agree."""
+    convolution = nn.Conv2d(3, 4, 3)
+
+    def flat(x):
+        assert x.is_contiguous()
+        return convolution(x).view(x.size(0), -1).sum(1)
+
+    image = images(rng)
+    planes = torch.from_numpy(image.numpy().transpose(0, 3, 1, 2).copy())
+    with torch.no_grad():
+        expected = convolution(planes).sum((1, 2, 3))
+    made = policy(flat)
+    np.testing.assert_allclose(made.control(image, 0), expected, atol=1e-4)
+    control, gradient = made.vjp(image, 0, mi.Float(1, 1))
+    np.testing.assert_allclose(control, expected, atol=1e-4)
+    assert np.any(gradient.numpy())
+
+
+def test_pilotnet_convolves_the_camera_s_memory(rng, monkeypatch):
+    """It is spared the copy, and its numbers are those of the view, to the bit."""
+    network = PilotNet()
+    image = mi.TensorXf(rng.random((2, 66, 200, 3), dtype=np.float32))
+    view = torch.from_numpy(image.numpy()).permute(0, 3, 1, 2).requires_grad_(True)
+    expected = network(view, torch.tensor([1, 1]))
+    (gradient,) = torch.autograd.grad(expected.sum(), view)
+    control, d_image = TorchPolicy(network).vjp(image, 1, mi.Float(1, 1))
+    np.testing.assert_array_equal(control, expected.detach())
+    np.testing.assert_array_equal(d_image, gradient.permute(0, 2, 3, 1))
+
+
+def test_networks_that_write_in_place_change_nothing_of_the_loop(rng):
+    def halve(x, hidden):
+        hidden.add_(1.0)
+        return x.mul_(0.5).mean((1, 2, 3)), hidden
+
+    made, image = policy(halve, recurrent=[(-1, 2)]), images(rng)
+    before = image.numpy().copy()
+    memory = made.initial_memory(2)
+    for _ in range(2):
+        control, after = made.step(image, 0, memory)
+        d_image, _ = made.step_vjp(image, 0, memory, mi.Float(1, 1), ())
+        np.testing.assert_array_equal(image.numpy(), before)
+        assert not memory[0].any() and bool((after[0] == 1).all())
+        np.testing.assert_allclose(control, 0.5 * before.mean((1, 2, 3)), rtol=1e-5)
+        np.testing.assert_allclose(d_image.numpy(), 0.5 / before[0].size, rtol=1e-5)
+
+
+def raise_(error):
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x: {"control": x}, "returns a dict; the control as a tensor"),
+        (lambda x: None, "returns a NoneType"),
+        (lambda x: (x.mean((1, 2, 3)), None), "returns a NoneType"),
+        (lambda x: (), "returns an empty tuple"),
+        (lambda x: x.nothing, "shape .2, 3, 6, 8.*AttributeError: .*'nothing'"),
+        (lambda x: {}["key"], "KeyError: 'key'; declare policy.preprocess"),
+        (lambda x: raise_(AssertionError("Guard failed")), "AssertionError: Guard f"),
+        (lambda x: 1 / 0, "ZeroDivisionError"),
+    ],
+)
+def test_modules_that_fail_are_told(function, message, rng):
+    with pytest.raises(InputError, match=f"(?s)mine.py: .*{message}"):
+        policy(function).step(images(rng), 0, ())
+
+
+@pytest.mark.parametrize("error", [MemoryError(), KeyboardInterrupt()])
+def test_what_is_no_fault_of_the_module_goes_through(error, rng):
+    with pytest.raises(type(error)):
+        policy(lambda x: raise_(error)).step(images(rng), 0, ())
+
+
+class Counting(nn.Module):
+    """Keeps a state in itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.level = None
+
+    def forward(self, image):
+        mean = image.mean((1, 2, 3))
+        self.level = mean if self.level is None else 0.5 * (self.level + 2 * mean)
+        return self.level
+
+
+class Buffered(nn.Module):
+    """Changes a buffer that no answer shows yet."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+
+    def forward(self, image):
+        self.count.add_(1)
+        return image.mean((1, 2, 3)) + torch.relu(self.count - 10)
+
+
+class Random(nn.Module):
+    def forward(self, image):
+        return nn.functional.dropout(image, 0.5, training=True).mean((1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (Counting, "its controls are"),
+        (Random, "its controls are"),
+        (Buffered, "its buffer 'count' changes"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["step", "step_vjp", "step_jvp"])
+def test_modules_that_are_not_repeatable_are_refused(module, message, mode, rng):
+    made, image = TorchPolicy(module(), NoGoal(), name="mine.py"), images(rng)
+    rest = {"step": (), "step_vjp": (mi.Float(1, 1), ()), "step_jvp": (image, ())}
+    with pytest.raises(InputError, match=f"mine.py: .*{message}.*training mode.*recur"):
+        getattr(made, mode)(image, 0, (), *rest[mode])
+
+
+def test_the_check_is_made_once(rng):
+    calls = []
+
+    def mean(x):
+        calls.append(len(x))
+        return x.mean((1, 2, 3))
+
+    made = policy(mean)
+    for _ in range(3):
+        made.step(images(rng), 0, ())
+    assert len(calls) == 2 + 3
+
+
+@pytest.mark.parametrize("wrap", [nn.Identity, OneImage])
+def test_a_second_output_is_not_dropped(wrap, rng):
+    module = Wrap(lambda x: (x.mean((1, 2, 3)), x.mean((1, 2, 3))))
+    network = OneImage(module) if wrap is OneImage else module
+    with pytest.raises(InputError, match="policy.recurrent.*policy.output"):
+        TorchPolicy(network, NoGoal()).step(images(rng), 0, ())

@@ -1,0 +1,268 @@
+"""Frames of scenes: channels, closed forms, poses, passes, metadata."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+from helpers import film_scenes as scenes
+
+import mi_nerfattack
+from mi_nerfattack.capture.camera_path import read_path, route_path
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.pathtrace import frames as film
+from mi_nerfattack.render.pathtrace.frames import FrameRenderer, write_frame
+from mi_nerfattack.vehicle.route.route import Route
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+AOVS = "dd.y:depth,nn:sh_normal,pp:position"
+AOV_NAMES = ["dd.y.T", *(f"{layer}.{c}" for layer in ("nn", "pp") for c in "XYZ")]
+
+
+def aov(inside: str = "") -> str:
+    text = f'<string name="aovs" value="{AOVS}"/>'
+    return f'<integrator type="aov">{text}{inside}</integrator>'
+
+
+def stored(path):
+    """Read channels and header as other programs do."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        pixels = {name: channel.pixels for name, channel in file.channels().items()}
+        return pixels, dict(file.header())
+
+
+@pytest.mark.parametrize("spp", [1, 4])
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "tent"])
+def test_slab_has_its_closed_form_in_every_filter(tmp_path, rfilter, spp):
+    path = scenes.write_slab(tmp_path, f'<rfilter type="{rfilter}"/>')
+    channels = FrameRenderer(path, spp=spp).render().channels
+    sigma, length, near = scenes.DENSITY, 2.0, 2.0 - scenes.NEAR
+    opacity = 1 - np.exp(-sigma * length)
+    moment = (1 - (1 + sigma * length) * np.exp(-sigma * length)) / sigma
+    srgb = 1 / (1 + np.exp(-scenes.RAW_COLOUR))
+    radiance = ((srgb + 0.055) / 1.055) ** 2.4
+    centre = scenes.HEIGHT // 2, scenes.WIDTH // 2
+    # rays of one pixel differ by 0.3 degrees from the axis, 1.3e-5 in length
+    for prefix, colour in (("", opacity * radiance), ("box.", opacity * radiance)):
+        for name in "RGB":
+            assert channels[prefix + name][centre] == pytest.approx(colour, rel=1e-3)
+        assert channels[prefix + "A"][centre] == pytest.approx(opacity, rel=1e-3)
+        depth = near + moment / opacity
+        assert channels[prefix + "Z"][centre] == pytest.approx(depth, rel=1e-3)
+
+
+def test_depth_is_infinite_where_there_is_nothing_and_never_nan(tmp_path):
+    path = scenes.write_slab(tmp_path, '<rfilter type="gaussian"/>', fov=120)
+    channels = FrameRenderer(path, spp=16).render().channels
+    depth, opacity = channels["Z"], channels["A"]
+    assert not np.isnan(depth).any()
+    assert np.isinf(depth[0, 0]) and opacity[0, 0] == 0
+    seen = opacity > 0
+    np.testing.assert_array_equal(np.isinf(depth), ~seen)
+    # between the nearest face and the farthest corner of the box
+    assert depth[seen].min() > 2 and depth[seen].max() < np.sqrt(4**2 + 2)
+    write_frame(tmp_path / "a.exr", FrameRenderer(path).render(), "half")
+
+
+def test_left_is_left_and_up_is_up(tmp_path):
+    write_frame(
+        tmp_path / "a.png",
+        FrameRenderer(scenes.write_balls(tmp_path), spp=4).render(),
+        "half",
+    )
+    image = np.array(mi.Bitmap(str(tmp_path / "a.png")))
+    focal = 0.5 * scenes.WIDTH / np.tan(np.radians(20))
+    right, down = np.array([[-0.6, -0.45], [0.6, 0.45]]).T * focal / 3
+    columns = (scenes.WIDTH / 2 + right).astype(int)
+    rows = (scenes.HEIGHT / 2 + down).astype(int)
+    np.testing.assert_array_equal(image[rows[0], columns[0]], [255, 0, 0])
+    np.testing.assert_array_equal(image[rows[1], columns[1]], [0, 255, 0])
+    assert image[0, -1].max() == 0 and image[-1, 0].max() == 0
+
+
+@pytest.mark.parametrize("pixels", ["rgb", "rgba", "luminance", "luminance_alpha"])
+def test_frame_is_what_mitsuba_renders(tmp_path, pixels):
+    text = f'<string name="pixel_format" value="{pixels}"/>{scenes.BOX}'
+    path = scenes.write_balls(tmp_path, film=text)
+    frame = FrameRenderer(path, spp=3).render(seed=7)
+    names = {"rgb": "RGB", "rgba": "RGBA", "luminance": "Y", "luminance_alpha": "YA"}
+    assert "".join(frame.channels) == names[pixels]
+    scene = mi.load_file(str(path), parallel=False)
+    expected = np.array(mi.render(scene, spp=3, seed=7))
+    actual = np.stack(list(frame.channels.values()), axis=-1)
+    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-7)
+    write_frame(tmp_path / "a.png", frame, "half")
+
+
+def test_alpha_of_the_film_stays_beside_the_opacity(tmp_path):
+    text = f'<string name="pixel_format" value="rgba"/>{scenes.BOX}'
+    frame = FrameRenderer(scenes.write_slab(tmp_path, text)).render()
+    assert {"A", "opacity", "Z", "box.A"} <= set(frame.channels)
+
+
+@pytest.mark.parametrize("pixels", ["rgb", "rgba"])
+def test_stock_aovs_keep_their_names_and_their_digits(tmp_path, pixels):
+    first = scenes.PATH.replace("<integrator", '<integrator name="first"')
+    second = '<integrator type="depth" name="second"/>'
+    text = f'<string name="pixel_format" value="{pixels}"/>{scenes.BOX}'
+    path = scenes.write_balls(tmp_path, aov(first + second), text)
+    frame = FrameRenderer(path, spp=1).render()
+    letters = pixels.upper()
+    others = [f"second.{letter}" for letter in letters]
+    assert list(frame.channels) == [*letters, *others, *AOV_NAMES]
+    write_frame(tmp_path / "a.exr", frame, "half")
+    stored_pixels, _ = stored(tmp_path / "a.exr")
+    for name, values in stored_pixels.items():
+        is_short = name[-1] in "RGBA"
+        assert values.dtype == (np.float16 if is_short else np.float32), name
+        if not is_short:
+            np.testing.assert_array_equal(values, frame.channels[name])
+    # from the near plane, where Mitsuba's rays start, to the position
+    hit = frame.channels["dd.y.T"] > 0
+    point = np.stack([frame.channels[f"pp.{c}"][hit] for c in "XYZ"])
+    away = point - scenes.EYE[:, None]
+    distance = np.linalg.norm(away, axis=0) * (1 - scenes.NEAR / -away[0])
+    np.testing.assert_allclose(frame.channels["dd.y.T"][hit], distance, rtol=1e-5)
+    np.testing.assert_allclose(frame.channels["second.R"][hit], distance, rtol=1e-5)
+    assert frame.channels["R"][hit].max() == frame.channels["G"][hit].max() == 1
+
+
+def test_mono_films_of_nested_integrators(tmp_path):
+    text = f'<string name="pixel_format" value="luminance"/>{scenes.BOX}'
+    inside = scenes.PATH.replace("<integrator", '<integrator name="first"')
+    frame = FrameRenderer(scenes.write_balls(tmp_path, aov(inside), text)).render()
+    assert list(frame.channels) == ["Y", *AOV_NAMES]
+
+
+def test_aovs_alone_have_no_colour(tmp_path):
+    frame = FrameRenderer(scenes.write_balls(tmp_path, aov())).render()
+    assert list(frame.channels) == AOV_NAMES
+    with pytest.raises(InputError, match=r"gives no colour.*write .exr"):
+        write_frame(tmp_path / "a.png", frame, "half")
+
+
+def test_metadata_tell_camera_pose_and_origin(tmp_path):
+    path = scenes.write_slab(tmp_path, fov=40)
+    renderer = FrameRenderer(path, 0, 5, {"spp": "2"})
+    write_frame(tmp_path / "a.exr", renderer.render(seed=3), "float")
+    pixels, header = stored(tmp_path / "a.exr")
+    assert {values.dtype for values in pixels.values()} == {np.dtype(np.float32)}
+    assert header["scene"] == "scene.xml"
+    assert header["scene_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert json.loads(header["scene_parameters"]) == {"spp": "2"}
+    assert (header["spp"], header["seed"]) == ("5", "3")
+    assert header["variant"] == "llvm_ad_rgb"
+    assert header["software"] == f"mi-nerfattack {mi_nerfattack.__version__}"
+    assert header["colorSpace"] == "linear Rec.709"
+    camera = json.loads(header["camera"])
+    focal = 0.5 * scenes.WIDTH / np.tan(np.radians(20))
+    assert camera["fx"] == pytest.approx(focal) == camera["fy"]
+    assert (camera["cx"], camera["cy"]) == (scenes.WIDTH / 2, scenes.HEIGHT / 2)
+    pose = np.array(header["camera_to_world"].split(), float).reshape(4, 4)
+    expected = scenes.opengl_pose(scenes.EYE) * [1, -1, -1, 1]
+    np.testing.assert_allclose(pose, expected, atol=1e-6)
+
+
+def test_metadata_tell_the_distortion(tmp_path):
+    metadata = FrameRenderer(scenes.write_lens(tmp_path)).render().metadata
+    camera = json.loads(metadata["camera"])
+    assert camera["fx"] == camera["fy"] == 20
+    assert camera["k1"] == pytest.approx(-0.1)
+
+
+def test_mitsuba_reads_our_files(tmp_path):
+    frame = FrameRenderer(scenes.write_slab(tmp_path)).render()
+    for precision in ("half", "float"):
+        path = tmp_path / f"{precision}.exr"
+        write_frame(path, frame, precision)
+        bitmap = mi.Bitmap(str(path))
+        names = [field.name for field in bitmap.struct_()]
+        assert set(names) == set(frame.channels)
+        pixels = np.array(bitmap)  # all of them half, if one is
+        for i, name in enumerate(names):
+            expected = frame.channels[name]
+            np.testing.assert_allclose(pixels[..., i], expected, rtol=2**-11)
+
+
+@pytest.mark.parametrize(
+    "write", [scenes.write_slab, scenes.write_balls, scenes.write_lens]
+)
+def test_poses_and_seeds_compile_nothing_after_the_first_frame(tmp_path, write):
+    renderer = FrameRenderer(write(tmp_path), spp=2)
+    poses = read_path(scenes.write_path(tmp_path, 4))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        renderer.render(poses[0], 0)
+        dr.kernel_history_clear()
+        for i in (1, 2, 3):
+            renderer.render(poses[i], i)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) >= 3
+    assert all(kernel["cache_hit"] for kernel in history)
+
+
+def test_a_pose_of_a_path_is_that_of_a_sensor(tmp_path):
+    renderer = FrameRenderer(scenes.write_balls(tmp_path), spp=2)
+    poses = read_path(scenes.write_path(tmp_path, 3))
+    own = renderer.render(seed=1).channels
+    moved = renderer.render(poses[2], 1).channels
+    again = renderer.render(poses[0], 1)
+    for name in "RGB":
+        np.testing.assert_allclose(again.channels[name], own[name], atol=1e-5)
+    pose = np.array(again.metadata["camera_to_world"].split(), float)
+    np.testing.assert_allclose(pose.reshape(4, 4), poses[0], atol=1e-8)
+    # from the other side red is up and to the right
+    red = np.argwhere(moved["R"] > 0.9).mean(axis=0)
+    assert red[0] < scenes.HEIGHT / 2 and red[1] > scenes.WIDTH / 2
+
+
+def test_route_is_driven_at_its_speed(tmp_path):
+    route = Route.from_file(scenes.write_route(tmp_path), "straight")
+    mount = CameraMount(1.5, 0.25, 0.0)
+    poses = route_path(route, mount, fps=10)
+    assert len(poses) == 6  # 2 m at 0.4 m a frame
+    positions = poses[:, :3, 3]
+    np.testing.assert_allclose(positions[:, 1], -0.75 + 0.4 * np.arange(6), atol=1e-12)
+    np.testing.assert_allclose(positions[:, [0, 2]], [[5, 1.5]] * 6, atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, 2], [[0, 1, 0]] * 6, atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, 0], [[1, 0, 0]] * 6, atol=1e-12)
+    with pytest.raises(InputError, match="fps: 0"):
+        route_path(route, mount, fps=0)
+
+
+def test_many_samples_are_the_mean_of_passes(tmp_path, monkeypatch):
+    path = scenes.write_slab(tmp_path, fov=60)
+    monkeypatch.setattr(film, "_MAX_RAYS", 4 * scenes.WIDTH * scenes.HEIGHT)
+    renderer = FrameRenderer(path, spp=10)
+    frame = renderer.render(seed=2)
+    assert frame.metadata["spp"] == "12"  # three passes of four
+    seeds = [int(s) for s in np.random.SeedSequence(2).generate_state(3)]
+    scene = mi.load_file(str(path), parallel=False)
+    images = [np.array(mi.render(scene, spp=4, seed=s)) for s in seeds]
+    for i, name in enumerate("RGBA"):
+        expected = np.mean([image[..., i] for image in images], axis=0)
+        np.testing.assert_allclose(frame.channels[name], expected, rtol=1e-5)
+    moments = [np.nan_to_num(m[..., 4], posinf=0) * m[..., 3] for m in images]
+    opacity = np.mean([image[..., 3] for image in images], axis=0)
+    seen = opacity > 0
+    assert seen.any() and not seen.all()
+    depth = np.mean(moments, axis=0)[seen] / opacity[seen]
+    np.testing.assert_allclose(frame.channels["Z"][seen], depth, rtol=1e-5)
+    assert np.isinf(frame.channels["Z"][~seen]).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("suffix", ["exr", "png"])
+def test_what_is_not_finite_is_refused_by_channel(tmp_path, suffix, value):
+    frame = FrameRenderer(scenes.write_balls(tmp_path)).render()
+    frame.channels["G"][2, 3] = value
+    path = tmp_path / f"a.{suffix}"
+    with pytest.raises(InputError, match=r"a\.\w+: channel 'G'"):
+        write_frame(path, frame, "half")
+    assert not path.exists()

@@ -1,0 +1,220 @@
+"""Marches from a copy of a scene's parameters, beside the march of the field itself."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.small_fields import homogeneous, small_ngp
+
+from mi_nerfattack.fields import NGPField, NGPLayout, Occupancy, load_field
+from mi_nerfattack.fields.cpu.grid import PackedGrid
+from mi_nerfattack.fields.cpu.words import LongWords, ShortWords
+from mi_nerfattack.render.camera.intrinsics import (
+    CameraMount,
+    from_fov,
+    generate_rays,
+    mount_pose,
+)
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.march import STOP, Rays, march
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.scene_march import FieldMarch, PackedMarch, scene_march
+from mi_nerfattack.scenes import bundled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def random_rays(rng, count=300, spread=3.0) -> Rays:
+    """Make rays from in and around [-1, 1]^3, towards it, with jitter and ends."""
+    origin = rng.uniform(-spread, spread, (3, count))
+    direction = rng.uniform(-0.8, 0.8, (3, count)) - origin
+    direction /= np.linalg.norm(direction, axis=0)
+    return Rays(
+        mi.Point3f(origin.tolist()),
+        mi.Vector3f(direction.tolist()),
+        mi.Float(rng.uniform(0.5, 9.0, count).tolist()),
+        mi.Float(rng.uniform(0, 0.99, count).tolist()),
+        mi.Bool((rng.random(count) < 0.9).tolist()),
+    )
+
+
+def road_rays(x: float = -10.0) -> Rays:
+    """Look along the road of the bundled intersection."""
+    mount = CameraMount()
+    place = mi.Float([x]), mi.Float([-1.75]), mi.Float([0.0])
+    pose = mount_pose(place, mount.height_m, mount.forward_m, mount.pitch_deg)
+    dr.eval(pose)
+    origin, direction = generate_rays(from_fov(50, 17, 90.0), *pose, 1)
+    return Rays(origin, direction)
+
+
+def some_cells(rng) -> Occupancy:
+    return Occupancy(rng.random((6, 5, 4)) < 0.4)
+
+
+def assert_same(posed: PosedField, rays: Rays, stop: float = STOP) -> None:
+    found = PackedMarch(posed, stop).march(rays)
+    expected = march(posed, *rays, stop)
+    for name, atol in (("radiance", 2e-5), ("opacity", 2e-6), ("moment", 1e-4)):
+        pair = [np.array(getattr(item, name)) for item in (found, expected)]
+        np.testing.assert_allclose(*pair, atol=atol, err_msg=name)
+
+
+def test_it_is_the_march_of_the_bundled_scene():
+    assert_same(
+        PosedField(load_field(bundled("intersection/field.safetensors"))), road_rays()
+    )
+
+
+@pytest.mark.parametrize("cone", [0.0, 0.05])
+def test_it_is_the_march_of_a_small_field(rng, cone):
+    field = small_ngp(cone=cone)
+    field.occupancy = some_cells(rng)
+    posed = PosedField(field)
+    rays = random_rays(rng)
+    assert 0.05 < float(dr.mean(march(posed, *rays).opacity)[0]) < 0.95
+    assert_same(posed, rays)
+
+
+def test_it_stops_where_the_march_stops(rng):
+    """With a coarse threshold, another place of termination would be seen."""
+    field = small_ngp()
+    assert_same(PosedField(field), random_rays(rng), stop=0.3)
+
+
+def test_pose_and_scale(rng):
+    field = small_ngp(cone=0.02)
+    field.occupancy = some_cells(rng)
+    posed = PosedField(field, Pose.upright((0.3, -0.2, 0.1), 0.7, 1.6))
+    assert_same(posed, random_rays(rng, spread=5.0))
+
+
+def test_rays_from_inside(rng):
+    assert_same(PosedField(small_ngp()), random_rays(rng, spread=0.9))
+
+
+def test_several_features_and_levels(rng):
+    layout = NGPLayout(3, 4, 9, 6, 40, 24)
+    field = NGPField(layout, -np.ones(3), np.array([1.0, 2.0, 1.5]), step_m=0.1)
+    for name, value in field.parameters().items():
+        fresh = rng.normal(0, 0.6, dr.width(value)).astype(np.float32)
+        field.set_parameter(name, type(value)(fresh))
+    assert_same(PosedField(field), random_rays(rng))
+
+
+def test_empty_field_and_opaque_first_cell(rng):
+    field = small_ngp()
+    field.occupancy = Occupancy(np.zeros((2, 2, 2), bool))
+    rays = random_rays(rng)
+    seen = PackedMarch(PosedField(field), STOP).march(rays)
+    assert not np.array(seen.opacity).any() and not np.array(seen.radiance).any()
+    field = small_ngp()
+    field.density_scale = 1e9
+    assert_same(PosedField(field), rays)
+
+
+def test_numbers_for_all_rays_stay_one_entry():
+    rays = road_rays()
+    assert dr.width(rays.t_max) == dr.width(rays.jitter) == 1
+    posed = PosedField(load_field(bundled("intersection/field.safetensors")))
+    seen = PackedMarch(posed, STOP).march(rays)
+    assert dr.width(seen.opacity) == dr.width(rays.direction)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_features_are_those_of_the_encoding(rng, kind):
+    field = small_ngp()
+    table = rng.normal(size=field.encoding.n_params).astype(kind)
+    field.set_parameter("table", mi.Float(table.astype(np.float32)))
+    point = rng.uniform(0, 0.999, (3, 200)).astype(np.float32).tolist()
+    unit, active = mi.Point3f(point), mi.Bool((rng.random(200) < 0.5).tolist())
+    grid = PackedGrid(field.encoding)
+    assert isinstance(grid.table, ShortWords if kind == np.float16 else LongWords)
+    found = grid.encode(unit, active)
+    expected = list(field.encoding(unit, active))
+    assert len(found) == len(expected) == field.encoding.n_output_features
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a.numpy(), mi.Float(b).numpy(), atol=2e-6)
+
+
+def test_gains_multiply_the_radiance(rng):
+    posed, rays = PosedField(small_ngp()), random_rays(rng)
+    gain = mi.Color3f(*(rng.uniform(0.5, 2, 300).tolist() for _ in range(3)))
+    plain = PackedMarch(posed, STOP).march(rays)
+    rays.gains = [gain]
+    for kind in (PackedMarch, FieldMarch):
+        lit = kind(posed, STOP).march(rays)
+        expected = np.array(plain.radiance) * np.array(gain)
+        np.testing.assert_allclose(np.array(lit.radiance), expected, atol=2e-5)
+
+
+def test_new_parameters_are_noticed(rng):
+    field = small_ngp()
+    posed, rays = PosedField(field), random_rays(rng)
+    scene = PackedMarch(posed, STOP)
+    before = np.array(scene.march(rays).radiance)
+    field.set_parameter("table", 0.5 * field.parameters()["table"])
+    after = np.array(scene.march(rays).radiance)
+    assert np.abs(after - before).max() > 0.01
+    expected = np.array(march(posed, *rays).radiance)
+    np.testing.assert_allclose(after, expected, atol=2e-5)
+
+
+def test_parameters_may_lose_half_precision(rng):
+    """A table that short words hold is followed by one that they do not, and back."""
+    field = small_ngp()
+    posed, rays = PosedField(field), random_rays(rng)
+    scene = PackedMarch(posed, STOP)
+    table = field.encoding.data.numpy().astype(np.float16).astype(np.float32)
+    for factor in (1.0, 0.7, 0.5):
+        field.set_parameter("table", mi.Float(np.float32(factor) * table))
+        found, expected = scene.march(rays), march(posed, *rays)
+        pair = np.array(found.radiance), np.array(expected.radiance)
+        np.testing.assert_allclose(*pair, atol=2e-5)
+
+
+def test_nothing_is_compiled_for_other_rays():
+    posed = PosedField(load_field(bundled("intersection/field.safetensors")))
+    scene = PackedMarch(posed, STOP)
+    for x in (-10.0, -9.0):
+        scene.march(road_rays(x))
+    fresh = [road_rays(x) for x in (-3.0, 5.0)]
+    dr.eval(fresh)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for rays in fresh:
+            scene.march(rays)
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    assert history and all(entry["cache_hit"] for entry in history)
+
+
+def test_memory_does_not_grow_with_the_samples(rng):
+    rays = random_rays(rng, 4096)
+    peaks = []
+    for step_m in (0.1, 0.005):
+        field = small_ngp()
+        field.step_m = step_m
+        field.density_scale = 1e-3
+        scene = PackedMarch(PosedField(field), STOP)
+        scene.march(rays)
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        scene.march(rays)
+        dr.sync_thread()
+        peaks.append(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    assert peaks[1] <= 1.05 * peaks[0]
+
+
+def test_the_choice_is_by_field():
+    assert isinstance(scene_march(PosedField(small_ngp()), STOP), PackedMarch)
+    assert isinstance(scene_march(PosedField(homogeneous()), STOP), FieldMarch)
+
+
+def test_grid_fields_are_marched_as_ever(rng):
+    posed, rays = PosedField(homogeneous()), random_rays(rng)
+    found = scene_march(posed, STOP).march(rays)
+    expected = np.array(march(posed, *rays).radiance)
+    np.testing.assert_allclose(np.array(found.radiance), expected, atol=1e-6)

@@ -1,0 +1,225 @@
+"""The report of a fit: numbers that are known, pictures, and views without depth."""
+
+from __future__ import annotations
+
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.small_fields import homogeneous, sigmoid_to_linear, small_ngp
+from helpers.sphere_views import SIZE, sphere_views
+
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.capture.posed_images import PosedImages, held_out
+from mi_nerfattack.fit.options import FitProgress, FitResult
+from mi_nerfattack.fit.scores import (
+    FieldRenderer,
+    ViewScore,
+    evaluate,
+    reference,
+    worst_views,
+)
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
+from mi_nerfattack.report.pages.fit import judge_fit, summary, write_fit_report
+from mi_nerfattack.report.pages.verdict import OBJECT, judge, pooled_db, verdict
+from mi_nerfattack.report.plots.fit import running_mean
+from mi_nerfattack.report.plots.views import abs_difference
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def grey_views(shades: list[int]) -> PosedImages:
+    """One flat image a shade, all from x = -3 towards a box of half-edge 1."""
+    camera = from_fov(16, 12, 20.0)
+    images = np.zeros((len(shades), 12, 16, 3), np.uint8)
+    images[...] = np.array(shades)[:, None, None, None]
+    poses = np.stack([look_at([-3.0, 0, 0], [0.0, 0, 0])] * len(shades))
+    return PosedImages(images, poses, camera, tuple(f"grey {s}" for s in shades))
+
+
+def solid_box():
+    """A box that stops all light within a tenth of a millimetre, sRGB 0.5745."""
+    field = homogeneous(1e5, 0.3)
+    shown = float(linear_to_srgb_numpy(sigmoid_to_linear(np.array([0.3])))[0])
+    return field, shown
+
+
+def a_result(field, images: PosedImages, **changes) -> FitResult:
+    scores = evaluate(field, images, held_out(len(images)))
+    history = tuple(
+        FitProgress(25 * i, 100, i / 4, 0.1 / i, 20.0 + i, 2.0 * i, 1.0, 0.1)
+        for i in range(1, 5)
+    )
+    values = {
+        "field": field,
+        "psnr_heldout_db": float(np.mean([s.psnr_db for s in scores])),
+        "ssim_heldout": float(np.mean([s.ssim for s in scores])),
+        "per_view": tuple(scores),
+        "history": history,
+        "wall_s": 12.0,
+        "steps": 100,
+    }
+    return FitResult(**(values | changes))
+
+
+def test_psnr_of_a_known_offset():
+    field, shown = solid_box()
+    shades = [100, 147, 250]
+    for score, shade in zip(
+        evaluate(field, grey_views(shades), range(3)), shades, strict=True
+    ):
+        expected = -20 * np.log10(abs(shown - shade / 255))
+        assert score.psnr_db == pytest.approx(expected, abs=0.01)
+        assert score.hazy == 0
+
+
+def test_depth_and_haze_of_a_known_box():
+    field, _ = solid_box()
+    images = grey_views([0])
+    view = FieldRenderer(field).render(images.camera, images.camera_to_world[0])
+    x = (np.arange(16) + 0.5 - 8) / images.camera.fx
+    y = (np.arange(12) + 0.5 - 6) / images.camera.fy
+    to_wall = 2 * np.sqrt(1 + x**2 + y[:, None] ** 2)
+    np.testing.assert_allclose(view.depth, to_wall, atol=0.011)  # a step
+    thin = homogeneous(0.3)  # 1 - exp(-0.6) = 0.45 along the axis
+    view = FieldRenderer(thin).render(images.camera, images.camera_to_world[0])
+    assert view.hazy == 1
+
+
+def test_only_worst_views_keep_their_rendering():
+    field, _ = solid_box()
+    shades = [140, 10, 150, 250, 147]
+    scores = evaluate(field, grey_views(shades), range(5), keep=2)
+    assert [score.rendering is not None for score in scores] == [
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert [score.index for score in worst_views(scores, 4)] == [1, 3]
+
+
+def test_images_with_alpha_lie_over_white():
+    images, _ = sphere_views(1)
+    alpha = images.images[0, ..., 3:] / 255
+    wanted = images.images[0, ..., :3] / 255 * alpha + (1 - alpha)
+    np.testing.assert_allclose(reference(images, 0), wanted, atol=1 / 255)
+
+
+def test_report_folder(tmp_path):
+    field, shown = solid_box()
+    images = grey_views([140] * 24 + [20])
+    depth = np.full((25, 12, 16), 2.3, np.float32)
+    depth[:, :6] = np.inf
+    result = a_result(field, images)
+    folder = tmp_path / "a.report"
+    page = write_fit_report(folder, result, images, depth, "A <fit>")
+    assert page == folder / "report.html"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "curve.png",
+        "depth.png",
+        "metrics.json",
+        "report.html",
+        "views.png",
+        "worst.png",
+    ]
+    text = files.read_text(page)
+    assert "A &lt;fit&gt;" in text and "Not good enough" in text
+    assert text.count("data:image/png;base64,") == 4
+    assert not re.search(r"(src|href)=\"(?!data:)", text)
+    assert not re.search(r"\b(nan|inf)\b", text)
+    metrics = files.read_json(folder / "metrics.json")
+    assert metrics | summary(result) == metrics
+    assert [view["index"] for view in metrics["per_view"]] == [0, 8, 16, 24]
+    # the box's wall lies 2 m from the camera, 2 / cos away along a ray
+    assert metrics["depth_error_median_m"] == pytest.approx(0.29, abs=0.02)
+    assert metrics["good_enough"] is False
+    assert metrics["settings"]["length_unit"] == "metre"
+    for name in ("worst", "depth", "curve", "views"):
+        assert files.read_image(folder / f"{name}.png").shape[1] == 1200
+
+
+def test_report_of_views_that_show_nothing(tmp_path):
+    """No surface, no depth, equal images: infinite numbers, and never NaN."""
+    field = homogeneous()
+    field.set_parameter("density", np.full(field.n_vertices, -200, np.float32))
+    images = grey_views([0] * 9)
+    depth = np.full((9, 12, 16), np.inf, np.float32)
+    result = a_result(field, images, history=())
+    assert result.psnr_heldout_db == np.inf
+    page = write_fit_report(tmp_path, result, images, depth, "empty")
+    metrics = files.read_json(tmp_path / "metrics.json")
+    assert metrics["psnr_heldout_db"] is None
+    assert metrics["depth_error_median_m"] is None
+    assert not re.search(r"\bnan\b", files.read_text(page))
+
+
+def test_report_of_an_ngp_without_depth(tmp_path):
+    images, _ = sphere_views(9, alpha=False)
+    result = a_result(small_ngp(), images)
+    page = write_fit_report(tmp_path, result, images, None, "ngp")
+    text = files.read_text(page)
+    assert "there is no depth to compare with" in text
+    assert "good enough to test a policy in" in text
+    assert mi.variant() == "llvm_ad_rgb"
+    assert images.camera.width == SIZE
+
+
+def scores_of(psnr: list[float], hazy: float = 0.01) -> list[ViewScore]:
+    return [ViewScore(i, f"{i}", value, 0.9, hazy) for i, value in enumerate(psnr)]
+
+
+@pytest.mark.parametrize(
+    ("psnr", "fitted", "hazy", "failed"),
+    [
+        ([30, 31, 29], 31, 0.01, []),
+        ([30, 31], 31, 0.01, ["held-out views"]),
+        ([23, 23, 23], 25, 0.01, ["mean PSNR"]),
+        ([30, 17, 30], 25, 0.01, ["worst"]),
+        ([25, 25, 25], 31, 0.01, ["fitted rays less"]),
+        ([25, 25, 25], 26, 0.2, ["opacity"]),
+        ([np.inf] * 3, np.inf, 0.0, []),
+    ],
+)
+def test_verdict_names_what_is_not_met(psnr, fitted, hazy, failed):
+    criteria = judge(scores_of(psnr, hazy), fitted)
+    names = [item.name for item in criteria if not item.met]
+    assert len(names) == len(failed)
+    assert all(part in name for part, name in zip(failed, names, strict=True))
+    text = verdict(criteria)
+    assert text.startswith("Not good enough" if failed else "Good enough")
+    assert all(name in text for name in names)
+
+
+def test_an_object_is_judged_as_one():
+    """No poses to refine, no images to take: a grid comes from renders."""
+    result = a_result(solid_box()[0], grey_views([20] * 9))
+    text = verdict(judge_fit(result))
+    assert text.startswith("Not good enough as an object to attack: held-out views")
+    assert "--views" in text and "--resolution 128" in text
+    assert "policy" not in text and "pose" not in text
+    good = verdict(judge(scores_of([30.0] * 3), 31.0, OBJECT))
+    assert good.startswith("Good enough as an object to attack")
+
+
+def test_pooled_psnr_averages_squared_errors():
+    assert pooled_db([20.0, 20.0]) == pytest.approx(20)
+    expected = -10 * np.log10((1e-2 + 1e-4) / 2)
+    assert pooled_db([20.0, 40.0]) == pytest.approx(expected)
+    assert pooled_db([np.inf]) == np.inf
+    assert len(judge(scores_of([30.0]))) == len(judge(scores_of([30.0]), 30.0)) - 1
+
+
+def test_running_mean_keeps_lines():
+    line = np.linspace(3, 7, 101)
+    np.testing.assert_allclose(running_mean(line)[10:-10], line[10:-10])
+    assert running_mean([]).size == 0
+    np.testing.assert_array_equal(running_mean([1.0, 5.0]), [1, 5])
+
+
+def test_difference_of_depths_is_never_nan():
+    a, b = np.array([1.0, np.inf, np.inf, 2.0]), np.array([1.5, np.inf, 3.0, np.inf])
+    np.testing.assert_array_equal(abs_difference(a, b), [0.5, np.inf, np.inf, np.inf])

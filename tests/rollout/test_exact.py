@@ -1,0 +1,289 @@
+"""The loop's derivatives in double precision, against autograd through time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+import torch
+from helpers import analytic_loop as analytic
+
+from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import AbstractObjective, StageSum
+from mi_nerfattack.rollout.reduction import Mean, Worst
+from mi_nerfattack.rollout.sweep import StepRecorder
+from mi_nerfattack.rollout.tape import FullTape
+from mi_nerfattack.rollout.torch_rollout import torch_rollout
+from mi_nerfattack.vehicle.state import to_state
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ADJOINTS = {
+    "replay": Replay(),
+    "kept": KeptBackgrounds(),
+    "checkpointed": Checkpointed(3),
+    "tape": FullTape(),
+}
+OFFSETS = np.array(
+    [[0.1, -0.2, 0.3, 0.05, 0.1, -0.15], [0.0, 0.2, -0.1, 0.3, 0.0, 0.1]]
+)
+
+
+class Wave(AbstractObjective):
+    """A function of position, heading and time that no two states share."""
+
+    def evaluate(self, states):
+        x, y, theta = (states.rows[i] for i in range(3))
+        value = dr.sin(1.3 * y + 0.2 * x) + dr.square(theta) * dr.cos(x)
+        return states.total(value * (1 + states.time))
+
+
+def wave_in_torch(states, dt):
+    """The same, (n,) from states (n, T + 1, m)."""
+    x, y, theta = states[:, 1:, :3].unbind(2)
+    time = dt * torch.arange(1, states.shape[1], dtype=torch.float64)
+    value = torch.sin(1.3 * y + 0.2 * x) + theta**2 * torch.cos(x)
+    return (value * (1 + time)).sum(1)
+
+
+def expected_gradient(loop, twin, initial, horizon, attached, reduce=torch.mean):
+    """Differentiate the twin by textures, initial states and offsets."""
+    textures = [
+        torch.tensor(texture.numpy(), requires_grad=True)
+        for texture in loop.sensor.textures()
+    ]
+    start = torch.tensor(initial, requires_grad=True)
+    offsets = torch.tensor(loop.sensor.offsets(), requires_grad=True)
+    states, _ = twin.drive(start, textures, horizon, attached, offsets)
+    value = reduce(wave_in_torch(states, twin.dt))
+    value.backward()
+    grads = [texture.grad.numpy() for texture in textures]
+    return float(value.detach()), [*grads, start.grad.numpy(), offsets.grad.numpy()]
+
+
+def flat(gradient):
+    """Lay a gradient out as `expected_gradient` does."""
+    textures = [texture.numpy() for texture in gradient.textures]
+    return [*textures, np.array(gradient.initial).T, gradient.offsets]
+
+
+def assert_close(found, expected, tolerance=1e-8):
+    for a, b in zip(found, expected, strict=True):
+        scale = np.linalg.norm(b)
+        assert np.linalg.norm(a - b) <= tolerance * scale, (a, b)
+
+
+@pytest.mark.parametrize("name", ADJOINTS)
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize(
+    ("vehicle", "integrator", "substeps", "delay", "horizon"),
+    [
+        ("dubins", "rk4", 1, 0, 1),
+        ("dubins", "euler", 1, 0, 10),
+        ("ackermann_rate", "rk4", 3, 4, 5),
+        ("bicycle", "implicit_midpoint", 2, 1, 5),
+    ],
+)
+def test_adjoints_are_autograd(
+    vehicle, integrator, substeps, delay, horizon, attached, name
+):
+    loop, twin = analytic.make_pair(vehicle, integrator, substeps, delay, 2)
+    loop.sensor.set_offsets(OFFSETS)
+    initial = loop.dynamics.extend(analytic.random_poses(3))
+    rollout = Rollout(loop, Wave(), horizon, adjoint=ADJOINTS[name], attached=attached)
+    evaluation = rollout.run(to_state(initial))
+    found = rollout.gradient(evaluation, offsets=True)
+    value, expected = expected_gradient(loop, twin, initial, horizon, attached)
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    assert_close(flat(found), expected)
+
+
+@pytest.mark.slow
+def test_the_longest_horizon_of_the_issue():
+    loop, twin = analytic.make_pair("ackermann", "rk4", 1, 2)
+    initial = analytic.random_poses(2)
+    found = {}
+    for name in ("replay", "tape"):
+        rollout = Rollout(loop, Wave(), 100, adjoint=ADJOINTS[name], attached=True)
+        evaluation = rollout.run(to_state(initial))
+        found[name] = flat(rollout.gradient(evaluation, offsets=True))
+    assert_close(found["replay"], found["tape"])
+    _, expected = expected_gradient(loop, twin, initial, 100, True)
+    assert_close(found["replay"], expected, 1e-7)
+
+
+def test_costates_are_minus_the_derivative_by_the_states():
+    loop, _ = analytic.make_pair("ackermann_rate", "rk4", 2, 1)
+    initial = loop.initial(analytic.random_poses(2))
+    replay, tape = (
+        Rollout(loop, Wave(), 6, adjoint=adjoint, attached=True)
+        for adjoint in (Replay(), FullTape())
+    )
+    found = replay.gradient(replay.run(initial)).costates
+    assert found.shape == (6, 2, 4)
+    assert_close([found], [tape.gradient(tape.run(initial)).costates])
+
+
+def test_the_worst_drive_alone_is_differentiated():
+    loop, twin = analytic.make_pair()
+    initial = analytic.random_poses(4)
+    rollout = Rollout(loop, Wave(), 5, reduction=Worst())
+    evaluation = rollout.run(to_state(initial))
+    found = flat(rollout.gradient(evaluation, offsets=True))
+    value, expected = expected_gradient(loop, twin, initial, 5, False, torch.max)
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    assert evaluation.costs.shape == (4,)
+    assert_close(found, expected)
+
+
+def test_dr_backward_differentiates_the_function(rng):
+    loop, twin = analytic.make_pair(objects=2)
+    initial = analytic.random_poses(3)
+    _, expected = expected_gradient(loop, twin, initial, 4, True)
+    rollout = Rollout(loop, Wave(), 4, attached=True)
+    textures, start = loop.sensor.textures(), to_state(initial)
+    offsets = analytic.tensor(loop.sensor.offsets())
+    dr.enable_grad(textures, start, offsets)
+    value = rollout(textures, start, offsets)
+    loop.sensor.set_textures([0 * t for t in dr.detach(textures)])  # another's use
+    loop.sensor.set_offsets(OFFSETS)
+    dr.backward(3 * value)
+    found = [dr.grad(texture).numpy() for texture in textures]
+    found += [np.array(dr.grad(start)).T, dr.grad(offsets).numpy()]
+    assert_close([value / 3 for value in found], expected)
+
+
+def test_the_function_remembers_where_the_objects_stood():
+    loop, twin = analytic.make_pair(objects=2)
+    loop.sensor.set_offsets(OFFSETS)
+    initial = analytic.random_poses(2)
+    _, expected = expected_gradient(loop, twin, initial, 4, True)
+    rollout = Rollout(loop, Wave(), 4, attached=True)
+    leaves = [
+        torch.tensor(t.numpy(), requires_grad=True) for t in loop.sensor.textures()
+    ]
+    in_torch = torch_rollout(rollout)(leaves, torch.tensor(initial))
+    textures = loop.sensor.textures()
+    dr.enable_grad(textures)
+    value = rollout(textures, to_state(initial))
+    loop.sensor.set_offsets(0 * OFFSETS)  # another's use
+    dr.backward(value)
+    assert_close([dr.grad(texture).numpy() for texture in textures], expected[:2])
+    loop.sensor.set_offsets(0 * OFFSETS)
+    in_torch.backward()
+    assert_close([leaf.grad.numpy() for leaf in leaves], expected[:2])
+
+
+def test_torch_differentiates_the_function():
+    loop, twin = analytic.make_pair()
+    initial = analytic.random_poses(2)
+    _, expected = expected_gradient(loop, twin, initial, 4, True)
+    seen = []
+    function = torch_rollout(Rollout(loop, Wave(), 4, attached=True), seen.append)
+    leaves = [
+        torch.tensor(value, requires_grad=True)
+        for value in (
+            loop.sensor.textures()[0].numpy(),
+            initial,
+            loop.sensor.offsets(),
+        )
+    ]
+    value = function(*leaves)
+    (2 * value).backward()
+    assert float(value.detach()) == seen[0].value
+    assert_close([leaf.grad.numpy() / 2 for leaf in leaves], expected)
+    assert torch.autograd.gradcheck(function, leaves, eps=1e-5, atol=1e-6)
+
+
+def test_parameters_that_need_no_gradient_get_none():
+    loop, _ = analytic.make_pair()
+    function = torch_rollout(Rollout(loop, Wave(), 2))
+    texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)
+    start = torch.tensor(analytic.random_poses(1))
+    function(texture, start).backward()
+    assert texture.grad is not None and start.grad is None
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_forward_and_reverse_mode_are_transposes(rng, attached):
+    loop, _ = analytic.make_pair("ackermann_rate", "rk4", 2, 3, 2)
+    initial = loop.initial(analytic.random_poses(3))
+    rollout = Rollout(loop, Wave(), 7, attached=attached)
+    evaluation = rollout.run(initial)
+    found = rollout.gradient(evaluation)
+    shapes = [texture.shape for texture in found.textures]
+    textures = [rng.normal(size=shape) for shape in shapes]
+    start = rng.normal(size=(3, 4))
+    tangent = rollout.tangent(
+        evaluation, [analytic.tensor(t) for t in textures], to_state(start)
+    )
+    expected = (np.array(found.initial).T * start).sum()
+    expected += sum(
+        (a.numpy() * b).sum() for a, b in zip(found.textures, textures, strict=True)
+    )
+    assert tangent == pytest.approx(float(expected), rel=1e-11)
+
+
+def test_the_gradient_comes_apart_by_periods(rng):
+    loop, _ = analytic.make_pair(objects=2)
+    initial = to_state(analytic.random_poses(2))
+    rollout = Rollout(loop, Wave(), 6)
+    directions = [rng.normal(size=t.shape) for t in loop.sensor.textures()]
+    found = rollout.gradient(rollout.run(initial), recorder=StepRecorder(directions))
+    parts = found.attribution
+    assert parts.norms.shape == parts.along.shape == (6, 2)
+    assert (parts.norms > 0).all()
+    periods = {}
+    recorder = StepRecorder(on_period=periods.__setitem__)
+    rollout.gradient(rollout.run(initial), recorder=recorder)
+    for index, rows in periods.items():
+        norms = [np.linalg.norm(row) for row in rows]
+        np.testing.assert_allclose(norms, parts.norms[index], rtol=1e-6)
+    assert sorted(periods) == list(range(6))
+    whole = [
+        (gradient.numpy() * direction).sum()
+        for gradient, direction in zip(found.textures, directions, strict=True)
+    ]
+    np.testing.assert_allclose(parts.along.sum(0), whole, rtol=1e-5)
+
+
+def test_what_cannot_be_differentiated_is_refused():
+    loop, _ = analytic.make_pair()
+    initial = to_state(analytic.random_poses(1))
+
+    class Blind(type(loop.policy)):
+        differentiable = False
+
+    blind = replace(loop, policy=Blind(analytic.AnalyticPolicy()))
+    rollout = Rollout(blind, Wave(), 2)
+    with pytest.raises(TypeError, match="Blind: a black box has no derivatives"):
+        rollout.gradient(rollout.run(initial))
+    tape = Rollout(loop, Wave(), 2, adjoint=FullTape())
+    with pytest.raises(TypeError, match="no gradient by periods; use Replay"):
+        tape.gradient(tape.run(initial), recorder=StepRecorder())
+    with pytest.raises(ValueError, match="segment: 0"):
+        Checkpointed(0)
+    with pytest.raises(ValueError, match="delay: -1"):
+        replace(loop, delay=-1)
+    with pytest.raises(ValueError, match="substeps: 0"):
+        replace(loop, substeps=0)
+
+
+def test_a_state_of_the_wrong_size_is_refused():
+    loop, _ = analytic.make_pair("ackermann_rate")
+    with pytest.raises(ValueError, match=r"3 rows; RateLimitedAckermann has 4"):
+        Rollout(loop, Wave(), 2).run(to_state(analytic.random_poses(1)))
+
+
+def test_mean_of_stage_costs_with_weights():
+    loop, _ = analytic.make_pair()
+    initial = to_state(analytic.random_poses(3))
+    weights = np.array([0.0, 0.0, 2.0])
+    objective = StageSum(lambda state: state[1], weights)
+    evaluation = Rollout(loop, objective, 3, Mean()).run(initial)
+    expected = 2 * evaluation.trajectory.states_numpy()[:, 3, 1]
+    np.testing.assert_allclose(evaluation.costs, expected, rtol=1e-14)
+    assert evaluation.value == pytest.approx(expected.mean(), rel=1e-13)

@@ -1,0 +1,282 @@
+"""The closed loop through fields, and its adjoints, in single precision."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from helpers.derivatives import central_difference
+from helpers.rollouts import (
+    ADJOINTS,
+    INITIAL,
+    OFFSET,
+    along_texture,
+    gradient,
+    make_rollout,
+    objective,
+    texture_gradient,
+    unit,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 10])
+def test_attached_gradient_is_that_of_the_whole_loop(toy, horizon, rng):
+    from mi_nerfattack.vehicle.integrators import RK4
+
+    loop, item = toy.make_loop(RK4())  # Euler feels a control after two steps
+    rollout = make_rollout(toy, loop, horizon, attached=True)
+    found = texture_gradient(rollout)
+    along = unit(found)
+    for direction in (along, unit(along + 0.5 * unit(rng.normal(size=found.shape)))):
+        value = along_texture(toy, rollout, item, direction)
+        expected = float((found * direction).sum())
+        assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
+
+
+def test_attached_gradient_by_the_initial_state(toy):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 5, attached=True)
+    found = np.array(gradient(rollout).initial)[:, 0]
+    for axis, step in ((0, 4e-2), (1, 4e-2), (2, 1e-2)):
+
+        def value(s, axis=axis):
+            moved = INITIAL.copy()
+            moved[0, axis] += s
+            return objective(rollout, moved)
+
+        expected = pytest.approx(found[axis], rel=1e-3, abs=1e-3 * np.abs(found).max())
+        assert central_difference(value, step) == expected
+
+
+def test_gradient_by_the_pose_of_an_object(toy):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 4, attached=True)
+    loop.sensor.set_offsets(OFFSET)
+    found = gradient(rollout, offsets=True).offsets
+    for axis in range(6):
+
+        def value(s, axis=axis):
+            moved = OFFSET.copy()
+            moved[0, axis] += s
+            loop.sensor.set_offsets(moved)
+            return objective(rollout)
+
+        # samples that cross the faces of cells, kinks of the field, cost accuracy, as
+        # do the ends of the interval on the ray, which count as constants
+        scale = np.abs(found[0, 3 * (axis // 3) :][:3]).max()
+        expected = pytest.approx(found[0, axis], rel=2e-2, abs=2e-2 * scale)
+        assert central_difference(value, 3e-3) == expected
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_forward_and_reverse_mode_are_transposes(toy, rng, attached):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 4, attached)
+    evaluation = rollout.run(loop.initial(INITIAL))
+    found = rollout.gradient(evaluation)
+    by_texture = found.textures[0].numpy().astype(float)
+    direction = unit(by_texture) + 0.3 * unit(rng.normal(size=by_texture.shape))
+    start = np.array([[0.1, -0.3, 0.05]])
+    expected = (by_texture * direction).sum() + (
+        np.array(found.initial).T * start
+    ).sum()
+    tensor = mi.TensorXf(direction.astype(np.float32))
+    tangent = rollout.tangent(evaluation, [tensor], loop.initial(start))
+    assert tangent == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize("horizon", [2, 5])
+def test_detached_gradient_is_that_of_a_torch_loop_with_detach(toy, horizon):
+    loop, item = toy.make_loop()
+    rollout = make_rollout(toy, loop, horizon)
+    found = texture_gradient(rollout)
+    texture = torch.as_tensor(toy.texture_of(item).astype(np.float64))
+    texture.requires_grad_(True)
+    value = toy.torch_objective(loop, texture, INITIAL[0], horizon)
+    value.backward()
+    expected = texture.grad.numpy()
+    assert objective(rollout) == pytest.approx(float(value.detach()), rel=1e-5)
+    assert np.linalg.norm(expected) > 0
+    error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+    assert error < 1e-3
+
+
+def test_euler_needs_two_steps_to_feel_a_control(toy):
+    loop, _ = toy.make_loop()
+    found = gradient(make_rollout(toy, loop, 1, attached=True))
+    assert not found.textures[0].numpy().any()
+    assert found.costates.shape == (1, 1, 3)
+
+
+def test_attached_and_detached_differ(toy):
+    loop, _ = toy.make_loop()
+    a = texture_gradient(make_rollout(toy, loop, 5, attached=True))
+    b = texture_gradient(make_rollout(toy, loop, 5))
+    assert np.linalg.norm(a - b) > 1e-3 * np.linalg.norm(b)
+
+
+@pytest.mark.parametrize("name", ["RK4", "ImplicitMidpoint"])
+def test_other_integrators_against_differences(toy, name):
+    from mi_nerfattack.vehicle import integrators
+
+    loop, item = toy.make_loop(getattr(integrators, name)())
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = texture_gradient(rollout)
+    value = along_texture(toy, rollout, item, unit(found))
+    expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
+    assert central_difference(value, 0.2) == expected
+
+
+def test_a_batch_is_the_mean_of_its_members(toy):
+    loop, _ = toy.make_loop()
+    both = np.array([[0.0, 0.35, 0.02], [0.1, -0.2, -0.05]])
+    rollout = make_rollout(toy, loop, 3)
+    batch, one, two = (
+        texture_gradient(rollout, poses) for poses in (both, both[:1], both[1:])
+    )
+    assert np.allclose(batch, 0.5 * (one + two), rtol=1e-3, atol=1e-7)
+
+
+def test_a_batch_is_one_sequence_of_launches(toy):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 3, adjoint="kept_backgrounds")
+    counts = []
+    for size in (2, 8):
+        poses = np.repeat(INITIAL, size, 0) + 0.01 * np.arange(size)[:, None]
+        gradient(rollout, poses)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            gradient(rollout, poses + 0.003)
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        counts.append(len(history))
+    assert counts[0] == counts[1] > 0
+
+
+def test_jitter_is_replayed(toy):
+    loop, _ = toy.make_loop(jitter_seed=7)
+    state = loop.initial(INITIAL)
+    a = loop.sensor.observe(state, 3).image.numpy()
+    assert np.array_equal(a, loop.sensor.observe(state, 3).image.numpy())
+    assert not np.array_equal(a, loop.sensor.observe(state, 4).image.numpy())
+
+
+def test_a_jittered_loop_is_differentiated_as_it_was_driven(toy):
+    loop, item = toy.make_loop(jitter_seed=7)
+    rollout = make_rollout(toy, loop, 3, attached=True)
+    found = texture_gradient(rollout)
+    value = along_texture(toy, rollout, item, unit(found))
+    expected = pytest.approx(np.linalg.norm(found), rel=1e-3)
+    assert central_difference(value, 0.2) == expected
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[:3])
+def test_nothing_is_compiled_after_the_first_steps(toy, adjoint):
+    loop, _ = toy.make_loop()
+    gradient(make_rollout(toy, loop, 4, adjoint=adjoint))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        gradient(make_rollout(toy, loop, 4, adjoint=adjoint), INITIAL + 0.07)
+        history = dr.kernel_history((dr.KernelType.JIT,))
+    assert history
+    assert all(entry["cache_hit"] for entry in history)
+
+
+def test_memory_does_not_grow_with_the_horizon(toy):
+    loop, _ = toy.make_loop()
+    backend = dr.backend_v(mi.Float)
+
+    def peak(horizon):
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        gradient(make_rollout(toy, loop, horizon))
+        dr.sync_thread()
+        return dr.detail.malloc_watermark(backend)
+
+    peak(4)
+    assert peak(32) <= 1.05 * peak(8)
+
+
+def test_a_sensor_without_derivatives_is_refused(toy):
+    from mi_nerfattack.rollout.sensor import AbstractSensor
+
+    class Blind(AbstractSensor):
+        def __init__(self, sensor):
+            self.sensor = sensor
+
+        def observe(self, state, step):
+            return self.sensor.observe(state, step)
+
+    loop, _ = toy.make_loop()
+    blind = replace(loop, sensor=Blind(loop.sensor))
+    with pytest.raises(TypeError, match="Blind: has no derivatives"):
+        gradient(make_rollout(toy, blind, 1))
+
+
+def test_horizon_below_one_and_bad_states_are_refused(toy):
+    from mi_nerfattack.vehicle.state import to_state
+
+    loop, _ = toy.make_loop()
+    with pytest.raises(ValueError, match="horizon"):
+        objective(make_rollout(toy, loop, 0))
+    with pytest.raises(ValueError, match="states"):
+        to_state(np.array([[0.0, np.nan, 0.0]]))
+    with pytest.raises(ValueError, match=r"offsets: shape \(2, 6\)"):
+        loop.sensor.set_offsets(np.zeros((2, 6)))
+    with pytest.raises(ValueError, match="textures: 2 given for 1 objects"):
+        rollout = make_rollout(toy, loop, 1)
+        rollout.install(2 * loop.sensor.textures(), None)
+
+
+def test_objects_that_share_a_field_are_refused(toy):
+    from mi_nerfattack.rollout.field_sensor import FieldSensor
+
+    old = toy.make_loop()[0].sensor
+    with pytest.raises(ValueError, match="two of them share a field"):
+        FieldSensor(old.scene, 2 * old.objects, old.camera)
+
+
+def test_another_mount_makes_another_image(toy):
+    from mi_nerfattack.render.camera.intrinsics import CameraMount
+
+    loop, _ = toy.make_loop()
+    state = loop.initial(INITIAL)
+    before = loop.sensor.observe(state, 0).image.numpy().copy()
+    loop.sensor.mount = CameraMount(height_m=1.6, forward_m=0.3, pitch_deg=4.0)
+    assert np.abs(loop.sensor.observe(state, 0).image.numpy() - before).max() > 0.01
+
+
+def test_kept_backgrounds_are_not_rendered_again(toy):
+    loop, _ = toy.make_loop()
+    rollout = make_rollout(toy, loop, 3, adjoint="kept_backgrounds")
+    evaluation = rollout.run(loop.initial(INITIAL))
+    kept = evaluation.trajectory.kept
+    bytes_kept = sum(
+        4 * dr.width(array)
+        for march, _ in kept
+        for array in (*march.radiance, march.opacity, march.moment)
+    )
+    assert bytes_kept == 3 * toy.WIDTH * toy.HEIGHT * 20  # as its docstring says
+    before = loop.sensor.renders
+    rollout.gradient(evaluation)
+    assert loop.sensor.renders == before
+
+
+def test_sensors_die_safely_while_others_record(toy):
+    """Dr.Jit aborts when a recording is destroyed while another is made."""
+    before = gc.get_threshold()
+    gc.set_threshold(1)
+    try:
+        for _ in range(4):
+            loop, _ = toy.make_loop()
+            loop.sensor.cycle = loop.sensor  # only the collector can free it
+            gradient(make_rollout(toy, loop, 1))
+    finally:
+        gc.set_threshold(*before)

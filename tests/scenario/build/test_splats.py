@@ -1,0 +1,201 @@
+"""Splats in scene files and in scenario files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import small_fields as small
+from helpers import splat_files as made
+
+from mi_nerfattack.backend.colour import srgb_to_linear_numpy
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import save_field
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+BLUE = np.array([0.1, 0.3, 0.9])
+DENSITY, RAW = 0.7, 0.3
+COLOUR = float(small.sigmoid_to_linear(np.array(RAW)))
+CUBE_OPACITY = 1 - np.exp(-2 * DENSITY)
+
+# The integrator
+
+
+@pytest.fixture
+def paths(tmp_path: Path, variant: str) -> dict[str, str]:
+    """Files of a wall at x = 0 and of the cube."""
+    save_field(tmp_path / "cube.safetensors", small.homogeneous(DENSITY, RAW))
+    made.write_ply(tmp_path / "wall.ply", made.columns(made.wall(0, step=0.3, half=9)))
+    return {name: str(tmp_path / name) for name in ("cube.safetensors", "wall.ply")}
+
+
+def scene(paths: dict[str, str], shift: float, **more: Any) -> Any:
+    """Load the wall at x = -4 and the cube at x = shift, seen from x = 6."""
+    at = mi.ScalarTransform4f().translate
+    integrator = {
+        "type": "field_integrator",
+        "composite": "depth",
+        "street": {
+            "type": "splat_background",
+            "filename": paths["wall.ply"],
+            "to_world": at([-4, 0, 0]),
+        },
+        "object": {
+            "type": "grid_field",
+            "filename": paths["cube.safetensors"],
+            "to_world": at([shift, 0, 0]),
+        },
+    }
+    integrator |= more.pop("integrator", {})
+    view = mi.ScalarTransform4f().look_at([6, 0, 0], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 9, "height": 9, "rfilter": {"type": "box"}}
+    camera = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
+    return mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": camera, **more},
+        parallel=False,
+    )
+
+
+def named(image: Any, world: Any) -> dict[str, np.ndarray]:
+    """Split an image into channels by name."""
+    names = ["R", "G", "B", *world.integrator().aov_names()]
+    return dict(zip(names, np.moveaxis(image.numpy(), -1, 0), strict=True))
+
+
+@pytest.mark.parametrize("shift", [0.0, -20.0])
+def test_an_image_shows_both_by_depth(paths, shift: float) -> None:
+    world = scene(paths, shift)
+    channels = named(mi.render(world, spp=4), world)
+    assert world.integrator().aov_names()[2:7] == [f"street.{c}" for c in "RGBAZ"]
+    back = srgb_to_linear_numpy(BLUE)
+    a = CUBE_OPACITY if shift == 0 else 0.0
+    for name, colour in zip("RGB", back, strict=True):
+        expected = a * COLOUR + (1 - a) * colour
+        assert channels[name][4, 4] == pytest.approx(expected, abs=5e-4)
+        assert channels[name][0, 0] == pytest.approx(colour, abs=5e-4)
+    assert channels["opacity"][4, 4] == pytest.approx(1, abs=2e-3)
+    assert channels["street.Z"][4, 4] == pytest.approx(10, rel=1e-2)
+
+
+def test_surfaces_end_the_march(paths) -> None:
+    at = mi.ScalarTransform4f().translate([4, 0, 0])
+    screen = at @ mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale(0.2)
+    world = scene(paths, 0.0, screen={"type": "rectangle", "to_world": screen})
+    channels = named(mi.render(world, spp=1), world)
+    assert channels["opacity"][4, 4] == 0  # behind the rectangle
+    assert channels["opacity"][4, 0] == pytest.approx(1, abs=2e-3)
+
+
+def test_a_texture_in_front_of_splats_has_a_gradient(paths) -> None:
+    world = scene(paths, 0.0)
+    params = mi.traverse(world)
+    (key,) = [key for key in params.keys() if key.endswith("texture")]
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(world, params, spp=1)
+    dr.backward(dr.sum(image[..., 0]))
+    assert float(np.abs(dr.grad(params[key]).numpy()).max()) > 0
+
+
+def test_every_variant_shows_splats(paths, each_variant: str) -> None:
+    world = scene(paths, -20.0)
+    image = mi.render(world, spp=64)  # every pixel shows the wall
+    back = srgb_to_linear_numpy(BLUE)
+    if image.shape[2] == 1 + len(world.integrator().aov_names()):
+        expected = [float(np.dot(back, [0.212671, 0.715160, 0.072169]))]
+    else:
+        expected = back.tolist()
+    mean = image.numpy().mean((0, 1))[: len(expected)]
+    np.testing.assert_allclose(mean, expected, atol=8e-3)
+
+
+def test_what_cannot_be_shown_is_refused(paths) -> None:
+    with pytest.raises(RuntimeError, match="wall.ply: .* set composite to depth"):
+        scene(paths, 0.0, integrator={"composite": "interleaved"})
+    lit = {"type": "grid_field", "filename": paths["cube.safetensors"], "relit": True}
+    with pytest.raises(RuntimeError, match="wall.ply: .* set relit to false"):
+        scene(paths, 0.0, integrator={"object": lit})
+    data = mi.TensorXf([[0, 0, 0, 1, 1, 1, 0, 0, 0, 1]])
+    world = scene(paths, 0.0, dots={"type": "ellipsoids", "data": data})
+    with pytest.raises(InputError, match="dots: .* nest a splat_background"):
+        world.integrator().render(world, spp=1)
+    splat = {"type": "splat_background", "filename": paths["wall.ply"]}
+    with pytest.raises(RuntimeError, match="cannot use the nested SplatBackground"):
+        more = {"type": "grid_field", "filename": paths["cube.safetensors"]}
+        mi.load_dict({"type": "field_emitter", "a": more, "b": splat})
+    with pytest.raises(RuntimeError, match="is no medium"):
+        mi.load_dict({"type": "heterogeneous", "sigma_t": splat})
+    shear = mi.ScalarTransform4f().scale([1, 2, 1])
+    with pytest.raises(RuntimeError, match="to_world"):
+        mi.load_dict(splat | {"to_world": shear})
+
+
+# The scenario
+
+SCENARIO = """\
+name = "splats"
+[scene]
+field = "wall.ply"
+to_world = [[2, 0, 0, 9], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
+deployment = "deployment.xml"
+routes = "routes.json"
+route = "line"
+[[objects]]
+id = "cube"
+field = "cube.safetensors"
+position_m = [5.0, 0.0, 1.0]
+[policy]
+file = "policy.safetensors"
+[camera]
+width = 12
+height = 6
+"""
+
+
+@pytest.fixture
+def build(paths):
+    """Return a function that builds the world of a scenario text."""
+    from mi_nerfattack.scenario.build.world import build_world
+    from mi_nerfattack.scenario.scenario import load_scenario
+
+    folder = Path(paths["wall.ply"]).parent
+    points = [[-20.0, 0.0], [60.0, 0.0]]
+    route = {"goal": 0, "lane_width_m": 3.5, "speed_ms": 5.0, "points_m": points}
+    (folder / "routes.json").write_text(json.dumps({"line": route}))
+    body = '<integrator type="path"/><shape type="rectangle"/>'
+    (folder / "deployment.xml").write_text(f'<scene version="3.0.0">{body}</scene>')
+
+    def inner(text: str) -> Any:
+        path = folder / "scenario.toml"
+        path.write_text(text)
+        return build_world(load_scenario(path)[0], folder, None)
+
+    return inner
+
+
+def test_a_scenario_drives_among_splats(build) -> None:
+    from mi_nerfattack.vehicle.state import to_state
+
+    sensor = build(SCENARIO).surrogate
+    seen = sensor.observe(to_state(np.zeros((1, 3))), 0).seen
+    depth = seen.layers[0].depth.numpy().reshape(6, 12)  # the wall at x = 9
+    ahead = np.cos(np.arctan(1 / 12)) * np.cos(np.radians(6) - np.arctan(1 / 12))
+    assert depth[2, 6] == pytest.approx((9 - 0.5) / ahead, rel=0.02)
+
+
+def test_scenarios_with_splats_refuse_what_they_cannot_do(build) -> None:
+    with pytest.raises(InputError, match="wall.ply: .* set attack.attached to false"):
+        build(SCENARIO + "[attack]\nattached = true\n")
+    text = SCENARIO.replace("[scene]", '[scene]\ncomposite = "interleaved"')
+    with pytest.raises(InputError, match="wall.ply: .* set composite to depth"):
+        build(text)
+    with pytest.raises(InputError, match="scene.to_world: .*expected a 3x3 rotation"):
+        build(SCENARIO.replace("[[2, 0", "[[3, 0"))
+    with pytest.raises(InputError, match=r"scenario.toml:4: scene.to_world"):
+        build(SCENARIO.replace("[[2, 0", '[["2", 0'))

@@ -1,0 +1,271 @@
+"""The scenario file: defaults, refusals with lines, paths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io.resumable import differences
+from mi_nerfattack.scenario.scenario import (
+    load_scenario,
+    portable_text,
+    replace_objects,
+    resolve,
+)
+
+MINIMAL = """\
+name = "test"
+[scene]
+field = "scene.safetensors"
+deployment = "bundled:intersection/scene.xml"
+routes = "routes.json"
+route = "right"
+
+[[objects]]
+id = "hydrant"
+field = "object.safetensors"
+position_m = [1.0, 2.0, 0.0]
+
+[[objects]]
+id = "second"
+field = "object.safetensors"
+position_m = [1.0, 2.0, 0.0]
+scale = 2.0
+
+[policy]
+file = "policy.safetensors"
+[attack]
+iterations = 3
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def inner(text):
+        path = tmp_path / "scenario.toml"
+        path.write_text(text)
+        return path
+
+    return inner
+
+
+def test_defaults_and_text(write):
+    scenario, text = load_scenario(write(MINIMAL))
+    assert text == MINIMAL
+    assert scenario.attack.iterations == 3
+    assert scenario.camera.width == 200 and scenario.camera.height == 66
+    assert [item.scale for item in scenario.objects] == [1.0, 2.0]
+
+
+def test_digest_tells_scenarios_apart(write):
+    folder = write(MINIMAL).parent
+    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
+        (folder / name).write_bytes(name.encode())
+    (folder / "routes.json").write_text("{}")
+
+    def digest(text):
+        return load_scenario(write(text))[0].digest(folder)
+
+    first = digest(MINIMAL)
+    assert first == digest("# remark\n" + MINIMAL)
+    assert first == digest(portable_text(MINIMAL, folder))
+    assert first != digest(MINIMAL.replace("= 3", "= 4"))
+    (folder / "policy.safetensors").write_bytes(b"another policy")
+    assert first != digest(MINIMAL)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("iterations = 3", "iteratons = 3", 22, ["iteratons", "unknown", "iterations"]),
+        ("iterations = 3", "iterations = 0", 22, ["iterations", "0"]),
+        ("iterations = 3", 'iterations = "3"', 22, ["iterations"]),
+        ("scale = 2.0", "scale = -2.0", 17, ["scale", "-2"]),
+        ("scale = 2.0", "scale = nan", 17, ["scale"]),
+        ('route = "right"\n', "", 2, ["route", "required"]),
+        ("[policy]", "[polisy]", 19, ["polisy"]),
+        ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
+        ("[attack]", "[attack", None, ["scenario.toml"]),
+        ("[attack]", "[attack]\nsegment = 8", 22, ["segment", "checkpointed"]),
+        ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
+        (
+            "[attack]",
+            '[attack]\nparameters = "pose"\nlearning_rate = 0.1',
+            23,
+            ["learning_rate", "pose"],
+        ),
+        ("[attack]", "[vehicle]\nwheelbase_m = 3.0\n[attack]", 22, ["ackermann"]),
+        (
+            "[attack]",
+            '[vehicle]\nmodel = "bicycle"\nmax_heading_rate = 3.0\n[attack]',
+            23,
+            ["max_heading_rate", "dubins"],
+        ),
+        (
+            "[attack]",
+            "[drive]\ncovariance = [[1, 0, 0], [0, 1, 0.5], [0, 0, 1]]\n[attack]",
+            22,
+            ["covariance", "symmetric"],
+        ),
+        (
+            "[attack]",
+            "[drive]\ncovariance = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]\n[attack]",
+            22,
+            ["covariance", "eigenvalue -1;"],
+        ),
+        (
+            "[attack]",
+            "[drive]\nlateral_sd_m = 0.2\ncovariance = [[1, 0, 0], [0, 1, 0], "
+            "[0, 0, 1]]\n[attack]",
+            23,
+            ["covariance", "lateral_sd_m"],
+        ),
+    ],
+)
+def test_errors_name_key_and_line(write, old, new, line, words):
+    path = write(MINIMAL.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_scenario(path)
+    message = str(caught.value)
+    assert str(path) in message
+    for word in words:
+        assert word in message
+    if line is not None:
+        assert f"{path}:{line}" in message
+
+
+def test_a_wrong_object_is_one_problem(write):
+    text = MINIMAL.replace("position_m = [1.0, 2.0, 0.0]\nscale", "scale")
+    first = MINIMAL.index("[[objects]]")
+    text = text[:first] + text[text.index("[[objects]]", first + 1) :]
+    with pytest.raises(InputError, match=r"objects.0.position_m: [^\n]*$") as caught:
+        load_scenario(write(text))
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(InputError, match="absent.toml"):
+        load_scenario(tmp_path / "absent.toml")
+
+
+def test_resolve(tmp_path):
+    assert resolve("a/b", tmp_path) == tmp_path / "a/b"
+    assert resolve(str(tmp_path / "c"), "elsewhere") == tmp_path / "c"
+    assert resolve("bundled:intersection/routes.json", tmp_path).is_file()
+    with pytest.raises(InputError, match="bundled"):
+        resolve("bundled:nothing.toml", tmp_path)
+
+
+def test_text_of_a_run_replays_anywhere(write, tmp_path):
+    path = write(MINIMAL)
+    scenario, text = load_scenario(path)
+    scenario, text = replace_objects(scenario, text, tmp_path / "mine.safetensors")
+    portable = tmp_path / "elsewhere" / "scenario.toml"
+    portable.parent.mkdir()
+    portable.write_text(portable_text(text, path.parent))
+    again, _ = load_scenario(portable)
+    mine = str(tmp_path / "mine.safetensors")
+    assert [item.field for item in again.objects] == [mine, mine]
+    assert [item.field for item in scenario.objects] == [mine, mine]
+    assert again.scene.field == str(tmp_path / "scene.safetensors")
+    assert again.scene.deployment == "bundled:intersection/scene.xml"
+    assert again.policy.file == str(tmp_path / "policy.safetensors")
+
+
+def test_quotes_in_paths_survive():
+    text = """field = "it's/x.st"\nfile = 'a "b".st'\n"""
+    lines = portable_text(text, "/base").splitlines()
+    assert lines[0] == """field = "/base/it's/x.st\""""
+    assert lines[1] == 'file = "/base/a \\"b\\".st"'
+
+
+@pytest.mark.parametrize("rank", [1, 3])
+def test_initial_poses_scatter_by_the_covariance(write, rank):
+    from mi_nerfattack.scenario.build.world import initial_states
+    from mi_nerfattack.vehicle.route.route import Route
+
+    root = np.random.default_rng(0).normal(size=(3, rank)) * [[0.5], [0.2], [0.02]]
+    wanted = root @ root.T
+    text = f"[drive]\ncovariance = {wanted.tolist()}\n[attack]"
+    scenario, _ = load_scenario(write(MINIMAL.replace("[attack]", text)))
+    route = Route("north", 0, np.array([[2.0, 1.0], [2.0, 9.0], [4.0, 20.0]]))
+    states = initial_states(scenario, route, 20001, 0)
+    np.testing.assert_allclose(states[0], [2.0, 1.0, np.pi / 2])
+    # along the lane is +y, to the left of it -x
+    shifts = (states[1:] - states[0])[:, [1, 0, 2]] * [1, -1, 1]
+    deviation = np.sqrt(wanted.diagonal())
+    scale = np.outer(deviation, deviation)
+    np.testing.assert_allclose(np.cov(shifts.T) / scale, wanted / scale, atol=0.04)
+    np.testing.assert_allclose(shifts.mean(axis=0) / deviation, 0, atol=0.04)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ('[policy]\nfile = "policy.safetensors"\n', "", 1),
+        ('file = "policy.safetensors"', '"file" = "policy.safetensors"', 20),
+        ('file = "policy.safetensors"', 'file = """\npolicy.safetensors"""', 21),
+        ('name = "test"', 'name = """\nfield = "x"\n"""', None),
+    ],
+)
+def test_files_that_could_not_be_made_absolute_are_refused(write, old, new, line):
+    """They would be looked for beside the scenario.toml of the run folder."""
+    text = MINIMAL.replace(old, new)
+    if not new:
+        text = 'policy = { file = "policy.safetensors" }\n' + text
+    with pytest.raises(InputError, match="on a line of its own") as caught:
+        load_scenario(path := write(text))
+    assert f"{path}:{line or ''}" in str(caught.value)
+
+
+def test_a_dotted_key_is_refused(write):
+    text = 'policy.file = "policy.safetensors"\n' + MINIMAL.replace(
+        '[policy]\nfile = "policy.safetensors"\n', ""
+    )
+    with pytest.raises(
+        InputError, match=r"toml:1: policy\.file: .*under the \[section\]"
+    ):
+        load_scenario(write(text))
+
+
+def test_escapes_in_paths_survive(write, tmp_path):
+    text = MINIMAL.replace("object.safetensors", r"it\u0073 \"ö\".st")
+    scenario, text = load_scenario(write(text))
+    portable = tmp_path / "elsewhere.toml"
+    portable.write_text(portable_text(text, tmp_path))
+    again, _ = load_scenario(portable)
+    wanted = str(tmp_path / 'its "ö".st')
+    assert [item.field for item in again.objects] == [wanted, wanted]
+    changed, text = replace_objects(scenario, text, tmp_path / "mine")
+    portable.write_text(text)
+    assert load_scenario(portable)[0].objects == changed.objects
+
+
+def test_module_of_a_vehicle_counts_with_its_source(write, tmp_path, monkeypatch):
+    package = tmp_path / "cars_of_this_test"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise AssertionError('was imported')")
+    source = package / "slow.py"
+    source.write_text("speed = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    vehicle = '[vehicle]\nmodel = "custom"\ncontrol_limit = 1.0\nfunction = '
+    folder = write("").parent
+    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
+        (folder / name).write_bytes(name.encode())
+    (folder / "routes.json").write_text("{}")
+
+    def identity(reference):
+        text = MINIMAL.replace("[attack]", f'{vehicle}"{reference}"\n[attack]')
+        return load_scenario(write(text))[0].identity(folder)
+
+    before = identity("cars_of_this_test.slow:car")
+    assert before == identity("cars_of_this_test.slow:car")
+    source.write_text("speed = 2")
+    assert differences(before, identity("cars_of_this_test.slow:car")) == [
+        "scenario.vehicle.function: the content of cars_of_this_test.slow:car has "
+        "changed"
+    ]
+    identity("cars_of_this_test.absent:car")  # refused later, where it is imported
+    identity("absent_package.absent:car")
+    identity("math.absent:car")

@@ -1,0 +1,163 @@
+"""Collection by several processes, killed and continued."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from helpers.roadside import PaintedSite, bent, small, straight
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.system import workers
+from mi_nerfattack.system.workers import AbstractWork, InThisProcess, Processes
+from mi_nerfattack.training.collect import CollectSettings, collect
+from mi_nerfattack.training.sources import Scattered
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SCRIPT = """
+import mi_nerfattack
+from tests.training.test_collect_workers import settings
+from helpers.roadside import PaintedSite, bent, straight
+from mi_nerfattack.training.collect import collect
+from mi_nerfattack.training.sources import Scattered
+from mi_nerfattack.system.workers import Processes
+
+if __name__ == "__main__":
+    site = PaintedSite(delay_s=0.3)
+    routes = [straight(), bent()]
+    collect(site, routes, Scattered(), settings(), {folder!r}, Processes(2))
+"""
+
+
+def settings() -> CollectSettings:
+    return small(frames=240)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def is_alive(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_killed_collection_continues_without_gaps_or_duplicates(tmp_path):
+    routes = [straight(), bent()]
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    collect(PaintedSite(), routes, Scattered(), settings(), whole, InThisProcess())
+    script = tmp_path / "run.py"
+    script.write_text(SCRIPT.format(folder=str(part)))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, str(script)], env=environment)
+    deadline = time.monotonic() + 120
+    while len(list(part.rglob("shard.json"))) < 3 and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    children = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
+    )
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    pids = [int(pid) for pid in children.stdout.split()]
+    while any(is_alive(pid) for pid in pids):  # they notice that it has gone
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    done = len(list(part.rglob("shard.json")))
+    assert 3 <= done < settings().shards
+    collect(PaintedSite(), routes, Scattered(), settings(), part, InThisProcess())
+    for path in part.rglob(".*.tmp"):  # of the killed writers
+        path.unlink()
+    assert contents(part) == contents(whole)
+
+
+STARTING = """
+if __name__ == "__mp_main__":  # what a process imports before it works
+    import pathlib, time
+    pathlib.Path("started").touch()
+    time.sleep(60)
+
+from tests.training.test_collect_workers import Piece
+from mi_nerfattack.system.workers import Processes
+
+if __name__ == "__main__":
+    try:
+        Processes(2).run(Piece(None), range(2), print)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs process groups")
+def test_ctrl_c_while_workers_start_is_told_once(tmp_path):
+    """A terminal sends it to all processes."""
+    (tmp_path / "run.py").write_text(STARTING)
+    process = subprocess.Popen(
+        [sys.executable, "run.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "started").exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.communicate(timeout=30) == ("interrupted\n", "")
+
+
+@dataclass(frozen=True)
+class Piece(AbstractWork):
+    """Ends its process at piece 2, or raises there."""
+
+    code: int | None
+
+    def open(self):
+        return self.code
+
+    def do(self, opened, index, report):
+        report(1)
+        if index == 2 and opened is not None:
+            os.kill(os.getpid(), opened)
+        if index == 2:
+            raise InputError("piece two: is wrong; take another")
+
+    def close(self, opened):
+        pass
+
+
+def test_a_dead_worker_is_told():
+    with pytest.raises(InputError, match=r"ended by signal 9 in piece 2; it may have"):
+        Processes(1).run(Piece(signal.SIGKILL), range(8), lambda units: None)
+
+
+def test_an_error_in_a_worker_is_the_callers():
+    with pytest.raises(InputError, match="piece two: is wrong"):
+        Processes(1).run(Piece(None), range(8), lambda units: None)
+
+
+@pytest.mark.parametrize("count", [0, 1000, 1.5])
+def test_number_of_workers_is_checked(count):
+    with pytest.raises(InputError, match="workers"):
+        Processes(count)
+
+
+def test_a_large_machine_has_as_many_workers_as_are_allowed(monkeypatch):
+    monkeypatch.setattr(workers, "cores", lambda: 384)
+    assert Processes().count == 256

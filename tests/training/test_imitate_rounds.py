@@ -1,0 +1,104 @@
+"""Rounds of an imitation: who drives where, and which rows are never trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from helpers.roadside import PaintedSite, bent, small, straight
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.training import imitate as module
+from mi_nerfattack.training.dataset import FrameDataset
+from mi_nerfattack.training.imitate import imitate
+from mi_nerfattack.training.record import training_record
+from mi_nerfattack.training.settings import ImitationSettings
+from mi_nerfattack.training.train import TrainSettings, fit_policy
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SITE = PaintedSite("mitsuba", size_px=(200, 66))
+HERE = InThisProcess()
+ROUTES = [straight(), bent()]
+DRIVE = EvaluateSettings(runs=1, objects=0, horizon=2)
+SETTINGS = ImitationSettings(
+    frames={"mitsuba": 48},
+    dagger_frames={"mitsuba": 24},
+    dagger_rounds=2,
+    dagger_epochs=1,
+    horizon=4,
+    collecting=small(shard=4),
+    training=TrainSettings(epochs=1, batch=64, held_out=0.3),
+    validation=DRIVE,
+    final=DRIVE,
+)
+
+
+@pytest.fixture
+def rounds(monkeypatch) -> list[tuple[FrameDataset, FrameDataset]]:
+    """Data of every training and of its held-out loss."""
+    seen = []
+
+    def fit(module, data, *arguments, held_out, **keywords):
+        seen.append((data, held_out))
+        return fit_policy(module, data, *arguments, held_out=held_out, **keywords)
+
+    monkeypatch.setattr(module, "fit_policy", fit)
+    return seen
+
+
+def rows(data: FrameDataset) -> set[tuple[bytes, float]]:
+    frames = data.read_frames(np.arange(len(data)))[:, 0, 0]
+    return {(f.tobytes(), c) for f, c in zip(frames, data.controls, strict=True)}
+
+
+def test_rows_that_are_held_out_are_never_trained_on(rounds, tmp_path):
+    result = imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE)
+    assert len(rounds) == 3
+    trained = set().union(*(rows(data) for data, _ in rounds))
+    for number, (data, held) in enumerate(rounds):
+        assert len(data) + len(held) == 48 + 24 * number
+        assert not trained & rows(held)
+    # a row that was held out stays so
+    assert rows(rounds[0][1]) <= rows(rounds[2][1])
+    assert len(rounds[0][1]) >= 4
+    assert len(result.shards) == (48 + 24 + 24) // 4
+
+
+def test_rounds_of_other_seeds_have_other_frames(tmp_path):
+    frames, order = {}, {}
+    for seed in (0, 1):
+        settings = dataclasses.replace(SETTINGS, seed=seed, dagger_rounds=1)
+        imitate([SITE], ROUTES, settings, tmp_path / f"{seed}", HERE)
+        for number in (0, 1):
+            name = tmp_path / f"{seed}" / f"round_{number}" / "mitsuba/manifest.json"
+            frames[seed, number] = files.read_json(name)["settings"]["seed"]
+            path = tmp_path / f"{seed}" / f"checkpoint_{number}.safetensors"
+            about = json.loads(files.read_safetensors(path)[1]["run"])
+            order[seed, number] = about["settings"]["seed"]
+    assert len(set(frames.values())) == len(set(order.values())) == 4
+
+
+def test_weights_to_start_with_are_not_those_of_the_run_before(tmp_path):
+    settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
+    imitate([SITE], ROUTES, settings, tmp_path, HERE)
+    with pytest.raises(InputError, match=r"checkpoint_0.*data \(start\); remove it"):
+        imitate([SITE], ROUTES, settings, tmp_path, HERE, start=PilotNet(2))
+
+
+def test_frames_of_rounds_that_are_left_out_are_not_recorded(tmp_path):
+    imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE)
+    fewer = dataclasses.replace(SETTINGS, dagger_rounds=1)
+    result = imitate([SITE], ROUTES, fewer, tmp_path / "data", HERE)
+    record = training_record(fewer, [SITE], tmp_path / "data", result.shards, "train")
+    assert record["data"] == {"round_0/mitsuba": 48, "round_1/mitsuba": 24}
+    elsewhere = training_record(fewer, [SITE], tmp_path, result.shards[:1], "train")
+    assert elsewhere["data"] == {"data/round_0/mitsuba": 4}
+    other = training_record(fewer, [SITE], tmp_path / "b", result.shards[:1], "train")
+    assert other["data"] == {"earlier/mitsuba": 4}

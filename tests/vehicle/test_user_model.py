@@ -1,0 +1,395 @@
+"""Vehicle models of the user's own, in Dr.Jit and in torch, and their scenario keys."""
+
+from __future__ import annotations
+
+import doctest
+
+import drjit as dr
+import numpy as np
+import pytest
+import torch
+from helpers import analytic_loop as analytic
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.scenario.build.vehicle import build_dynamics, build_integrator
+from mi_nerfattack.scenario.scenario import load_scenario, portable_text
+from mi_nerfattack.scenario.sections import VehicleSection
+from mi_nerfattack.vehicle import (
+    RK4,
+    Ackermann,
+    Dubins,
+    ExplicitEuler,
+    FunctionDynamics,
+    ImplicitMidpoint,
+    KinematicBicycle,
+    RateLimitedAckermann,
+    user_model,
+)
+from mi_nerfattack.vehicle.torch_model import TorchDynamics
+from mi_nerfattack.vehicle.trial import require_model
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LAG = RateLimitedAckermann(4.0, 2.5, 0.6, 0.9, 0.15)
+FILE = """
+import drjit as dr
+import torch
+
+def car(state, control):
+    _, _, theta, speed = state
+    return speed * dr.cos(theta), speed * dr.sin(theta), control, 8 - speed
+
+def torch_car(state, control):
+    _, _, theta, speed = state.unbind(1)
+    rows = speed * theta.cos(), speed * theta.sin(), control, 8 - speed
+    return torch.stack(rows, 1)
+
+def constant(state, control):
+    return state[0], state[1], control, 8 - dr.detach(state[3])
+
+def torch_constant(state, control):
+    return torch.cat([state[:, :2], control[:, None], -state[:, 3:].detach()], 1)
+
+def mean(state, control):
+    return state[0], state[1], control, dr.mean(state[3])
+
+def root(state, control):
+    return state[0], state[1], control, dr.sqrt(state[3] - 9)
+
+def steep(state, control):
+    return torch.cat([state[:, :2], control[:, None], (0 * state[:, 3:]).sqrt()], 1)
+
+def fails(state, control):
+    raise KeyError("wheel")
+
+number = 3
+"""
+
+
+def rows64(values):
+    return [dr.llvm.ad.Float64(item) for item in np.asarray(values, float).tolist()]
+
+
+def state64(values):
+    rows = rows64(values)
+    return (dr.llvm.ad.Array3f64 if len(rows) == 3 else dr.llvm.ad.ArrayXf64)(*rows)
+
+
+def lag_in_drjit(state, control):
+    wanted = (control - state[3]) / 0.15 / 0.9
+    rate = 0.9 * wanted / (1 + wanted**8) ** 0.125
+    sin, cos = dr.sincos(state[2])
+    return [4 * cos, 4 * sin, 4 / 2.5 * dr.tan(state[3]), rate]
+
+
+OWN = {
+    "drjit": FunctionDynamics(lag_in_drjit, 4, 0.6),
+    "torch": TorchDynamics(analytic.TORCH_VEHICLES["ackermann_rate"], 4, 0.6),
+}
+
+
+@pytest.mark.parametrize("framework", OWN)
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("integrator", [ExplicitEuler(), RK4(), ImplicitMidpoint()])
+def test_own_model_equals_ours(framework, count, integrator):
+    """Steps, and their derivatives in both modes."""
+    rng, own = np.random.default_rng(1), OWN[framework]
+    x, t_x, weight = rng.normal(size=(3, 4, count)) * 0.4
+    u, t_u = rng.normal(size=(2, count)) * 0.4
+
+    def products(dynamics):
+        start, control = state64(x), rows64([u])[0]
+        dr.enable_grad(start, control)
+        end = integrator.step(dynamics, start, dynamics.saturate(control), 0.1)
+        integrator.check(dynamics, start, end, dynamics.saturate(control), 0.1)
+        value = end.numpy().copy()
+        dr.backward(dr.sum(dr.sum(end * state64(weight), axis=0)))
+        reverse = dr.grad(start).numpy().copy(), dr.grad(control).numpy().copy()
+        start, control = state64(x), rows64([u])[0]
+        dr.enable_grad(start, control)
+        end = integrator.step(dynamics, start, dynamics.saturate(control), 0.1)
+        dr.set_grad(start, state64(t_x))
+        dr.set_grad(control, rows64([t_u])[0])
+        return [value, *reverse, dr.forward_to(end).numpy().copy()]
+
+    for found, expected in zip(products(own), products(LAG), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
+    assert own.recordable == (framework == "drjit")
+
+
+@pytest.mark.parametrize("framework", OWN)
+def test_whole_loop_with_an_own_model(framework):
+    """The loop's gradient is autograd's through the whole of the loop in torch."""
+    ours, twin = analytic.make_pair("ackermann_rate", "rk4", 2, 1)
+    loop = ClosedLoop(
+        ours.sensor, ours.policy, 1, OWN[framework], RK4(), 0.1, substeps=2, delay=1
+    )
+    poses = analytic.random_poses(3)
+    initial = torch.tensor(OWN[framework].extend(poses), requires_grad=True)
+    texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)
+    states, _ = twin.drive(initial, [texture], 6, True)
+    cost = (states[:, 1:, 1] ** 2).sum(1).mean()
+    expected = torch.autograd.grad(cost, [texture, initial])
+    rollout = Rollout(loop, StageSum(lambda x: x[1] * x[1]), 6, attached=True)
+    evaluation = rollout.run(loop.initial(poses))
+    gradient = rollout.gradient(evaluation)
+    assert evaluation.value == pytest.approx(cost.item(), rel=1e-11)
+    np.testing.assert_allclose(
+        gradient.textures[0].numpy(), expected[0], rtol=1e-8, atol=1e-10
+    )
+    np.testing.assert_allclose(
+        gradient.initial.numpy().T, expected[1], rtol=1e-8, atol=1e-10
+    )
+
+
+def test_example_of_the_docstring():
+    assert doctest.testmod(user_model).failed == 0
+
+
+def test_single_precision_in_torch():
+    own = TorchDynamics(lambda x, u: torch.stack([x[:, 0], x[:, 1], u], 1))
+    state = dr.llvm.ad.Array3f(1, 2, dr.llvm.ad.Float(3, 4))
+    found = own.derivative(state, dr.llvm.ad.Float(0.5, 0.25))
+    assert type(found) is type(state)
+    np.testing.assert_array_equal(found.numpy(), [[1, 1], [2, 2], [0.5, 0.25]])
+
+
+def test_numbers_and_single_rows_are_taken():
+    own = FunctionDynamics(lambda x, u: (1.5, dr.cos(x[2]), u))
+    found = own.derivative(state64(np.zeros((3, 4))), rows64([[1, 2, 3, 4]])[0])
+    np.testing.assert_array_equal(found.numpy(), [[1.5] * 4, [1.0] * 4, [1, 2, 3, 4]])
+
+
+@pytest.mark.parametrize("kind", [FunctionDynamics, TorchDynamics])
+def test_initial_values_of_other_rows(kind):
+    poses = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(
+        kind(len, 5, 1.0, (7.0, 8.0)).extend(poses), np.c_[poses, [[7, 8], [7, 8]]]
+    )
+    np.testing.assert_array_equal(kind(len, 4).extend(poses), np.c_[poses, [0, 0]])
+    np.testing.assert_array_equal(kind(len).extend(poses), poses)
+
+
+@pytest.mark.parametrize("kind", [FunctionDynamics, TorchDynamics])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((2,), r"size: 2; at least 3"),
+        ((3, 0.0), r"limit: 0.0"),
+        ((3, 1.0, (1.0,)), r"rest: .*; 0 finite"),
+        ((5, 1.0, (1.0,)), r"rest: .*; 2 finite"),
+        ((4, 1.0, (float("nan"),)), r"rest: \(nan,\)"),
+    ],
+)
+def test_own_models_reject_parameters(kind, arguments, words):
+    with pytest.raises(InputError, match=f"{kind.__name__}.{words}"):
+        kind(len, *arguments)
+
+
+def call(own):
+    """Evaluate at three vehicles, differentiating by the control."""
+    x, u = state64(np.ones((own.state_size, 3))), rows64([[0.1, 0.2, 0.3]])[0]
+    dr.enable_grad(u)
+    dr.backward(dr.sum(dr.sum(own.derivative(x, u), axis=0)))
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        (lambda x, u: None, "returned NoneType; 3 rows"),
+        (lambda x, u: 5.0, "returned float"),
+        (lambda x, u: u, "returned Float64"),
+        (lambda x, u: [x[0], u], "returned 2 rows; 3 rows"),
+        (lambda x, u: np.zeros((3, 3)), r"returned ndarray of shape \(3, 3\)"),
+        (lambda x, u: ("a", u, u), r"rows \(str, Float64, Float64\)"),
+        (lambda x, u: (u, u, rows64([[1, 2]])[0]), r"rows of \[3, 3, 2\] entries"),
+        (lambda x, u: (x[0], x[1], dr.detach(u)), "no derivative by the control"),
+        (lambda x, u: x[7], r"raised \w+ in line \d+"),
+    ],
+)
+def test_what_a_function_must_not_return(returned, words):
+    message = rf"FunctionDynamics\(test_vehicle_user.py:<lambda>\): .*{words}"
+    with pytest.raises(InputError, match=message):
+        call(FunctionDynamics(returned))
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        (lambda x, u: None, r"returned NoneType; a tensor \(3, 3\)"),
+        (lambda x, u: x[:, :2], r"returned Tensor of shape \(3, 2\)"),
+        (lambda x, u: x / 0, r"gave \[inf, inf, inf\] for vehicle 0"),
+        (lambda x, u: x.detach(), "no derivative by the control"),
+        (lambda x, u: 2 * x, "no derivative by the control"),
+        (lambda x, u: x @ u, "returned Tensor of shape"),
+        (lambda x, u: x.wheel, "raised AttributeError in line"),
+    ],
+)
+def test_what_a_torch_function_must_not_return(returned, words):
+    message = rf"TorchDynamics\(test_vehicle_user.py:<lambda>\): .*{words}"
+    with pytest.raises(InputError, match=message):
+        call(TorchDynamics(returned))
+
+
+def test_states_that_are_not_finite_are_reported():
+    own = FunctionDynamics(lambda x, u: (x[0], x[1], u / (x[2] - 1)))
+    x, u = state64([[0.0, 0.0], [0.0, 0.0], [2.0, 1.0]]), rows64([[1.0, 1.0]])[0]
+    end = RK4().step(own, x, u, 0.1)
+    with pytest.raises(InputError, match=r"gave .*inf.* for vehicle 1"):
+        RK4().check(own, x, end, u, 0.1)
+    RK4().check(Dubins(), x, end, u, 0.1)  # ours cannot fail, so nobody waits
+
+
+def test_trial_does_not_mind_kinks():
+    own = FunctionDynamics(lambda x, u: (dr.abs(x[0]), dr.maximum(x[1], 0), u))
+    start = state64([[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    require_model("own", own, start, rows64([[0.1, 0.2]])[0])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "car.py").write_text(FILE)
+    return tmp_path
+
+
+def custom(name, **keys):
+    values = {"state_size": 4, "control_limit": 1.5, "rest_state": (5.0,), **keys}
+    return VehicleSection(model="custom", function=name, **values)
+
+
+def test_models_of_the_section():
+    default = VehicleSection()
+    assert build_dynamics(default) == Dubins(5.0, 1.5)
+    assert default.substeps == 1 and default.delay_steps == 0
+    assert build_integrator(default) == RK4()
+    degree = np.pi / 180
+
+    def build(model, **keys):
+        return build_dynamics(VehicleSection(model=model, speed_ms=4.0, **keys))
+
+    assert build("ackermann", wheelbase_m=2.0) == Ackermann(4.0, 2.0, 34 * degree)
+    assert build(
+        "ackermann_rate", max_steer_rate_deg_s=30.0, steer_time_s=0.2
+    ) == RateLimitedAckermann(4.0, 2.7, 34 * degree, 30 * degree, 0.2)
+    assert build(
+        "bicycle", front_axle_m=1.0, rear_axle_m=1.5, max_steer_deg=20.0
+    ) == KinematicBicycle(4.0, 1.0, 1.5, 20 * degree)
+
+
+@pytest.mark.parametrize(
+    ("name", "framework"), [("car", "drjit"), ("torch_car", "torch")]
+)
+def test_function_of_a_file(folder, name, framework):
+    dynamics = build_dynamics(custom(f"car.py:{name}", framework=framework), folder)
+    np.testing.assert_array_equal(dynamics.extend(np.zeros(3)), [[0, 0, 0, 5]])
+    slope = dynamics.derivative(state64([[0], [0], [0], [6]]), rows64([[0.5]])[0])
+    np.testing.assert_allclose(slope.numpy()[:, 0], [6, 0, 0.5, 2])
+    assert float(dynamics.saturate(rows64([[100.0]])[0])[0]) == pytest.approx(1.5)
+
+
+def test_function_of_a_module(folder, monkeypatch):
+    (folder / "own_cars.py").write_text(FILE)
+    monkeypatch.syspath_prepend(str(folder))
+    assert build_dynamics(custom("own_cars:car")).state_size == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "framework", "words"),
+    [
+        ("gone.py:car", "drjit", r"gone.py: does not exist"),
+        ("car.py:cart", "drjit", r"car.py: has no function 'cart'; it has car, "),
+        ("car.py:number", "drjit", r"has no function 'number'"),
+        ("no_such_package.cars:car", "drjit", r"No module named 'no_such_package'.*F"),
+        ("math:cart", "drjit", r"math has no function 'cart'"),
+        ("broken:car", "drjit", r"importing it raised ZeroDivisionError"),
+        ("broken.py:car", "drjit", r"broken.py: raised ZeroDivisionError"),
+        ("car.py:fails", "drjit", r"car.py:fails\): raised KeyError in line 30"),
+        ("car.py:torch_car", "drjit", r"torch_car\): raised AttributeError"),
+        ("car.py:car", "torch", r"car\): raised ValueError"),
+        ("car.py:constant", "drjit", r"row 3 .* no derivative by row 3 of the state"),
+        ("car.py:torch_constant", "torch", r"row 3 .* no derivative by row 3"),
+        ("car.py:mean", "drjit", r"vehicles must not mix"),
+        ("car.py:root", "drjit", r"gave .*nan"),
+        ("car.py:steep", "torch", r"derivative by row 3 of the state is .*nan"),
+    ],
+)
+def test_functions_that_are_refused(folder, monkeypatch, name, framework, words):
+    (folder / "broken.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(str(folder))
+    with pytest.raises(InputError, match=words):
+        build_dynamics(custom(name, framework=framework), folder)
+
+
+SCENARIO = """\
+name = "test"
+[scene]
+field = "a"
+deployment = "a"
+routes = "a"
+route = "right"
+[policy]
+file = "a"
+[[objects]]
+id = "one"
+field = "a"
+position_m = [1.0, 2.0, 0.0]
+[vehicle]
+model = "custom"
+function = "car.py:car"
+control_limit = 1.5
+state_size = 4
+rest_state = [5.0]
+"""
+
+
+def load(folder, text):
+    path = folder / "scenario.toml"
+    path.write_text(text)
+    return load_scenario(path)[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"custom"', '"dubins"', r":15: vehicle.function: has no meaning with model"),
+        ('function = "car.py:car"\n', "", r"vehicle.function: is missing; model"),
+        ("control_limit = 1.5\n", "", r"vehicle.control_limit: is missing"),
+        ("car.py:car", "car.py", r":15: vehicle.function: .*pattern"),
+        ("= 1.5", "= -1.5", r":16: vehicle.control_limit: "),
+        ("= 4", "= 2", r":17: vehicle.state_size: .*greater than or equal to 3"),
+        ("= 4", "= 5", r":18: vehicle.rest_state: has 1 numbers; .* needs 2 or none"),
+        ("[5.0]", "[5.0]\nsubsteps = 0", r":19: vehicle.substeps: "),
+        ("[5.0]", "[5.0]\ndelay_steps = -1", r":19: vehicle.delay_steps: "),
+        (
+            SCENARIO[SCENARIO.index("model") :],
+            'model = "ackermann_rate"\nsteer_time_s = 0.03\n',
+            r":15: vehicle.steer_time_s: .* diverge with rk4: .* raise substeps",
+        ),
+    ],
+)
+def test_section_is_checked(folder, old, new, words):
+    assert load(folder, SCENARIO).vehicle.rest_state == (5.0,)
+    with pytest.raises(InputError, match=words):
+        load(folder, SCENARIO.replace(old, new))
+
+
+def test_stiff_steering_is_taken_with_enough_substeps(folder):
+    head = SCENARIO[: SCENARIO.index("model")]
+    text = head + 'model = "ackermann_rate"\nsteer_time_s = 0.03\nsubsteps = 2\n'
+    assert load(folder, text).vehicle.substeps == 2
+
+
+def test_digest_and_text_follow_the_function(folder):
+    (folder / "a").write_text("a")
+    first = load(folder, SCENARIO).digest(folder)
+    text = portable_text(SCENARIO, folder)
+    assert str(folder / "car.py:car") in text
+    assert load(folder, text).digest(folder) == first
+    (folder / "car.py").write_text(FILE + "# changed\n")
+    assert load(folder, SCENARIO).digest(folder) != first
+    module = SCENARIO.replace("car.py:car", "own.cars:car")
+    assert portable_text(module, folder).count('"own.cars:car"') == 1
+    assert load(folder, module).digest(folder) != first
