@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.scenario.build.objective import build_reduction
 from mi_nerfattack.attack.freedom import Freedom
-from mi_nerfattack.scenario.build.world import World, initial_states
-from mi_nerfattack.rollout.adjoint import AbstractAdjoint, Checkpointed, KeptBackgrounds, Replay
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.rollout.adjoint import (
+    AbstractAdjoint,
+    Checkpointed,
+    KeptBackgrounds,
+    Replay,
+)
 from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.scenario.build.objective import build_reduction
+from mi_nerfattack.scenario.build.world import World, initial_states
 from mi_nerfattack.scenario.sections import AttackSection
 
 

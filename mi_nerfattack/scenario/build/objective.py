@@ -7,17 +7,29 @@ from pathlib import Path
 import numpy as np
 
 from mi_nerfattack.attack import weights
-from mi_nerfattack.attack.objectives import AbsoluteDeviation, CrossTrackDeviation, DepartureTime, HeadingDeviation, TargetDistance
+from mi_nerfattack.attack.objectives import (
+    AbsoluteDeviation,
+    CrossTrackDeviation,
+    DepartureTime,
+    HeadingDeviation,
+    TargetDistance,
+)
 from mi_nerfattack.attack.user_cost import UserCost
 from mi_nerfattack.rollout.drive import departure_limit
-from mi_nerfattack.vehicle.state import to_state
-from mi_nerfattack.rollout.objective import AbstractObjective, StageCost, StageSum, Terminal, WeightedSum
+from mi_nerfattack.rollout.objective import (
+    AbstractObjective,
+    StageCost,
+    StageSum,
+    Terminal,
+    WeightedSum,
+)
 from mi_nerfattack.rollout.reduction import AbstractReduction, CVaR, Mean, Worst
 from mi_nerfattack.scenario.scenario import Scenario, resolve
 from mi_nerfattack.scenario.sections import AbstractTerm, ObjectiveSection
 from mi_nerfattack.scenario.user_code import load_function, split_reference
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.state import to_state
 
 
 def build_objective(

@@ -9,10 +9,9 @@ from typing import Any
 
 import torch
 
-from mi_nerfattack.io import files
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
-from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported.load import load_exported, load_torchscript
@@ -20,7 +19,26 @@ from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal, NoGoal, OneHot
 from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.preprocess import AbstractStage, Crop, FractionalCrop, Normalise, Preprocess, Resize, ToLinear, antialias, area, bilinear, channels_first, channels_last, time_channels_last, time_first, to_bgr, to_grey, to_yuv
+from mi_nerfattack.policy.preprocess import (
+    AbstractStage,
+    Crop,
+    FractionalCrop,
+    Normalise,
+    Preprocess,
+    Resize,
+    ToLinear,
+    antialias,
+    area,
+    bilinear,
+    channels_first,
+    channels_last,
+    time_channels_last,
+    time_first,
+    to_bgr,
+    to_grey,
+    to_yuv,
+)
+from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.scenario import resolve
 from mi_nerfattack.scenario.sections import PolicySection, PreprocessSection
 from mi_nerfattack.scenario.user_code import load_function, split_reference

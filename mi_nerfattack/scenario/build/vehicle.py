@@ -6,15 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.vehicle.state import to_state
 from mi_nerfattack.scenario.scenario import VehicleSection, resolve
 from mi_nerfattack.scenario.user_code import import_function, load_function
+from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
-from mi_nerfattack.vehicle.user_model import FunctionDynamics
-from mi_nerfattack.vehicle.integrators import RK4, AbstractIntegrator, ExplicitEuler, ImplicitMidpoint
-from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
+from mi_nerfattack.vehicle.integrators import (
+    RK4,
+    AbstractIntegrator,
+    ExplicitEuler,
+    ImplicitMidpoint,
+)
+from mi_nerfattack.vehicle.state import to_state
 from mi_nerfattack.vehicle.trial import require_model
+from mi_nerfattack.vehicle.user_model import FunctionDynamics
 
 #: Vehicles with which a user's model is tried.
 TRIALS = 3
@@ -67,7 +72,9 @@ def _custom_dynamics(section: VehicleSection, base: str | Path) -> AbstractDynam
     if section.framework == "drjit":
         dynamics = FunctionDynamics(function, section.state_size, limit, rest)
     else:
-        from mi_nerfattack.vehicle.torch_model import TorchDynamics  # torch only if needed
+        from mi_nerfattack.vehicle.torch_model import (
+            TorchDynamics,  # torch only if needed
+        )
 
         dynamics = TorchDynamics(function, section.state_size, limit, rest)
     rng = np.random.default_rng(0)

@@ -10,12 +10,23 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mi_nerfattack.attack.objectives import AbsoluteDeviation, CrossTrackDeviation, DepartureTime, HeadingDeviation, TargetDistance
-from mi_nerfattack.scenario.build.objective import build_objective, build_reduction
+from mi_nerfattack.attack.objectives import (
+    AbsoluteDeviation,
+    CrossTrackDeviation,
+    DepartureTime,
+    HeadingDeviation,
+    TargetDistance,
+)
 from mi_nerfattack.attack.user_cost import UserCost
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.rollout.objective import StageSum, StateHistory, Terminal, WeightedSum
+from mi_nerfattack.rollout.objective import (
+    StageSum,
+    StateHistory,
+    Terminal,
+    WeightedSum,
+)
 from mi_nerfattack.rollout.reduction import CVaR, Mean, Worst
+from mi_nerfattack.scenario.build.objective import build_objective, build_reduction
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.vehicle import Dubins, Route
 

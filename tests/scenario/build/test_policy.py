@@ -17,9 +17,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.build.policy import load_policy, policy_kind
-from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.sections import PolicySection
 

@@ -1,0 +1,1 @@
+"""From the sections of a scenario to world, vehicle, policy and objective."""
