@@ -76,13 +76,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     Volumes with ``relit`` true are inserted objects, lit by the scene's emitters: their
     radiance counts as the reflectance of a diffuse surface, ``L = radiance E / pi``, at
     their expected depth; all else, fields and surfaces, is darkened where they shadow
-    it. See ``render.relight`` for what this leaves out. Costs several marches a field.
+    it. See ``render.lighting.relight`` for what this leaves out. Costs several
+    marches a field.
 
     Differentiable in primal, forward and backward mode with respect to the fields'
     parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces, and
     the light on relit objects, which is a constant.
     Monochromatic variants show luminance; spectral ones the linear spectrum of
-    ``render.spectrum``; AOVs are RGB everywhere.
+    ``render.lighting.spectrum``; AOVs are RGB everywhere.
     """
 
     def __init__(self, props: mi.Properties) -> None:

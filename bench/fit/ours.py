@@ -1,4 +1,4 @@
-"""Our side of `bench fit`: the training steps of `capture.fit.fit_ngp`."""
+"""Our side of `bench fit`: the training steps of `fit.fit.fit_ngp`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A training step in PyTorch: the peer of a step of `capture.fit.fit_ngp`.
+"""A training step in PyTorch: the peer of a step of `fit.fit.fit_ngp`.
 
 Rays of random pixels with a random shift of their samples, the march and the field of
 :mod:`bench.torch.ngp`, Huber loss of sRGB values, autograd, Adam.

@@ -43,7 +43,8 @@ class Rollout:
     """``J(textures, initial states, offsets)`` of a batch of drives.
 
     Call it with Dr.Jit arrays and differentiate by `dr.backward`; with torch tensors
-    see `bridge.rollout`. Or, without either's graph, :meth:`run` and :meth:`gradient`.
+    see `rollout.torch_rollout`. Or, without either's graph, :meth:`run` and
+    :meth:`gradient`.
 
     Attributes:
         loop: the closed loop; its sensor's textures are replaced.

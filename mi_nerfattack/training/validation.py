@@ -95,7 +95,7 @@ class ClosedLoop(AbstractValidation):
         }
 
     def card(self, module: PilotNet) -> dict[str, Any]:
-        """Drive, and return all figures; see `policy.evaluate.evaluate`."""
+        """Drive, and return all figures; see `evaluation.evaluate.evaluate`."""
         # the parameters of a policy that drives are frozen
         policy = TorchPolicy(copy.deepcopy(module))
         arguments = (self.routes, self.objects, self.ground, self.settings)

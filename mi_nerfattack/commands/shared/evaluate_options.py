@@ -61,7 +61,7 @@ class PlaceOptions:
         if town is None or self.routes_file is None:
             raise InputError(
                 "--environments: carla drives along routes of a town; give --server "
-                "HOST:PORT/TOWN and --routes-file (deploy.carla_route makes routes)"
+                "HOST:PORT/TOWN and --routes-file (deploy.carla.route makes routes)"
             )
         if self.scene is None and (len(environments) > 1 or self.object):
             raise InputError(

@@ -3,9 +3,9 @@
 A field holds the light that left its surfaces when it was captured. An inserted object
 is lit otherwise where it stands: its radiance is read as a diffuse reflectance rho, so
 that a ray shows ``rho E / pi`` with E the irradiance of the object's expected surface.
-This holds for objects that ``capture.asset`` renders: its light makes the radiance of
-a surface that faces the key equal to rho, and no less than 0.75 rho elsewhere but for
-occlusion, and that shading stays in.
+This holds for objects that ``capture.object_renders`` renders: its light makes the
+radiance of a surface that faces the key equal to rho, and no less than 0.75 rho
+elsewhere but for occlusion, and that shading stays in.
 
 What surrounds the object is darkened by the share of its irradiance that the object
 takes: the ratio of the irradiance with and without it, of the same light samples, so
