@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ from mi_nerfattack.evaluation.field_and_scene import (
 )
 from mi_nerfattack.fit.scores import HAZY
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import STYLE, figure, page, table
+from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.pages.fit import finite
 from mi_nerfattack.report.plots.charts import chart
 from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_depths
@@ -25,16 +24,6 @@ from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_dept
 MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-
-_PAGE = page(
-    "<p>$verdict</p>",
-    """<h2>Routes</h2>
-<div class="scroll">$routes</div>
-<p>$settings</p>
-<h2>Along the routes</h2>
-$along
-$frames""",
-)
 
 
 def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Path:
@@ -51,15 +40,15 @@ def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Pa
     root = files.make_folder(folder)
     files.write_json(root / "metrics.json", document(comparison))
     write_along(root / "along.png", comparison)
-    frames = "\n".join(_frames(root, route) for route in comparison.routes)
-    text = _PAGE.substitute(
-        title=html.escape(title),
-        style=STYLE,
-        verdict=html.escape(verdict(comparison)),
-        routes=_table(comparison),
-        settings=html.escape(settings_line(comparison)),
-        along=figure("agreement frame by frame", root / "along.png"),
-        frames=frames,
+    text = render(
+        "compare.html.j2",
+        title=title,
+        verdict=verdict(comparison),
+        columns=COLUMNS,
+        rows=list(zip(rows(comparison), map(_bad, comparison.routes), strict=True)),
+        settings=settings_line(comparison),
+        along=root / "along.png",
+        frames=[_frames(root, route) for route in comparison.routes if route.worst],
     )
     files.write_text(root / "report.html", text)
     return root / "report.html"
@@ -215,30 +204,21 @@ def _number(value: float, digits: int) -> str:
     return "nothing shown" if math.isinf(value) else f"{value:.{digits}f}"
 
 
-def _table(comparison: Comparison) -> str:
-    bad = set()
-    for i, route in enumerate(comparison.routes):
-        if not _is_psnr_good(route):
-            bad.add((i, COLUMNS.index(_PSNR)))
-        if not _is_depth_good(route):
-            bad.add((i, COLUMNS.index(_DEPTH)))
-    return table(COLUMNS, rows(comparison), bad)
+def _bad(route: RouteComparison) -> set[int]:
+    """Return the columns in which a route is too far off."""
+    good = {_PSNR: _is_psnr_good(route), _DEPTH: _is_depth_good(route)}
+    return {COLUMNS.index(name) for name in good if not good[name]}
 
 
-def _frames(root: Path, route: RouteComparison) -> str:
-    if not route.worst:
-        return ""
+def _frames(root: Path, route: RouteComparison) -> tuple[str, Path, Path]:
+    """Write the worst frames of a route; return its name and the two pictures."""
     views = [_pair(frame) for frame in route.worst]
     colours, depths = (
         root / f"{_file_name(route.name)}_{kind}.png" for kind in ("worst", "depth")
     )
     write_colours(colours, views, "scene, path-traced")
     write_depths(depths, views)
-    return (
-        f"<h2>Worst frames of {html.escape(route.name)}</h2>\n"
-        + figure("scene, field, and their difference", colours)
-        + figure("depth of the field, of the scene, and their difference", depths)
-    )
+    return route.name, colours, depths
 
 
 def _file_name(name: str) -> str:

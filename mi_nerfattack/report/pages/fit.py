@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fit.options import FitProgress, FitResult
 from mi_nerfattack.fit.scores import ViewScore, reference, worst_views
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.elements import STYLE, figure, page, pairs, table
+from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.pages.verdict import (
     OBJECT,
     PLACE,
@@ -34,26 +33,6 @@ from mi_nerfattack.report.plots.views import (
 )
 
 _SHOWN_VIEWS = 4
-
-_PAGE = page(
-    "<p>$verdict</p>",
-    """<h2>Criteria</h2>
-<div class="scroll">$criteria</div>
-<h2>Summary</h2>
-<div class="scroll">$summary</div>
-<h2>Worst held-out views</h2>
-$worst
-<h2>Depth</h2>
-<p>$depth_note</p>
-$depth
-<h2>The fit</h2>
-$curve
-<h2>All held-out views</h2>
-$histogram
-<div class="scroll">$views</div>
-<h2>Settings</h2>
-<div class="scroll">$settings</div>""",
-)
 
 
 def write_fit_report(
@@ -96,46 +75,19 @@ def write_fit_report(
         "settings": result.field.metadata(),
     }
     files.write_json(root / "metrics.json", finite(document))
-    facts = _facts(result, fitted_db, depth_m)
-    page = _page(root, title, result, criteria, facts, depth is not None)
-    files.write_text(root / "report.html", page)
-    return root / "report.html"
-
-
-def _page(
-    root: Path,
-    title: str,
-    result: FitResult,
-    criteria: Sequence[Criterion],
-    facts: Mapping[str, Any],
-    known: bool,
-) -> str:
-    return _PAGE.substitute(
-        title=html.escape(title),
-        style=STYLE,
-        verdict=html.escape(verdict(criteria)),
-        criteria=_criteria_table(criteria),
-        summary=pairs(facts),
-        worst=figure("image, field, and their difference", root / "worst.png"),
-        depth_note=_DEPTH_NOTES[known],
-        depth=figure(_DEPTH_TITLES[known], root / "depth.png"),
-        curve=figure("loss and PSNR, single and averaged", root / "curve.png"),
-        histogram=figure("held-out views by PSNR", root / "views.png"),
-        views=_views_table(result.per_view),
-        settings=pairs(result.field.metadata()),
+    text = render(
+        "fit.html.j2",
+        title=title,
+        root=root,
+        verdict=verdict(criteria),
+        criteria=criteria,
+        facts=_facts(result, fitted_db, depth_m),
+        has_depth=depth is not None,
+        scores=sorted(result.per_view, key=lambda score: score.psnr_db),
+        settings=result.field.metadata(),
     )
-
-
-_DEPTH_TITLES = {
-    True: "depth of the field, depth that was given, and their difference",
-    False: "depth of the field",
-}
-_DEPTH_NOTES = {
-    True: "Of the worst views. Grey: the field stops less than half of the light, or "
-    "no depth is known.",
-    False: "Of the worst views; there is no depth to compare with. Grey: the field "
-    "stops less than half of the light.",
-}
+    files.write_text(root / "report.html", text)
+    return root / "report.html"
 
 
 def summary(result: FitResult) -> dict[str, Any]:
@@ -234,33 +186,6 @@ def _unit(result: FitResult) -> str:
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
-
-
-def _criteria_table(criteria: Sequence[Criterion]) -> str:
-    rows = [
-        [
-            item.name,
-            f"{item.value:.4g}",
-            f"{'at least' if item.at_least else 'at most'} {item.limit:g}",
-            "met" if item.met else "not met",
-        ]
-        for item in criteria
-    ]
-    bad = {(i, 1) for i, item in enumerate(criteria) if not item.met}
-    return table(("measured", "value", "limit", ""), rows, bad)
-
-
-def _views_table(scores: Sequence[ViewScore]) -> str:
-    rows = [
-        [
-            score.name,
-            f"{score.psnr_db:.2f}",
-            f"{score.ssim:.4f}",
-            f"{100 * score.hazy:.1f} %",
-        ]
-        for score in sorted(scores, key=lambda score: score.psnr_db)
-    ]
-    return table(("view, worst first", "PSNR (dB)", "SSIM", "hazy rays"), rows)
 
 
 def _entry(item: Criterion) -> dict[str, Any]:

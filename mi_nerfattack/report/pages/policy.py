@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.plots.policy import plot_errors
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.system.cores import cores
@@ -15,7 +16,6 @@ from mi_nerfattack.system.cores import cores
 SCHEMA = 1
 #: Written where the training says nothing about something.
 NOT_RECORDED = "not recorded"
-_WORST_SHOWN = 5
 _FORMER_SCHEMA = 1  # of a training's JSON: its settings are those of the validation
 
 #: Drives by environment, route and case.
@@ -72,16 +72,27 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
         name: of the policy.
         document: content of the JSON beside it.
     """
-    card = document["environments"]
-    sections = [
-        [f"# Policy `{name}`", "", summary(card)],
-        ["## Errors in the closed loop", "", *_errors(name, document)],
-        ["## Failures", "", *failures(card)],
-        ["## Not measured", "", *_unmeasured(document)],
-        ["## Training", "", *_training(document["training"])],
-        ["## How it was measured", "", *_measuring(document)],
-    ]
-    return "\n\n".join("\n".join(section) for section in sections) + "\n"
+    cells = list(_cells(document["environments"]))
+    runs = [(*keys, run) for *keys, figures in cells for run in figures["per_run"]]
+    stayed = [item for item in runs if not item[-1]["departed"]]
+    under = document["environments_under"].values()
+    exposures = sorted({item["exposure_ev"] for item in under})
+    return render(
+        "policy.md.j2",
+        name=name,
+        summary=summary(document["environments"]),
+        cells=cells,
+        limits=_limits(document["environments"]),
+        departed=[item for item in runs if item[-1]["departed"]],
+        stayed=sorted(stayed, key=lambda item: -item[-1]["cross_track_max_m"]),
+        skies=sorted({item["sky"] for item in under}),
+        stops=[f"{value:+g} EV" if value else "0 EV" for value in exposures],
+        training=document["training"],
+        training_rows=_training_rows(document["training"] or {}),
+        command=document["command"],
+        measuring_rows=_measuring_rows(document),
+        NOT_RECORDED=NOT_RECORDED,
+    )
 
 
 def summary(card: Mapping[str, Any]) -> str:
@@ -94,28 +105,6 @@ def summary(card: Mapping[str, Any]) -> str:
         f"{left} of {total} drives left the lane; mean distance from the lane centre "
         f"{min(means):.3f} to {max(means):.3f} m by environment, route and case."
     )
-
-
-def failures(card: Mapping[str, Any]) -> list[str]:
-    """List the drives that left their lane, and the worst of the others."""
-    runs = [
-        (environment, route, case, run)
-        for environment, route, case, figures in _cells(card)
-        for run in figures["per_run"]
-    ]
-    out = [item for item in runs if item[3]["departed"]]
-    rest = [item for item in runs if not item[3]["departed"]]
-    rest.sort(key=lambda item: -item[3]["cross_track_max_m"])
-    lines = [f"Drives that left the lane: {len(out)} of {len(runs)}.", ""]
-    if out:
-        lines += [*_run_table(out), ""]
-    shown = rest[:_WORST_SHOWN]
-    return [
-        *lines,
-        "The largest errors of drives that did not:",
-        "",
-        *_run_table(shown),
-    ]
 
 
 def training_facts(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,131 +139,32 @@ def _round(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _errors(name: str, document: Mapping[str, Any]) -> list[str]:
-    rows = []
-    for environment, route, case, figures in _cells(document["environments"]):
-        expert = figures.get("expert")
-        share = figures["departure_rate_ci95"]
-        rows.append(
-            [
-                environment,
-                route,
-                case,
-                str(figures["n"]),
-                f"{figures['cross_track_mean_m']:.3f}",
-                _interval(figures["cross_track_mean_ci95_m"], "{:.3f}"),
-                f"{figures['cross_track_max_m']:.2f}",
-                str(figures["departures"]),
-                _interval([100 * value for value in share], "{:.0f}") + " %",
-                "" if expert is None else f"{expert['cross_track_mean_m']:.3f}",
-            ]
-        )
-    head = ["environment", "route", "case", "drives", "mean (m)", "95 %", "largest (m)"]
-    head += ["left the lane", "95 %", "expert, mean (m)"]
-    limits = ", ".join(f"{r} {m:.2f} m" for r, m in _limits_by_route(document).items())
-    return [
-        *_table(head, rows),
-        "",
-        "Distance from the lane centre: mean over all steps of all drives, with a "
-        "bootstrap interval over drives, and the largest of any step. A drive has left "
-        "the lane when its distance exceeds half the lane less half the car "
-        f"({limits}); the share of such drives has a Wilson interval. The expert knows "
-        "its position and drives from the same starts.",
-        "",
-        f"![Distance from the lane centre over time]({name}.png)",
-    ]
+def _training_rows(facts: Mapping[str, Any]) -> list[list[str]]:
+    """Return names and values of what a training was given."""
+    labels = {"data": "frames"}
+    names = ("command", "data", "augmentation", "seed", "checksums", "machine")
+    shown = {labels.get(name, name): facts.get(name) for name in names}
+    rest = facts.get("settings") or {"settings": None}
+    shown |= {name: value for name, value in rest.items() if name not in shown}
+    return [row for name, value in shown.items() for row in _flat(name, value)]
 
 
-def _unmeasured(document: Mapping[str, Any]) -> list[str]:
-    """Say which conditions nobody drove in."""
-    under = document["environments_under"]
-    skies = sorted({item["sky"] for item in under.values()})
-    exposures = sorted({item["exposure_ev"] for item in under.values()})
-    stops = ", ".join(f"{value:+g} EV" if value else "0 EV" for value in exposures)
-    return [
-        f"Times of day driven in: {', '.join(skies)}; exposures: {stops}. Nothing is "
-        "known of all others, of other routes and of other objects than those below."
-    ]
-
-
-def _training(facts: Mapping[str, Any] | None) -> list[str]:
-    if facts is None:
-        return [
-            f"There is no record of the training beside the policy: {NOT_RECORDED}."
-        ]
-    shown = [
-        ("command", facts["command"]),
-        ("frames", facts["data"]),
-        ("augmentation", facts["augmentation"]),
-        ("seed", facts["seed"]),
-        ("checksums", facts["checksums"]),
-        ("machine", facts["machine"]),
-    ]
-    rows = [row for name, value in shown for row in _flat(name, value)]
-    settings = facts["settings"] or {}
-    skipped = ("frames", "seed", "augmentation")
-    rows += [
-        row
-        for name, value in settings.items()
-        if name not in skipped
-        for row in _flat(name, value)
-    ]
-    if not settings:
-        rows.append(["settings", NOT_RECORDED])
-    lines = _table(["", ""], rows)
-    rounds = [
-        [str(number), str(item["epochs"]), *_round_cells(item)]
-        for number, item in enumerate(facts["rounds"])
-    ]
-    head = ["round", "epochs", "least held-out loss", "least closed-loop error (m)"]
-    return [*lines, "", *_table(head, rounds)]
-
-
-def _round_cells(item: Mapping[str, Any]) -> list[str]:
-    names = ("held_out_loss", "closed_loop_error_m")
-    return [NOT_RECORDED if item[n] is None else f"{item[n]:.4f}" for n in names]
-
-
-def _measuring(document: Mapping[str, Any]) -> list[str]:
+def _measuring_rows(document: Mapping[str, Any]) -> list[list[str]]:
+    """Return names and values of how a policy was measured."""
     seconds = document.get("seconds_a_drive") or {}
-    rows = [
-        ["command", f"`{document['command']}`"],
-        ["machine", document["machine"]],
-        *(
-            [f"seconds a drive on one worker, {name}", f"{value:.1f}"]
+    shown = {
+        "machine": document["machine"],
+        **{
+            f"seconds a drive on one worker, {name}": f"{value:.1f}"
             for name, value in seconds.items()
-        ),
-        *_flat("policy", document["policy_section"]),
-        *_flat("place", document["place"]),
-        *_flat("environment", document["environments_under"]),
-        *_flat("settings", document["settings"]),
-        *_flat("version", document["versions"]),
-    ]
-    return _table(["", ""], rows)
-
-
-def _run_table(runs: Sequence[tuple[str, str, str, Mapping[str, Any]]]) -> list[str]:
-    head = ["environment", "route", "case", "run", "seed", "mean (m)", "largest (m)"]
-    head += ["there, x and y (m)", "at (s)", "left at (s)"]
-    rows = []
-    for environment, route, case, run in runs:
-        left = run["departed_time_s"]
-        x, y = run["worst_at_m"]
-        rows.append(
-            [
-                environment,
-                route,
-                case,
-                str(run["run"]),
-                str(run["seed"]),
-                f"{run['cross_track_mean_m']:.3f}",
-                f"{run['cross_track_max_m']:.2f}",
-                f"{x:.1f}, {y:.1f}",
-                f"{run['worst_time_s']:.1f}",
-                "" if left is None else f"{left:.1f}",
-            ]
-        )
-    return _table(head, rows)
+        },
+        "policy": document["policy_section"],
+        "place": document["place"],
+        "environment": document["environments_under"],
+        "settings": document["settings"],
+        "version": document["versions"],
+    }
+    return [row for name, value in shown.items() for row in _flat(name, value)]
 
 
 def _cells(card: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Any]]:
@@ -288,10 +178,6 @@ def _limits(card: Mapping[str, Any]) -> dict[str, float]:
     return {r: figures["departure_limit_m"] for _, r, _, figures in _cells(card)}
 
 
-def _limits_by_route(document: Mapping[str, Any]) -> dict[str, float]:
-    return _limits(document["environments"])
-
-
 def _flat(name: str, value: Any) -> list[list[str]]:
     """Return rows for a value and what it holds."""
     if isinstance(value, dict):
@@ -300,14 +186,3 @@ def _flat(name: str, value: Any) -> list[list[str]]:
         return [[name, NOT_RECORDED]]
     text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
     return [[name, text]]
-
-
-def _interval(values: Sequence[float] | None, form: str) -> str:
-    return "" if values is None else " to ".join(form.format(value) for value in values)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    lines = [list(head), ["---"] * len(head), *rows]
-    safe = [[cell.replace("|", "\\|") for cell in row] for row in lines]
-    return [f"| {' | '.join(row)} |" for row in safe]

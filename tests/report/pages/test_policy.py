@@ -1,0 +1,27 @@
+"""The page of a policy shows what its card says, whatever things are called."""
+
+from __future__ import annotations
+
+import copy
+
+from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.policy import page_text
+from mi_nerfattack.scenes import bundled
+
+CARD = files.read_json(bundled("policy/pilotnet.card.json"))
+
+
+def test_the_bundled_page_is_that_of_its_card():
+    path = bundled("policy/pilotnet.md")
+    assert page_text("pilotnet", CARD) == files.read_text(path)
+
+
+def test_names_neither_end_a_cell_nor_begin_an_element():
+    card = copy.deepcopy(CARD)
+    card["environments"]["a|b\n<script>"] = card["environments"].pop("mujoco")
+    card["command"] = "evaluate `a|b` <c>"
+    text = page_text("<net>", card)
+    assert "| a\\|b &lt;script> | straight | clean | 20 |" in text
+    assert "| command | `evaluate 'a\\|b' <c>` |" in text
+    assert "# Policy `<net>`" in text and "(&lt;net>.png)" in text
+    assert "<script" not in text
