@@ -1,6 +1,7 @@
 # Two commands need nothing else: `make demo` and `make test`.
 PYTHON ?= python3
 VENV := .venv
+PYTEST = $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal --durations 25
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 # The build that the results were measured with; it needs no GPU.
 TORCH := torch==2.13.0
@@ -9,19 +10,29 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint check-python clean
+.PHONY: help demo test test-slow test-all test-random lint check-python clean
 
 help:
-	@echo "make demo   run the whole chain on the bundled scene, less than 10 minutes"
-	@echo "make test   run the tests, about 20 minutes; less once kernels are compiled"
-	@echo "make lint   check format, lint and types"
-	@echo "make clean  remove the virtual environment and what was built"
+	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
+	@echo "make test         run the tests, at most 8 minutes; less with compiled kernels"
+	@echo "make test-all     the slow ones too, at most 40 minutes"
+	@echo "make test-random  formats and geometry on other examples each time"
+	@echo "make lint         check format, lint and types"
+	@echo "make clean        remove the virtual environment and what was built"
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/mi-nerfattack demo
 
 test: $(VENV)/.installed-test
-	$(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal --durations 25
+	$(PYTEST) -m "not slow"
+
+test-slow: $(VENV)/.installed-test
+	$(PYTEST) -m slow
+
+test-all: test test-slow
+
+test-random: $(VENV)/.installed-test
+	$(PYTEST) -m hypothesis --hypothesis-profile random
 
 lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff format --check .

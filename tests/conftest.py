@@ -14,22 +14,33 @@ import random
 import signal
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.variants import VARIANTS
+from hypothesis import HealthCheck, settings
 
 SEED = 0
-VARIANTS = (
-    "llvm_ad_rgb",
-    "llvm_ad_mono",
-    "llvm_ad_spectral",
-    "cuda_ad_rgb",
-    "cuda_ad_mono",
-    "cuda_ad_spectral",
+
+# Tables are as wide, and as plain, in every terminal.
+for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE"):
+    os.environ.pop(name, None)
+
+# `make test` draws the same examples on every machine; `make test-random` others each
+# time: pytest --hypothesis-profile random. How fast an example is decides nothing.
+_SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+settings.register_profile(
+    "fixed", deadline=None, database=None, derandomize=True, suppress_health_check=_SLOW
 )
+settings.register_profile(
+    "random", deadline=None, max_examples=300, suppress_health_check=_SLOW
+)
+settings.load_profile("fixed")
 
 # A job in the background of a shell ignores SIGINT, and so would what the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -66,12 +77,7 @@ def spectral() -> Iterator[str]:
 @pytest.fixture(params=VARIANTS)
 def each_variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """Set each variant that the plugins support and this machine can run."""
-    name = request.param
-    if name not in mi.variants():
-        pytest.skip(f"this Mitsuba has no {name}")
-    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        pytest.skip(f"{name}: no CUDA device")
-    yield from _with_variant(name)
+    yield from _with_variant(request.param)
 
 
 @pytest.fixture
@@ -99,6 +105,24 @@ def data_folder() -> Path:
     if folder is None:
         pytest.skip("NERFATTACK_DATA names no folder of test data")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def carla() -> ModuleType:
+    """The client of CARLA's server; what asks for it is collected where it is."""
+    import carla
+
+    return carla
+
+
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> None:
+    """Leave out what needs CARLA's client where it is not installed."""
+    if find_spec("carla") is None:
+        needing = [i for i in items if "carla" in getattr(i, "fixturenames", ())]
+        config.hook.pytest_deselected(items=needing)
+        items[:] = [item for item in items if item not in needing]
 
 
 def _with_variant(name: str) -> Iterator[str]:

@@ -147,27 +147,23 @@ def test_version(run):
     assert run("--version") == (0, f"mi-nerfattack {mi_nerfattack.__version__}\n", "")
 
 
-@pytest.mark.parametrize("arguments", [[], *([name] for name in COMMANDS)])
-def test_help_is_complete_and_loads_nothing_heavy(arguments):
+def test_help_is_complete_and_loads_nothing_heavy():
     code = (
-        "import sys, time\n"
-        "begin = time.process_time()\n"
-        "from mi_nerfattack.cli import main\n"
-        f"code = main({[*arguments, '--help']!r})\n"
-        "print(time.process_time() - begin, file=sys.stderr)\n"
-        "print(*sys.modules, file=sys.stderr)\n"
-        "sys.exit(code)"
+        "import contextlib, io, sys\n"
+        "from mi_nerfattack.cli import COMMANDS, main\n"
+        "assert main(['--help']) == 0\n"
+        "for name in COMMANDS:\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as out:\n"
+        "        assert main([name, '--help']) == 0\n"
+        "    assert 'usage: mi-nerfattack ' + name in out.getvalue()\n"
+        "print(*sys.modules, file=sys.stderr)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "usage: mi-nerfattack" in done.stdout
-    if not arguments:
-        assert all(name in done.stdout for name in COMMANDS)
-    seconds, loaded = done.stderr.splitlines()[-2:]
-    assert float(seconds) < 2  # of CPU; about 0.4
-    assert not HEAVY & set(loaded.split())
+    assert all(name in done.stdout for name in COMMANDS)
+    assert not HEAVY & set(done.stderr.split())
 
 
 def test_closed_pipe_is_quiet():
@@ -226,7 +222,7 @@ def test_ctrl_c_in_a_real_process():
     assert (process.returncode, err) == (130, "mi-nerfattack: interrupted\n")
 
 
-def test_doctor_as_json_and_as_table():
+def test_doctor_as_json_and_as_table(run):
     done = start("doctor", "--json")
     report = json.loads(done.stdout)
     found = {item["name"]: item for item in report["findings"]}
@@ -238,9 +234,9 @@ def test_doctor_as_json_and_as_table():
     assert found["default variant"]["state"] == "ok"
     for item in found.values():
         assert item["state"] == "ok" or item["remedy"], item
-    table = start("doctor")
-    assert table.returncode == done.returncode
-    assert re.search(r"LLVM +\d+\.\d+", table.stdout)
+    code, table, _ = run("doctor")
+    assert code == done.returncode
+    assert re.search(r"LLVM +\d+\.\d+", table)
 
 
 def test_doctor_without_llvm_tells_what_to_do():

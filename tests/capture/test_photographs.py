@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -305,11 +304,12 @@ class TestProcess:
             poses("raise ZeroDivisionError('why')")
 
     def test_interrupt_ends_the_process(self, poses, tmp_path):
-        pid = tmp_path / "pid"
+        pid, woken = tmp_path / "pid", tmp_path / "woken"
         code = (
             f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
             "print('I Processed file [2/3]', flush=True)\n"
-            "time.sleep(100)"
+            "time.sleep(100)\n"
+            f"pathlib.Path({str(woken)!r}).touch()"
         )
         seen = []
 
@@ -318,22 +318,18 @@ class TestProcess:
             if call == ("features", 2, 3):
                 raise KeyboardInterrupt
 
-        start = time.monotonic()
         with pytest.raises(KeyboardInterrupt):
             poses(code, interrupt)
-        assert time.monotonic() - start < 50
         with pytest.raises(ProcessLookupError):
             os.kill(int(pid.read_text()), 0)
-        assert ("features", 0, 3) in seen
+        assert ("features", 0, 3) in seen and not woken.exists()
 
     def test_process_ends_with_its_parent(self, tmp_path):
         (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
         command = [sys.executable, "-m", "mi_nerfattack.capture.colmap.process"]
         task = json.dumps({"work": "", "folder": "", "names": []})
         environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        result = subprocess.run(
-            command, input=task + "\n", text=True, timeout=50, env=environment
-        )
+        result = subprocess.run(command, input=task + "\n", text=True, env=environment)
         assert result.returncode == 1
 
     @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.page_text import page_text
 from helpers.small_fields import sigmoid_to_linear
 from helpers.sphere_views import sphere_views
 
@@ -114,7 +115,7 @@ def test_field_that_shows_nothing(place, tmp_path):
     text = verdict(comparison)
     assert "Not close enough on ahead" in text
     page = write_compare_report(tmp_path / "out", comparison, "nothing")
-    assert "NaN" not in files.read_text(page)
+    assert "NaN" not in page_text(page)
 
 
 def test_half_transparent_field_is_hazy(place):

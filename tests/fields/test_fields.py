@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
@@ -15,11 +15,7 @@ from mi_nerfattack.fields.occupancy import MAX_DISTANCE, build
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-quick = settings(
-    max_examples=20,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+quick = settings(max_examples=20)
 
 
 # Grid

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
@@ -30,11 +30,7 @@ READERS = [
 ]
 TYPES = ["f2", "f4", "f8", "u1", "i1", "u4", "i4", "i8", "?"]
 
-on_one_file = settings(
-    max_examples=30,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-    deadline=None,
-)
+on_one_file = settings(max_examples=30)
 names = st.text(min_size=1, max_size=20).filter(lambda name: name != "__metadata__")
 arrays = st.sampled_from(TYPES).flatmap(
     lambda kind: hnp.arrays(kind, hnp.array_shapes(min_dims=0, min_side=0, max_side=4))

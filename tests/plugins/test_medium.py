@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
+from helpers.variants import MONO, RGB
 
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
 
@@ -107,9 +108,8 @@ def test_density_renders_as_gridvolume(path: Path, integrator: str) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["volpath", "prbvolpath"])
+@pytest.mark.parametrize("each_variant", RGB + MONO, indirect=True)
 def test_radiance_as_albedo_renders_as_gridvolume(path: Path, integrator: str) -> None:
-    if mi.is_spectral:
-        pytest.skip("stock albedos are other spectra of the same colour")
     density, radiance = sampled(path)
     pairs = [(own(path), own(path, "radiance")), (density, radiance)]
     a, b = [np.array(mi.render(scene(*p, integrator), spp=8, seed=1)) for p in pairs]

@@ -125,8 +125,8 @@ GOOD = (200, b'{"control": [0.5, -0.25]}', 0)
 
 def test_http_protocol_and_retries(served, rng, monkeypatch):
     monkeypatch.setattr("mi_nerfattack.policy.http_policy.PAUSE_S", 0.01)
-    made, seen = handler((503, b"", 0), GOOD, (200, b"", 9), GOOD)
-    policy = HttpPolicy(served(made), timeout_s=3.0, retries=1, control_scale=2.0)
+    made, seen = handler((503, b"", 0), GOOD, (502, b"", 0), GOOD)
+    policy = HttpPolicy(served(made), retries=1, control_scale=2.0)
     image, memory = camera(2, rng), policy.initial_memory(2)
     for step in range(2):
         control, memory = policy.step(image, [0, 2], memory)

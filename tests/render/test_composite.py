@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.render.composite import depth_composite, over, sort_by_depth
@@ -16,11 +16,7 @@ from mi_nerfattack.render.march import March
 pytestmark = pytest.mark.usefixtures("variant")
 
 RED, GREEN, BLUE = np.eye(3)
-quick = settings(
-    max_examples=30,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+quick = settings(max_examples=30)
 
 
 def layer(colour: np.ndarray, opacity: float, depth: float) -> March:

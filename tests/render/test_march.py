@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
@@ -19,11 +19,7 @@ from mi_nerfattack.render.posed import PosedField
 pytestmark = pytest.mark.usefixtures("variant")
 
 SIGMA = 0.7
-quick = settings(
-    max_examples=20,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+quick = settings(max_examples=20)
 
 
 def along_x(

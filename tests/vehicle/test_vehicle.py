@@ -187,7 +187,7 @@ def test_saturation(dynamics):
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.01, 100))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_soft_limit_is_bounded_and_odd(value, limit):
     up, down = soft_limit(row64([value, -value]), limit).numpy()
     assert abs(up) <= limit * (1 + 1e-15) and up == -down

@@ -118,8 +118,7 @@ def test_straight_up_and_down_keep_their_matrix(pitch, yaw):
 
 
 @given(poses)
-def test_matrices_are_those_of_the_client_mirrored(pose):
-    carla = pytest.importorskip("carla")
+def test_matrices_are_those_of_the_client_mirrored(carla, pose):
     transform = carla.Transform(
         carla.Location(pose.x, pose.y, pose.z),
         carla.Rotation(pitch=pose.pitch, yaw=pose.yaw, roll=pose.roll),

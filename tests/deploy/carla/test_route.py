@@ -53,8 +53,7 @@ def test_routes_that_are_none(arguments, message):
         route_from_town(TOWN, API, (10.0, 0.0), **arguments)
 
 
-def test_a_route_along_an_opendrive_map_of_the_real_client():
-    carla = pytest.importorskip("carla")
+def test_a_route_along_an_opendrive_map_of_the_real_client(carla):
     town = carla.Map("bend", OPENDRIVE)
     # the lane's centre is 1.75 m right of the reference line; the arc turns left
     # with radius 10 m about (50, 10), so the lane's has 11.75 m
@@ -71,9 +70,8 @@ def test_a_route_along_an_opendrive_map_of_the_real_client():
 
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.499999, 0.5, 0.500001, 0.75])
 @pytest.mark.parametrize("spacing", [0.3, 1.0, 2.0])
-def test_a_way_is_found_from_any_place_of_a_lane(offset, spacing):
+def test_a_way_is_found_from_any_place_of_a_lane(carla, offset, spacing):
     """Also from 10.5 m, where 11.5 and 12.5 are both rounded to 12."""
-    carla = pytest.importorskip("carla")
     town, x = carla.Map("bend", OPENDRIVE), 10.0 + offset
     end, choice = (30.0 + offset, -1.75), {"spacing_m": spacing}
     route = route_from_town(town, carla, (x, -1.0), end=end, **choice)

@@ -18,8 +18,7 @@ def parameters(function) -> list[str]:
 
 
 @pytest.mark.parametrize("mimic", stand_in.MIMICS, ids=lambda item: item.__name__)
-def test_the_stand_in_has_nothing_that_the_client_has_not(mimic):
-    carla = pytest.importorskip("carla")
+def test_the_stand_in_has_nothing_that_the_client_has_not(carla, mimic):
     real = getattr(carla, mimic.__name__)
     names = {name for name in vars(mimic) if not name.startswith("_")}
     if dataclasses.is_dataclass(mimic):
@@ -43,8 +42,7 @@ def test_the_stand_in_has_nothing_that_the_client_has_not(mimic):
 @pytest.mark.parametrize(
     "name", ["Location", "Rotation", "VehicleControl", "WorldSettings"]
 )
-def test_the_stand_in_makes_values_as_the_client_does(name):
-    carla = pytest.importorskip("carla")
+def test_the_stand_in_makes_values_as_the_client_does(carla, name):
     real, mimic = getattr(carla, name)(), getattr(stand_in, name)()
     for item in dataclasses.fields(mimic):
         value = getattr(mimic, item.name)

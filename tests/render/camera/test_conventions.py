@@ -80,7 +80,7 @@ def test_colmap_pose_by_hand():
     np.testing.assert_allclose(matrix, pose(to_camera.T, place), atol=1e-12)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1),
     angle=st.floats(-3.1, 3.1),

@@ -189,7 +189,7 @@ def test_distorted_rays_project_back_with_opencv():
     )
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     x=st.floats(-0.6, 0.6),
     y=st.floats(-0.6, 0.6),

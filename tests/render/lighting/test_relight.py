@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import Derivatives, images
+from helpers.variants import MONO
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, save_field
@@ -99,9 +100,8 @@ def test_every_variant(each_variant: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, 2 * expected([RHO] * 3).squeeze(), rtol=3e-2)
 
 
+@pytest.mark.parametrize("each_variant", MONO, indirect=True)
 def test_a_grey_sun_in_mono(tmp_path: Path, each_variant: str) -> None:
-    if not mi.is_monochromatic:
-        pytest.skip("the other variants have colours")
     name = str(tmp_path / "box.safetensors")
     save_field(name, small.homogeneous(1e4, RAW))
     found = colour(scene({"object": volume(name)}, light=sun((-1, 0, 0))))

@@ -116,7 +116,7 @@ def test_prolongation_does_not_reach_other_segments():
 
 
 @given(st.lists(st.tuples(*[st.floats(-40, 40)] * 2), min_size=1, max_size=20))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_numpy_equals_drjit(positions):
     route = Route("z", 0, [[0, 0], [10, 0], [12, 5], [8, 9], [20, 20], [20, 0]])
     states = np.array([[x, y, 0.1] for x, y in positions])
