@@ -139,13 +139,13 @@ def _print(document: dict[str, Any]) -> None:
         title=f"{document['frames']} frames, {document['gradient_steps']} steps each",
     )
     table.add_column("")
-    for name in ("mean error, m", "standard error, m", "departures"):
+    for name in ("mean error, m", "standard error, m", "drives departed"):
         table.add_column(name, justify="right")
     for arm, found in document["arms"].items():
         table.add_row(
             arm,
             f"{found['mean_m']:.4f}",
             f"{found['standard_error_m']:.4f}",
-            str(found["departures"]),
+            str(found["drives_departed"]),
         )
     Console().print(table)

@@ -116,27 +116,27 @@ def run(
     site = PlaceSite(settings.environment, bundled_place(), weather)
     bench = _Bench(settings, site, folder, workers, show)
     errors: dict[str, list[list[float]]] = {arm: [] for arm in ARMS}
-    departures = dict.fromkeys(ARMS, 0)
+    departed = dict.fromkeys(ARMS, 0)
     for seed in settings.seeds:
         policies = bench.cloning(seed), bench.dagger(seed)
         for arm, policy in zip(ARMS, policies, strict=True):
             drives = bench.drive(arm, seed, policy)
             errors[arm].append([drive["mean_m"] for drive in drives])
-            departures[arm] += sum(drive["departed"] for drive in drives)
-    return to_document(settings, errors, departures)
+            departed[arm] += sum(drive["departed"] for drive in drives)
+    return to_document(settings, errors, departed)
 
 
 def to_document(
     settings: Settings,
     errors: dict[str, list[list[float]]],
-    departures: dict[str, int],
+    departed: dict[str, int],
 ) -> dict[str, Any]:
     """Return the result as JSON.
 
     Args:
         settings: see there.
         errors: by arm, seed and drive, metres.
-        departures: drives that left the lane, by arm.
+        departed: drives that left the lane, by arm.
     """
     arms = {}
     for arm, drives in errors.items():
@@ -147,7 +147,7 @@ def to_document(
             "standard_error_m": float(spread),
             "seeds_m": means.tolist(),
             "drives_m": drives,
-            "departures": departures[arm],
+            "drives_departed": departed[arm],
         }
     about = {"frames": settings.frames, "gradient_steps": settings.steps}
     return {**about, "settings": asdict(settings), "arms": arms}
@@ -322,7 +322,7 @@ def write_figure(path: Path, document: dict[str, Any]) -> None:
             axes.hlines(mean, place - 0.22, place + 0.22, color="black")
             text = (
                 f"mean {mean:.1f} cm\nstandard error {error:.1f} cm\n"
-                f"{found['departures']} of {drives.size} drives\n"
+                f"{found['drives_departed']} of {drives.size} drives\n"
                 "left the lane"
             )
             axes.annotate(text, (place + 0.25, mean), fontsize=8, va="center")

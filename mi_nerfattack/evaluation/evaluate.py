@@ -305,7 +305,7 @@ def make_card(
         expert = drives.get((label, route, EXPERT))
         if case == CLEAN and expert is not None:
             seen = card_figures(expert, limits[route])
-            names = ("n", "cross_track_mean_m", "cross_track_max_m", "departures")
+            names = ("n", "cross_track_mean_m", "cross_track_max_m", "drives_departed")
             figures["expert"] = {name: seen[name] for name in names}
         card.setdefault(label, {}).setdefault(route, {})[case] = figures
     return card

@@ -35,8 +35,8 @@ def summarise(
     - `cross_track_max_m`: largest |e| of any step;
     - `cross_track_total`: plain sum of |e| over the steps of a run (unit: metre-steps,
       so it grows when the time step shrinks), averaged over the runs;
-    - `departures`: number of steps beyond the limit, summed over the runs;
-    - `runs_departed`: number of runs with at least one such step;
+    - `steps_departed`: number of steps beyond the limit, summed over the runs;
+    - `drives_departed`: number of runs with at least one such step;
     - `per_run`: the figures of each run, ordered by its index.
 
     Args:
@@ -73,7 +73,7 @@ def card_figures(
 
     - `n`, `cross_track_mean_m`, `cross_track_max_m`, `cross_track_mean_ci95_m`: as of
       `summarise`;
-    - `departures`: number of drives that left the lane;
+    - `drives_departed`: number of drives that left the lane;
     - `departure_rate_ci95`: 95 % interval of their share (Wilson);
     - `per_run`: by run its seed and steps, its figures, its start (x, y, heading),
       where and when its error was largest, and when it left the lane (null if it did
@@ -92,7 +92,7 @@ def card_figures(
         "n": len(ordered),
         "cross_track_mean_m": float(distances.mean()),
         "cross_track_max_m": float(distances.max()),
-        "departures": left,
+        "drives_departed": left,
         "cross_track_mean_ci95_m": mean_interval(means, seed),
         "departure_rate_ci95": share_interval(left, len(ordered)),
         "departure_limit_m": limit,
@@ -169,7 +169,7 @@ class _Run(_Model):
     cross_track_mean_m: pydantic.NonNegativeFloat
     cross_track_max_m: pydantic.NonNegativeFloat
     cross_track_total: pydantic.NonNegativeFloat
-    departures: pydantic.NonNegativeInt
+    steps_departed: pydantic.NonNegativeInt
 
 
 class _Case(_Model):
@@ -177,7 +177,7 @@ class _Case(_Model):
     cross_track_mean_m: pydantic.NonNegativeFloat
     cross_track_max_m: pydantic.NonNegativeFloat
     cross_track_total: pydantic.NonNegativeFloat
-    departures: pydantic.NonNegativeInt
+    steps_departed: pydantic.NonNegativeInt
     per_run: list[_Run]
 
     @pydantic.model_validator(mode="after")
@@ -225,8 +225,8 @@ def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any
         "cross_track_mean_worst_run_m": float(means.max()),
         "cross_track_max_m": float(distances.max()),
         "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
-        "departures": sum(run["departures"] for run in per_run),
-        "runs_departed": sum(run["departures"] > 0 for run in per_run),
+        "steps_departed": sum(run["steps_departed"] for run in per_run),
+        "drives_departed": sum(run["steps_departed"] > 0 for run in per_run),
         "per_run": per_run,
     }
 
@@ -239,7 +239,7 @@ def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
         "cross_track_mean_m": float(drive.distance_m.mean()),
         "cross_track_max_m": float(drive.distance_m.max()),
         "cross_track_total": float(drive.distance_m.sum()),
-        "departures": int(drive.departed(limit).sum()),
+        "steps_departed": int(drive.departed(limit).sum()),
     }
 
 

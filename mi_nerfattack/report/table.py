@@ -75,7 +75,7 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
         document: as of `metrics.metrics_document`.
 
     Returns:
-        A row per route, environment and case; `steps out` are beyond the limit.
+        A row per route, environment and case; `steps departed` are beyond the limit.
     """
     table = rich.table.Table(
         title="Distance from the lane centre",
@@ -86,7 +86,7 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
     table.add_column("route", overflow="fold", max_width=14)
     for name in ("environment", "case"):
         table.add_column(name, no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m)", "steps\nout"):
+    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m)", "steps\ndeparted"):
         table.add_column(name, justify="right", no_wrap=True)
     for route, environments in document["routes"].items():
         for environment, cases in environments.items():
@@ -105,7 +105,7 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
         card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}, see `metrics.card_figures`.
 
     Returns:
-        A row per environment, route and case; `left the lane` counts drives.
+        A row per environment, route and case; `drives departed` left the lane.
     """
     table = rich.table.Table(
         title="Distance from the lane centre",
@@ -116,7 +116,7 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
     table.add_column("environment", overflow="fold", min_width=11, max_width=18)
     table.add_column("route", overflow="fold", min_width=8, max_width=14)
     table.add_column("case", no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "left\nlane", "expert\n(m)"):
+    for name in ("runs", "mean\n(m)", "max\n(m)", "drives\ndeparted", "expert\n(m)"):
         table.add_column(name, justify="right", no_wrap=True)
     for environment, routes in card.items():
         labels = [environment]
@@ -137,7 +137,7 @@ def _card_cells(figures: Mapping[str, Any]) -> list[str]:
         str(figures["n"]),
         f"{figures['cross_track_mean_m']:.3f}",
         f"{figures['cross_track_max_m']:.3f}",
-        str(figures["departures"]),
+        str(figures["drives_departed"]),
         "" if expert is None else f"{expert['cross_track_mean_m']:.3f}",
     ]
 
@@ -148,5 +148,5 @@ def _cells(figures: Mapping[str, Any]) -> list[str]:
         f"{figures['cross_track_mean_m']:.3f}",
         f"{figures['cross_track_max_m']:.3f}",
         f"{figures['cross_track_total']:.2f}",
-        str(figures["departures"]),
+        str(figures["steps_departed"]),
     ]

@@ -79,9 +79,9 @@ def fit_policy(
 ) -> list[dict[str, Any]]:
     """Train a policy and leave the weights of its best epoch in it.
 
-    Best is the epoch with the fewest departures in the closed loop, among these that of
-    the least mean error to a millimetre, among these that of the least held-out loss.
-    Without a validation in the closed loop the loss alone decides.
+    Best is the epoch with the fewest drives departed in the closed loop, among these
+    that of the least mean error to a millimetre, among these that of the least held-out
+    loss. Without a validation in the closed loop the loss alone decides.
 
     The loss is the mean squared difference of control divided by the largest
     control. With a checkpoint, each epoch ends by writing it atomically, and a run

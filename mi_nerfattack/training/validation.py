@@ -19,7 +19,7 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Keys of a row of a training's history.
-ERROR, DEPARTURES = "closed_loop_error_m", "closed_loop_departures"
+ERROR, DEPARTED = "closed_loop_error_m", "closed_loop_drives_departed"
 
 
 class AbstractValidation(ABC):
@@ -33,7 +33,7 @@ class AbstractValidation(ABC):
 
     @abstractmethod
     def measure(self, module: PilotNet) -> dict[str, Any]:
-        """Return what is known, for the history: JSON, with `ERROR` and `DEPARTURES`.
+        """Return what is known, for the history: JSON, with `ERROR` and `DEPARTED`.
 
         Args:
             module: in evaluation mode; left unchanged.
@@ -85,12 +85,12 @@ class ClosedLoop(AbstractValidation):
     progress: Callable[[int, int], None] = lambda done, total: None
 
     def measure(self, module: PilotNet) -> dict[str, Any]:
-        """Drive, and return mean error, departures, and the error of each route."""
+        """Drive; return mean error, drives departed, and the error of each route."""
         card = self.card(module)
         errors = route_errors(card)
         return {
             ERROR: float(np.mean(list(errors.values()))),
-            DEPARTURES: count_departures(card),
+            DEPARTED: count_departed(card),
             "routes": errors,
         }
 
@@ -112,9 +112,9 @@ class ClosedLoop(AbstractValidation):
 
 
 def rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Return what is smaller for better epochs: departures, error in mm, loss."""
+    """Return what is smaller for better epochs: drives departed, error in mm, loss."""
     error = round(row.get(ERROR, 0.0), 3)
-    return row.get(DEPARTURES, 0), error, row["held_out_loss"]
+    return row.get(DEPARTED, 0), error, row["held_out_loss"]
 
 
 def route_errors(card: Mapping[str, Any]) -> dict[str, float]:
@@ -127,10 +127,10 @@ def route_errors(card: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def count_departures(card: Mapping[str, Any]) -> int:
+def count_departed(card: Mapping[str, Any]) -> int:
     """Return the number of drives of a card that left their lane."""
     return sum(
-        figures["departures"]
+        figures["drives_departed"]
         for routes in card.values()
         for cases in routes.values()
         for figures in cases.values()

@@ -161,7 +161,7 @@ def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
     narrow = {"straight": {**ROUTES["straight"], "lane_width_m": 1.81}}
     files.write_json("routes.json", narrow)
     assert cli.main([*place, "--page", "out", "--seed", "4"]) == 0
-    assert "left" in capsys.readouterr().out  # the table; failures are figures
+    assert "departed" in capsys.readouterr().out  # the table; failures are figures
     text = Path("out/still-drive.md").read_text()
     assert "2 of 2 drives left the lane" in text
     assert "Drives that left the lane: 2 of 2." in text
@@ -172,7 +172,9 @@ def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
     assert "Times of day driven in: day" in text
     assert files.read_image("out/still-drive.png").std() > 5
     document = files.read_json("out/still-drive.card.json")
-    assert document["environments"]["mitsuba"]["straight"]["clean"]["departures"] == 2
+    assert (
+        document["environments"]["mitsuba"]["straight"]["clean"]["drives_departed"] == 2
+    )
     assert document["training"] is None
 
 
@@ -240,7 +242,7 @@ def test_pages_are_named_after_the_policy():
 
 
 def test_a_summary_counts_all_drives():
-    figures = {"n": 5, "departures": 1, "cross_track_mean_m": 0.25}
+    figures = {"n": 5, "drives_departed": 1, "cross_track_mean_m": 0.25}
     text = summary({"mitsuba": {"left": {"clean": figures, "random_objects": figures}}})
     assert text.startswith("2 of 10 drives left the lane")
 

@@ -164,7 +164,7 @@ def test_the_card_counts_drives_that_left_the_lane():
     ]
     figures = card(drives, [straight()], 1.8)["surrogate"]["straight"]["clean"]
     assert figures["n"] == 3
-    assert figures["departures"] == 1
+    assert figures["drives_departed"] == 1
     assert figures["cross_track_mean_m"] == pytest.approx(1.7 / 3)
     assert figures["cross_track_max_m"] == pytest.approx(0.9)
     assert [run["departed"] for run in figures["per_run"]] == [False, False, True]

@@ -20,7 +20,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report import table
 from mi_nerfattack.report.pages import attack as page
 from mi_nerfattack.report.plots import drives as plots
-from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.drive import Drive, departure_limit
 
 #: What `metrics.json` of a run folder holds.
 RUN_ENVIRONMENTS = ("surrogate", "deployment")
@@ -91,10 +91,10 @@ def test_drive_keeps_read_only_copies():
 
 
 def test_departure_limit():
-    assert metrics.departure_limit(3.5, 1.8) == pytest.approx(0.85, abs=1e-15)
+    assert departure_limit(3.5, 1.8) == pytest.approx(0.85, abs=1e-15)
     for lane, car in ((1.8, 1.8), (3.5, 0.0), (np.nan, 1.0), (np.inf, 1.0)):
         with pytest.raises(InputError, match="car_width_m"):
-            metrics.departure_limit(lane, car)
+            departure_limit(lane, car)
 
 
 def test_step_at_the_limit_has_not_departed():
@@ -122,14 +122,14 @@ def test_sums_by_hand():
     assert figures["cross_track_mean_m"] == pytest.approx(3.0 / 6)
     assert figures["cross_track_max_m"] == 1.0
     assert figures["cross_track_total"] == pytest.approx((0.6 + 2.4) / 2)
-    assert figures["departures"] == 2
+    assert figures["steps_departed"] == 2
     assert figures["runs_departed"] == 1
     assert figures["cross_track_mean_worst_run_m"] == pytest.approx(0.8)
     first, second = figures["per_run"]
     assert (first["run"], first["seed"], second["run"]) == (0, 100, 1)
     assert first["cross_track_mean_m"] == pytest.approx(0.2)
     assert second["cross_track_total"] == pytest.approx(2.4)
-    assert (first["departures"], second["departures"]) == (0, 2)
+    assert (first["steps_departed"], second["steps_departed"]) == (0, 2)
 
 
 def test_mean_is_over_steps_when_runs_differ_in_length():
@@ -183,7 +183,7 @@ def test_document_follows_the_schema(tmp_path):
     assert list(read["routes"]["straight"]["surrogate"]) == ["unperturbed", "random"]
     case = read["routes"]["straight"]["deployment"]["gradient"]
     assert case["n"] == 1
-    assert case["departures"] == 2
+    assert case["steps_departed"] == 2
 
 
 @pytest.mark.parametrize(
@@ -196,9 +196,17 @@ def test_document_follows_the_schema(tmp_path):
         (("routes", "straight", "moon"), {}, "metrics.routes.straight.moon"),
         (("routes", "straight", "surrogate", "random", "n"), 3, "n is 3"),
         (
-            ("routes", "straight", "surrogate", "random", "per_run", 1, "departures"),
+            (
+                "routes",
+                "straight",
+                "surrogate",
+                "random",
+                "per_run",
+                1,
+                "steps_departed",
+            ),
             -1,
-            "random.per_run.1.departures",
+            "random.per_run.1.steps_departed",
         ),
     ],
 )

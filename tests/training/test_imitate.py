@@ -30,7 +30,7 @@ from mi_nerfattack.training.presets import PRESETS, find_preset
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.train import TrainSettings, fit_policy
 from mi_nerfattack.training.validation import (
-    DEPARTURES,
+    DEPARTED,
     ERROR,
     AbstractValidation,
     ClosedLoop,
@@ -115,9 +115,9 @@ class Scripted(AbstractValidation):
     weights: list[torch.Tensor] = dataclasses.field(default_factory=list)
 
     def measure(self, module) -> dict[str, Any]:
-        departures, error = self.rows[len(self.weights)]
+        departed, error = self.rows[len(self.weights)]
         self.weights.append(module.head[-1].weight.detach().clone())
-        return {ERROR: error, DEPARTURES: departures}
+        return {ERROR: error, DEPARTED: departed}
 
     def describe(self):
         return {}
@@ -134,7 +134,7 @@ def data(rng) -> FrameDataset:
     ("rows", "best"),
     [
         ([(0, 0.05), (0, 0.03), (0, 0.04)], 1),
-        ([(1, 0.01), (0, 0.30), (2, 0.01)], 1),  # no departures first
+        ([(1, 0.01), (0, 0.30), (2, 0.01)], 1),  # fewer drives departed first
         ([(0, 0.2), (0, 0.1), (0, 0.0)], 2),
     ],
 )
@@ -149,8 +149,8 @@ def test_best_epoch_is_that_of_the_closed_loop(data, rows, best):
 
 def test_loss_decides_among_equals_and_unmeasured_epochs_do_not_count():
     rows = [
-        {ERROR: 0.0301, DEPARTURES: 0, "held_out_loss": 0.2},
-        {ERROR: 0.0304, DEPARTURES: 0, "held_out_loss": 0.1},
+        {ERROR: 0.0301, DEPARTED: 0, "held_out_loss": 0.2},
+        {ERROR: 0.0304, DEPARTED: 0, "held_out_loss": 0.1},
     ]
     assert rank(rows[1]) < rank(rows[0])
 
@@ -173,7 +173,7 @@ def test_training_goes_on_after_a_closed_loop(data):
     )
     # 3 periods on a straight lane from a random start: the error is near the start's
     assert set(before["routes"]) == {"mitsuba straight clean"}
-    assert [row[DEPARTURES] for row in history] == [0, 0]
+    assert [row[DEPARTED] for row in history] == [0, 0]
     assert history[0]["train_loss"] != history[1]["train_loss"]
 
 

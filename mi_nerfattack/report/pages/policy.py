@@ -99,7 +99,7 @@ def summary(card: Mapping[str, Any]) -> str:
     """Say in a sentence how many drives left their lane, and the errors."""
     cells = [figures for *_, figures in _cells(card)]
     total = sum(figures["n"] for figures in cells)
-    left = sum(figures["departures"] for figures in cells)
+    left = sum(figures["drives_departed"] for figures in cells)
     means = [figures["cross_track_mean_m"] for figures in cells]
     return (
         f"{left} of {total} drives left the lane; mean distance from the lane centre "
