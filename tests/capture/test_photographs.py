@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from mi_nerfattack import cli
+from mi_nerfattack.capture.colmap.follow import Stages
 from mi_nerfattack.capture.colmap.process import MARK
-from mi_nerfattack.capture.colmap.reconstruct import Structure, _Stages
+from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.capture.photographs import PoseOptions, estimate_poses, upright
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError, SetupError
@@ -239,7 +240,9 @@ class TestUnusable:
         (tmp_path / "pycolmap.py").write_text("raise ImportError('gone')")
         monkeypatch.syspath_prepend(str(tmp_path))
         folder = self.photographs(tmp_path / "p", 3)
-        self.refused(folder, "pycolmap: gone; .*pip install pycolmap")
+        with pytest.raises(SetupError, match="pycolmap: gone; .*pip install pycolmap"):
+            estimate_poses(folder, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
 
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_scale(self, scale):
@@ -343,7 +346,7 @@ class TestProcess:
     )
     def test_progress_of_a_log_line(self, line, done):
         calls = []
-        stages = _Stages(lambda *call: calls.append(call))
+        stages = Stages(lambda *call: calls.append(call))
         told = MARK + json.dumps({"stage": "s", "total": 60})
         stages.follow([told, f"I2026 7 pairing.cc:2] {line}\n"])
         assert calls == [("s", 0, 60), ("s", done, 60)]

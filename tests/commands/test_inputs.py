@@ -146,17 +146,17 @@ UNUSABLE = {
     "truncated cameras.bin": (
         colmap,
         cut("sparse/0/cameras.bin"),
-        "cameras.bin: byte 0: 1 cameras need 24 bytes, 20 are left",
+        "cameras.bin: .*copy it again",
     ),
     "truncated images.bin": (
         colmap,
         cut("sparse/0/images.bin"),
-        "images.bin: byte .*truncated",
+        "images.bin: .*copy it again",
     ),
     "garbage cameras.bin": (
         colmap,
         garbage("sparse/0/cameras.bin"),
-        "cameras.bin: byte 0: .* cameras need",
+        "cameras.bin: .*copy it again",
     ),
     "COLMAP without images": (
         colmap,

@@ -1,23 +1,21 @@
-"""COLMAP models, text and binary, as posed images.
-
-The files are read here rather than by pycolmap: it has no wheel for every platform,
-and a message should name the file, the place in it and the field.
-"""
+"""COLMAP models, text and binary, as posed images."""
 
 from __future__ import annotations
 
+import json
+import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mi_nerfattack.capture.colmap import binary as colmap_binary
-from mi_nerfattack.capture.colmap import text as colmap_text
-from mi_nerfattack.capture.colmap.records import CameraRecord, ImageRecord
+from mi_nerfattack.capture.colmap.follow import Stages, run_task
+from mi_nerfattack.capture.colmap.process import PARTS, POINTS, RESULT
 from mi_nerfattack.capture.posed_images import PosedImages, differing, load_images
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.conventions import (
     COLMAP_MODELS,
     colmap_to_opencv,
@@ -28,37 +26,20 @@ from mi_nerfattack.render.camera.intrinsics import Camera
 MODEL_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
 """Where in a folder a model is looked for, in this order."""
 
-
-@dataclass(frozen=True)
-class _Format:
-    suffix: str
-    cameras: Callable[[Path], list[CameraRecord]]
-    images: Callable[[Path], list[ImageRecord]]
-    points: Callable[[Path], np.ndarray]
+MAX_BYTES = 1 << 31
 
 
-_FORMATS = (
-    _Format(
-        ".bin",
-        colmap_binary.read_cameras,
-        colmap_binary.read_images,
-        colmap_binary.read_points,
-    ),
-    _Format(
-        ".txt",
-        colmap_text.read_cameras,
-        colmap_text.read_images,
-        colmap_text.read_points,
-    ),
-)
+class _Image(NamedTuple):
+    name: str
+    camera_id: int
+    quaternion: Sequence[float]
+    translation: Sequence[float]
 
 
 def find_model(folder: str | Path) -> Path | None:
     """Return the first of `MODEL_PLACES` in a folder that holds a model, or None."""
-    for place in MODEL_PLACES:
-        if _format_of(Path(folder) / place) is not None:
-            return Path(folder) / place
-    return None
+    found = _find(Path(folder))
+    return None if found is None else found[0]
 
 
 def read_colmap(
@@ -83,14 +64,21 @@ def read_colmap(
     Raises:
         InputError: no model, a damaged file, a camera model that is not one of
             `COLMAP_MODELS`, missing images, or images of several sizes.
+        SetupError: pycolmap, which reads it, is not installed.
     """
     root = Path(path)
-    model, kind = _model_in(root)
-    source = model / f"cameras{kind.suffix}"
-    cameras = _cameras(source, kind.cameras(source))
-    where = model / f"images{kind.suffix}"
-    records = sorted(kind.images(where), key=lambda record: record.name)
-    _check_images(where, records, cameras)
+    place = _find(root)
+    if place is None:
+        raise InputError(
+            f"{root}: no COLMAP model (cameras and images, .bin or .txt); looked in "
+            f"{', '.join(MODEL_PLACES)}"
+        )
+    model, suffix = place
+    contents, points = _read(model, suffix)
+    source, where = model / f"cameras{suffix}", model / f"images{suffix}"
+    cameras = _cameras(source, contents["cameras"])
+    records = sorted(_Image(*image) for image in contents["images"])
+    _check_images(where, records)
     found = _find_images(root, model, [record.name for record in records])
     missing = tuple(record.name for record in records if record.name not in found)
     if missing and not skip_missing:
@@ -106,7 +94,6 @@ def read_colmap(
         source,
         long_edge_px,
     )
-    points = model / f"points3D{kind.suffix}"
     return PosedImages(
         images,
         colmap_to_opencv([r.quaternion for r in used], [r.translation for r in used]),
@@ -114,62 +101,78 @@ def read_colmap(
         tuple(record.name for record in used),
         missing,
         differing(reduced),
-        kind.points(points) if points.is_file() else None,
+        points,
         "arbitrary",
     )
 
 
-def _model_in(root: Path) -> tuple[Path, _Format]:
+def _find(folder: Path) -> tuple[Path, str] | None:
+    """Return the folder of a model and the suffix of its files."""
     for place in MODEL_PLACES:
-        kind = _format_of(root / place)
-        if kind is not None:
-            return root / place, kind
-    raise InputError(
-        f"{root}: no COLMAP model (cameras and images, .bin or .txt); looked in "
-        f"{', '.join(MODEL_PLACES)}"
-    )
-
-
-def _format_of(folder: Path) -> _Format | None:
-    for kind in _FORMATS:
-        if all((folder / f"{n}{kind.suffix}").is_file() for n in ("cameras", "images")):
-            return kind
+        for suffix in (".bin", ".txt"):
+            needed = (folder / place / f"{name}{suffix}" for name in PARTS[:2])
+            if all(path.is_file() for path in needed):
+                return folder / place, suffix
     return None
 
 
-def _cameras(source: Path, records: Sequence[CameraRecord]) -> dict[int, Camera]:
-    result = {}
-    for record in records:
-        where = f"{source}: camera {record.camera_id}"
-        if record.model not in COLMAP_MODELS:
+def _read(model: Path, suffix: str) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Return what pycolmap finds in a model's files, and its points if it has any.
+
+    COLMAP checks little of what it reads, and reads without end in some damaged files:
+    this is done in a process of its own, with limits.
+    """
+    names = [f"{part}{suffix}" for part in PARTS]
+    names = [name for name in names if (model / name).is_file()]
+    with tempfile.TemporaryDirectory() as work:
+        for name in names:
+            if suffix == ".bin":
+                raw = files.read_bytes(model / name, MAX_BYTES)
+            else:
+                raw = files.read_text(model / name).encode()
+            (Path(work) / name).write_bytes(raw)
+        stages = Stages(lambda *_: None)
+        code = run_task({"work": work, "files": names}, stages)
+        if code:
             raise InputError(
-                f"{where}: model {record.model}; only {', '.join(COLMAP_MODELS)} can "
+                f"{model / stages.name}: {stages.ending(code)}; the file is damaged or "
+                "not of COLMAP, copy it again"
+            )
+        found = json.loads((Path(work) / RESULT).read_text(encoding="utf-8"))
+        points = np.load(Path(work) / POINTS)
+    if not np.isfinite(points).all():
+        raise InputError(
+            f"{model / names[-1]}: a position is not finite; copy the file again"
+        )
+    return found, points if len(names) > 2 else None
+
+
+def _cameras(source: Path, records: dict[str, Sequence[Any]]) -> dict[int, Camera]:
+    result = {}
+    for camera_id, (name, *rest) in records.items():
+        where = f"{source}: camera {camera_id}"
+        if name not in COLMAP_MODELS:
+            raise InputError(
+                f"{where}: model {name}; only {', '.join(COLMAP_MODELS)} can "
                 "be read; run 'colmap image_undistorter' and give its output, or "
                 "reconstruct with OPENCV"
             )
         try:
-            result[record.camera_id] = from_colmap(
-                record.model, record.width, record.height, record.parameters
-            )
+            result[int(camera_id)] = from_colmap(name, *rest)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     return result
 
 
-def _check_images(
-    where: Path, records: Sequence[ImageRecord], cameras: dict[int, Camera]
-) -> None:
+def _check_images(where: Path, records: Sequence[_Image]) -> None:
     if not records:
         raise InputError(f"{where}: the model holds no image; reconstruct it again")
     name, times = Counter(record.name for record in records).most_common(1)[0]
     if times > 1:
         raise InputError(f"{where}: image {name!r} occurs {times} times; names differ")
     for record in records:
-        if record.camera_id not in cameras:
-            raise InputError(
-                f"{where}: image {record.name!r}: camera {record.camera_id} is not in "
-                "the model's cameras"
-            )
+        if not record.name.isprintable():
+            raise InputError(f"{where}: image {record.name!r}: unprintable; rename it")
         values = (*record.quaternion, *record.translation)
         if not (np.isfinite(values).all() and any(record.quaternion)):
             raise InputError(

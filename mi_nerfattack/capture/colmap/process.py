@@ -3,26 +3,32 @@
 A native crash, or COLMAP's own abort, then ends this process and not its user's. The
 task comes as one line of JSON on standard input; when that is closed, nobody waits any
 longer and the process ends. What it is at goes to standard output as lines that start
-with `MARK`, between COLMAP's log lines; what it found, to `RESULT` in the working
-folder.
+with `MARK`, between COLMAP's log lines; what it found, to `RESULT` and `POINTS` in the
+working folder.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import sys
 import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 MARK = "@ "
 RESULT = "structure.json"
+POINTS = "points.npy"
+PARTS = ("cameras", "images", "points3D")  # of a model; the last may be missing
 LEAST_IMAGES = 3
 
 _LEAST_TRACK = 3  # images that see a point which counts
 _OVERLAP = 10  # sequential: neighbours, and neighbours at distances 2^k, k < overlap
 _BLOCK = 10  # exhaustive: photographs a side of the squares of pairs that are logged
+_PADDING = bytes(1 << 20)
 
 
 def main() -> int:
@@ -34,9 +40,87 @@ def main() -> int:
     except ImportError as error:
         _say(missing=str(error))
         return 2
-    database, folder = Path(task["work"]) / "database.db", Path(task["folder"])
-    names = task["names"]
     pycolmap.logging.logtostderr = True  # no file among the temporary ones
+    work = Path(task["work"])
+    if "files" not in task:
+        found = _reconstruct(pycolmap, task, work)
+    else:
+        try:
+            found = _read(pycolmap, task["files"], work)
+        except Exception as error:  # of pycolmap, about the files
+            sys.exit(f"{type(error).__name__}: {error}")
+    (work / RESULT).write_text(json.dumps(found), encoding="utf-8")
+    return 0
+
+
+def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
+    """Return a model's cameras and images; its points go to `POINTS`.
+
+    The files are added one by one, so that the last one is to blame for a failure.
+    COLMAP reads on beyond a file's end: zeros there let its loops end soon, and a
+    model that takes another length when it is written is not the file's.
+    """
+    folder, again = work / "model", work / "again"
+    folder.mkdir()
+    again.mkdir()
+    suffix = Path(names[0]).suffix
+    binary = suffix == ".bin"
+    size = sum((work / name).stat().st_size for name in names)
+    _limit(resource.RLIMIT_CPU, 20 + size // 1_000_000)
+    _limit(resource.RLIMIT_AS, (4 << 30) + 10 * size)
+    for part in PARTS:
+        (folder / f"{part}{suffix}").write_bytes(bytes(8) if binary else b"")
+    model, images = pycolmap.Reconstruction(), []
+    for name in names:
+        _say(stage=name, total=1)
+        path = (work / name).replace(folder / name)
+        given = _length(path)
+        if binary:
+            with path.open("ab") as file:
+                file.write(_PADDING)
+        (model.read_binary if binary else model.read_text)(folder)
+        (model.write_binary if binary else model.write_text)(again)
+        understood = _length(again / name)
+        if given != understood:
+            unit = "bytes" if binary else "words"
+            raise ValueError(f"{given} {unit}, a model like it has {understood}")
+        images = [_placed(image) for image in model.images.values()]
+    points = [model.points3D[i].xyz for i in sorted(model.points3D)]
+    np.save(work / POINTS, np.array(points, np.float64).reshape(-1, 3))
+    cameras = {
+        i: (camera.model.name, camera.width, camera.height, camera.params.tolist())
+        for i, camera in model.cameras.items()
+    }
+    return {"cameras": cameras, "images": images}
+
+
+def _limit(kind: int, most: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    if hard == resource.RLIM_INFINITY or most < hard:
+        resource.setrlimit(kind, (most, hard))
+
+
+def _placed(image: Any) -> tuple[str, int, list[float], list[float]]:
+    """Return name, camera, quaternion (w, x, y, z) and translation, world to camera."""
+    pose = image.cam_from_world()
+    x, y, z, w = pose.rotation.quat.tolist()
+    return image.name, image.camera_id, [w, x, y, z], pose.translation.tolist()
+
+
+def _length(path: Path) -> int:
+    """Return the bytes of a binary file, the words of a text file's records."""
+    if path.suffix == ".bin":
+        return path.stat().st_size
+    with path.open(encoding="utf-8") as lines:
+        return sum(len(line.split()) for line in lines if line[:1] != "#")
+
+
+def _reconstruct(
+    pycolmap: Any, task: dict[str, Any], work: Path
+) -> dict[str, Any] | None:
+    """Return what photographs show, None if nothing could be placed."""
+    database, folder = work / "database.db", Path(task["folder"])
+    names = task["names"]
     pycolmap.set_random_seed(task["seed"])
     _say(stage="features", total=len(names))
     pycolmap.extract_features(
@@ -50,9 +134,7 @@ def main() -> int:
     _match(pycolmap, database, task["matching"], len(names))
     models = _map(pycolmap, database, folder, task)
     found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    result = None if found is None else _summary(found)
-    (Path(task["work"]) / RESULT).write_text(json.dumps(result), encoding="utf-8")
-    return 0
+    return None if found is None else _summary(found)
 
 
 def _end_with_parent() -> None:

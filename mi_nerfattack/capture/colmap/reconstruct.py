@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import re
-import signal
-import subprocess
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from mi_nerfattack.capture.colmap.process import LEAST_IMAGES, MARK, RESULT
+from mi_nerfattack.capture.colmap.follow import StageCallback, Stages, run_task
+from mi_nerfattack.capture.colmap.process import LEAST_IMAGES, RESULT
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera.conventions import from_colmap
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.system.processes import module_command
 
 Matching = Literal["exhaustive", "sequential"]
 Lens = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
-StageCallback = Callable[[str, int, int], None]
-
-_CHILD = "mi_nerfattack.capture.colmap.process"
-_LAST_LINES = 5
-# COLMAP's log: "Processed file [3/12]", "Processing image [3/12]" or, of squares of
-# pairs, "Processing block [1/2, 2/2]"
-_COUNT = re.compile(r"Process\w+ (file|image|block) \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +65,8 @@ def reconstruct(
         progress: called with stage, done and total.
 
     Raises:
-        InputError: pycolmap is not installed, fewer than 3 photographs could be
-            placed, or the lens is impossible.
-        SetupError: pycolmap failed or crashed.
+        InputError: fewer than 3 photographs could be placed, or the lens is impossible.
+        SetupError: pycolmap is not installed, failed or crashed.
     """
     task = {
         "folder": str(folder),
@@ -90,104 +77,17 @@ def reconstruct(
         "long_edge_px": long_edge_px,
         "seed": seed,
     }
-    stages = _Stages(progress)
-    code = _run(task, stages)
-    if stages.missing is not None:
-        raise InputError(
-            f"pycolmap: {stages.missing}; poses are estimated with it: pip install "
-            "pycolmap, or reconstruct with COLMAP elsewhere and give the model to 'fit'"
-        )
+    stages = Stages(progress)
+    code = run_task(task, stages)
     if code:
-        raise SetupError(stages.failure(code))
+        raise SetupError(
+            f"{stages.ending(code)}; see that memory and the disk of temporary files "
+            "are not full, look for features at a smaller size (--long-edge), or "
+            "reconstruct with COLMAP elsewhere and give the model to 'fit'"
+        )
     stages.end()
     found = json.loads((work / RESULT).read_text(encoding="utf-8"))
     return _structure(found, len(names))
-
-
-def _run(task: dict[str, Any], stages: _Stages) -> int:
-    """Return the exit code of the process that does a task."""
-    process = subprocess.Popen(
-        module_command(_CHILD),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        encoding="utf-8",
-        errors="replace",
-        start_new_session=True,  # Ctrl-C is for us; we end it
-    )
-    assert process.stdin is not None and process.stdout is not None
-    with process:
-        try:
-            with contextlib.suppress(BrokenPipeError):  # its last lines say why
-                process.stdin.write(json.dumps(task) + "\n")
-                process.stdin.flush()
-            stages.follow(process.stdout)
-            return process.wait()
-        except BaseException:
-            process.kill()
-            raise
-
-
-class _Stages:
-    """Reads what the process says, and reports its progress."""
-
-    def __init__(self, progress: StageCallback) -> None:
-        self.missing: str | None = None
-        self._progress = progress
-        self._stage, self._total = "start", 0
-        self._last: deque[str] = deque(maxlen=_LAST_LINES)
-
-    def follow(self, lines: Iterable[str]) -> None:
-        """Read lines until there are no more."""
-        for line in lines:
-            if line.startswith(MARK):
-                self._told(json.loads(line[len(MARK) :]))
-            else:
-                self._logged(line)
-
-    def _told(self, what: dict[str, Any]) -> None:
-        self.missing = what.get("missing")
-        if "stage" in what:
-            self.end()
-            self._stage, self._total = what["stage"], what["total"]
-            self._show(0)
-        if "done" in what:
-            self._show(what["done"])
-
-    def _logged(self, line: str) -> None:
-        if line.strip():
-            self._last.append(line.strip())
-        count = _COUNT.search(line)
-        if count is None:
-            return
-        kind, *numbers = count.groups()
-        i, n, j, m = (1 if number is None else int(number) for number in numbers)
-        # a file's line comes when it is done, the others when they begin
-        done = (i - 1) * m + j - (kind != "file")
-        self._show(self._total * done // (n * m))
-
-    def _show(self, done: int) -> None:
-        self._progress(self._stage, min(done, self._total - 1), self._total)
-
-    def end(self) -> None:
-        """Report that the stage is done."""
-        if self._total:
-            self._progress(self._stage, self._total, self._total)
-
-    def failure(self, code: int) -> str:
-        """Tell how the process ended, from its exit code, and what to do."""
-        how = f"ended with code {code}"
-        if code < 0:
-            with contextlib.suppress(ValueError):
-                how = f"was ended by {signal.Signals(-code).name}"
-        last = "; ".join(self._last) or "nothing"
-        return (
-            f"pycolmap: {how} at the stage {self._stage!r} (its last lines: {last}); "
-            "see that memory and the disk of temporary files are not full, look for "
-            "features at a smaller size (--long-edge), or reconstruct with COLMAP "
-            "elsewhere and give the model to 'fit'"
-        )
 
 
 def _structure(found: dict[str, Any] | None, count: int) -> Structure:
