@@ -45,17 +45,6 @@ class PosedField:
         self._origin = mi.Point3f(*map(float, translation))
         dr.make_opaque(self._columns, self._origin)
 
-    def at(self, columns: list[mi.Vector3f], origin: mi.Point3f) -> PosedField:
-        """Return this field at another pose, given by arrays that may be attached.
-
-        Args:
-            columns: three, of the rotation from field to world.
-            origin: of the field's frame, metres in the world.
-        """
-        twin = copy.copy(self)
-        twin._columns, twin._origin = columns, origin
-        return twin
-
     def with_gain(self, gain: mi.Color3f) -> PosedField:
         """Return this field with its radiance multiplied, ray by ray.
 

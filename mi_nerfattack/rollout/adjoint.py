@@ -7,8 +7,8 @@ taken in resolved form, ``G_t = x_t - Phi(x_{t-1}, u)``, also for implicit integ
 (the derivative of whose Phi is that of the implicit function), so that ``l_t`` is
 minus the derivative of J by ``x_t``. Source: appendix A.9 to A.12.
 
-All members but :class:`FullTape` (tape.py) solve these equations; they differ in what
-they keep. m is the number of rows of the state, T the number of control periods.
+All members solve these equations; they differ in what they keep. m is the number of
+rows of the state, T the number of control periods.
 """
 
 from __future__ import annotations
@@ -31,10 +31,13 @@ class AbstractAdjoint(ABC):
         """Return what to keep of a control period during the forward pass."""
 
     @abstractmethod
+    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
+        """Go through the control periods of a drive, last one first."""
+
     def gradient(
         self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
     ) -> Gradient:
-        """Differentiate a cost.
+        """Differentiate a cost: solve for the costates, period by period.
 
         Args:
             loop: as it was when it drove.
@@ -45,25 +48,12 @@ class AbstractAdjoint(ABC):
         Raises:
             TypeError: sensor or policy have no such derivatives.
         """
-
-
-class AbstractCostates(AbstractAdjoint):
-    """Solves for the costates, period by period."""
-
-    def gradient(
-        self, loop: ClosedLoop, drive: Trajectory, cost: Cost, options: Options
-    ) -> Gradient:
-        """See :meth:`AbstractAdjoint.gradient`."""
         visits = self.visit(loop, drive)
         return backward(loop, drive, visits, cost.by_states(drive), options)
 
-    @abstractmethod
-    def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
-        """Go through the control periods of a drive, last one first."""
-
 
 @dataclass(frozen=True)
-class Replay(AbstractCostates):
+class Replay(AbstractAdjoint):
     """Keeps states, and the policy's memory where it has one; renders all again.
 
     Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
@@ -78,7 +68,7 @@ class Replay(AbstractCostates):
         return step.memory
 
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
-        """See :meth:`AbstractCostates.visit`."""
+        """See :meth:`AbstractAdjoint.visit`."""
         for index in reversed(range(drive.horizon)):
             state = drive.states[index]
             seen = loop.sensor.observe(state, index)
@@ -86,7 +76,7 @@ class Replay(AbstractCostates):
 
 
 @dataclass(frozen=True)
-class KeptBackgrounds(AbstractCostates):
+class KeptBackgrounds(AbstractAdjoint):
     """Keeps how the scene looked in each frame; renders the objects again.
 
     Memory: what :class:`Replay` keeps and 20 bytes a pixel and period (colour, opacity
@@ -102,7 +92,7 @@ class KeptBackgrounds(AbstractCostates):
         return differentiable(loop).keep(step.observation), step.memory
 
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
-        """See :meth:`AbstractCostates.visit`."""
+        """See :meth:`AbstractAdjoint.visit`."""
         sensor = differentiable(loop)
         for index in reversed(range(drive.horizon)):
             kept, memory = drive.kept[index]
@@ -111,7 +101,7 @@ class KeptBackgrounds(AbstractCostates):
 
 
 @dataclass(frozen=True)
-class Checkpointed(AbstractCostates):
+class Checkpointed(AbstractAdjoint):
     """Keeps the policy's memory once a segment; drives each segment again.
 
     For policies with a large memory (stacks of frames) and long drives. Memory: states,
@@ -135,7 +125,7 @@ class Checkpointed(AbstractCostates):
         return step.memory if step.index % self.segment == 0 else None
 
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
-        """See :meth:`AbstractCostates.visit`."""
+        """See :meth:`AbstractAdjoint.visit`."""
         sensor = differentiable(loop)
         starts = range(0, drive.horizon, self.segment)
         for start in reversed(starts):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -37,7 +36,8 @@ class Cost:
         history = drive.history()
         leaf = type(history.rows)(history.rows)
         dr.enable_grad(leaf)
-        dr.backward_from(self.attached(_with(history, leaf)))
+        attached = StateHistory(leaf, history.count, history.horizon, history.dt)
+        dr.backward_from(self.reduction.reduce(self.objective.evaluate(attached)))
         by_rows = np.array(dr.grad(leaf), np.float64)
         shape = (len(leaf), history.count, history.horizon)
         return self.scale * by_rows.reshape(shape).transpose(2, 1, 0)
@@ -45,11 +45,3 @@ class Cost:
     def tangent(self, drive: Trajectory, tangents: np.ndarray) -> float:
         """Differentiate in the direction of tangents (T, n, m) of x_1 to x_T."""
         return float((self.by_states(drive) * tangents).sum())
-
-    def attached(self, history: StateHistory) -> Any:
-        """Evaluate the cost of the batch, one entry, on Dr.Jit's tape."""
-        return self.reduction.reduce(self.objective.evaluate(history))
-
-
-def _with(history: StateHistory, rows: Any) -> StateHistory:
-    return StateHistory(rows, history.count, history.horizon, history.dt)

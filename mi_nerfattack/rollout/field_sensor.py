@@ -24,17 +24,10 @@ from mi_nerfattack.render.composite import (
     RayTangent,
     Seen,
     Task,
-    depth_composite,
 )
 from mi_nerfattack.render.march import STOP, March, Rays
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.taped import taped_march
-from mi_nerfattack.rollout.offset import (
-    offset_gradient,
-    offset_on_tape,
-    offset_pose,
-    wrench_of,
-)
+from mi_nerfattack.rollout.offset import offset_gradient, offset_pose, wrench_of
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
 
@@ -287,26 +280,6 @@ class FieldSensor(AbstractDifferentiableSensor):
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             t_pixels: Any = dr.forward_to(pixels, flags=flags)
         return self._tensor(t_pixels, dr.width(state))
-
-    def trace(self, state: Any, step: int, textures: list[Any], offsets: Any) -> Any:
-        """See :meth:`AbstractDifferentiableSensor.trace`; depth composite only."""
-        if not isinstance(self.composite, DepthComposite):
-            name = type(self.composite).__name__
-            raise TypeError(f"{name}: cannot be taped; use Replay or depth")
-        if not isinstance(self.scene, PosedField):
-            raise TypeError(f"{self.scene.name}: cannot be taped; use Replay")
-        count = dr.width(state)
-        key = dr.opaque(mi.UInt32, step)
-        rays = self._make_rays([state[i] for i in range(3)], key, count)
-        layers = [taped_march(self.scene, rays, self.stop)]
-        for k, (posed, texture) in enumerate(zip(self.objects, textures, strict=True)):
-            posed.field.packed = posed.field.pack(mi.Float(texture.array))
-            if offsets is not None:
-                row = [mi.Float(offsets[k, i].array) for i in range(6)]
-                posed = offset_on_tape(posed, posed.pose, row)
-            layers.append(taped_march(posed, rays, self.stop))
-        pixels = self._develop(depth_composite(layers), rays.direction)
-        return self._tensor(pixels, count)
 
     def _make_rays(self, state: Any, step: mi.UInt32, count: int) -> Rays:
         origin, direction = self._rays(state, count)

@@ -70,20 +70,3 @@ def wrench_of(posed: PosedField, rays: Any, seen_as: Any) -> list[Any]:
     torque = dr.cross(arm, by_origin) + dr.cross(rays.direction, by_direction)
     double = dr.float64_array_t(mi.Float)
     return [dr.sum(double(row)) for row in (*by_origin, *torque)]
-
-
-def offset_on_tape(posed: PosedField, pose: Pose, offset: Any) -> PosedField:
-    """Return the field moved by an offset, (6,), that is on Dr.Jit's tape."""
-    shift, w = mi.Vector3f(*offset[:3]), mi.Vector3f(*offset[3:])
-    square = dr.squared_norm(w)
-    angle = dr.sqrt(dr.maximum(square, 1e-12))
-    small = square < 1e-6
-    first = dr.select(small, 1 - square / 6, dr.sin(angle) / angle)
-    second = dr.select(small, 0.5 - square / 24, (1 - dr.cos(angle)) / dr.square(angle))
-    columns = []
-    for column in np.asarray(pose.rotation, np.float32).T:
-        v = mi.Vector3f(*map(float, column))
-        columns.append(
-            v + first * dr.cross(w, v) + second * dr.cross(w, dr.cross(w, v))
-        )
-    return posed.at(columns, mi.Point3f(*map(float, pose.translation)) + shift)

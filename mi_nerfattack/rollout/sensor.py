@@ -157,26 +157,3 @@ class AbstractDifferentiableSensor(AbstractSensor):
             TypeError: the sensor has no forward mode.
         """
         raise TypeError(f"{type(self).__name__}: has no forward mode; use gradient")
-
-    def trace(
-        self,
-        state: Any,
-        step: int,
-        textures: list[Any],
-        offsets: Any,
-    ) -> Any:
-        """Render with everything on Dr.Jit's tape; for :class:`FullTape`.
-
-        Args:
-            state: (m, n), attached or not.
-            step: index of the control period.
-            textures: one tensor (n_vertices, 3) an object, attached or not.
-            offsets: (k, 6) tensor, attached or not; None for none.
-
-        Returns:
-            the image, attached.
-
-        Raises:
-            TypeError: the sensor cannot be taped.
-        """
-        raise TypeError(f"{type(self).__name__}: cannot be taped; use Replay")

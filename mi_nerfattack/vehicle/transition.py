@@ -95,10 +95,6 @@ class Transition:
         dr.eval(result)
         return result
 
-    def trace(self, state: Any, older: Any, newer: Any) -> Any:
-        """Drive one period on Dr.Jit's tape."""
-        return self._advance(state, older, newer)[-1]
-
     def _advance(self, state: Any, older: Any, newer: Any) -> list[Any]:
         path = [state]
         for i in range(self.substeps):
@@ -110,7 +106,7 @@ class Transition:
         with dr.resume_grad():
             leaves = tuple(type(x)(x) for x in (state, older, newer))
             dr.enable_grad(leaves)
-            after = self.trace(*leaves)
+            after = self._advance(*leaves)[-1]
             dr.backward_from(_inner(after, cotangent))
             return tuple(dr.grad(leaf) for leaf in leaves)
 
@@ -120,7 +116,7 @@ class Transition:
             dr.enable_grad(leaves)
             for leaf, tangent in zip(leaves, tangents, strict=True):
                 dr.set_grad(leaf, tangent)
-            after = self.trace(*leaves)
+            after = self._advance(*leaves)[-1]
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             return dr.forward_to(after, flags=flags)
 

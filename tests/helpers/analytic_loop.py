@@ -110,12 +110,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
                 image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             )
 
-    def trace(self, state: Any, step: int, textures: list[Any], offsets: Any) -> Any:
-        shift = dr.opaque(row_type(), period_shift(step))
-        if offsets is not None:
-            offsets = tensor_type()(offsets)
-        return self._image(state, shift, textures, offsets)
-
     def start_gradient(self, poses: bool = False) -> None:
         self._gradients = [dr.zeros(tensor_type(), t.shape) for t in self._textures]
         self._by_offsets = np.zeros_like(self._offsets)
@@ -200,6 +194,7 @@ class TorchLoop:
         dt: control period, seconds.
         substeps: integration steps a period.
         delay: integration steps until a control takes effect.
+        states: those of the last drive, with their graph.
     """
 
     vehicle: str
@@ -209,7 +204,7 @@ class TorchLoop:
     dt: float
     substeps: int = 1
     delay: int = 0
-    images: list[torch.Tensor] = field(default_factory=list)
+    states: list[torch.Tensor] = field(default_factory=list)
 
     def drive(
         self,
@@ -224,14 +219,12 @@ class TorchLoop:
         Returns:
             States (n, horizon + 1, m) and raw controls (n, horizon), with their graph.
         """
-        self.images.clear()
         states, controls, state, steps = [initial], [], initial, 0
         goals = torch.full((len(initial),), self.goal)
         none = torch.zeros_like(initial[:, 0])
         for period in range(horizon):
             seen = state if attached else state.detach()
             image = torch_image(seen, period, textures, offsets)
-            self.images.append(image)
             controls.append(self.module(image.permute(0, 3, 1, 2), goals))
             for _ in range(self.substeps):
                 source = (steps - self.delay) // self.substeps
@@ -239,6 +232,7 @@ class TorchLoop:
                 state = self._advance(state, limited(self.vehicle, command))
                 steps += 1
             states.append(state)
+        self.states = states
         return torch.stack(states, 1), torch.stack(controls, 1)
 
     def _advance(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:

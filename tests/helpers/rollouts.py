@@ -6,14 +6,16 @@ import numpy as np
 
 INITIAL = np.array([[0.0, 0.35, 0.02]])
 OFFSET = np.array([[0.05, -0.1, 0.08, 0.1, -0.2, 0.15]])
-ADJOINTS = ("replay", "kept_backgrounds", "checkpointed", "tape")
+ADJOINTS = ("replay", "kept_backgrounds", "checkpointed")
 
 
 def make_adjoint(name):
-    from mi_nerfattack.rollout import adjoint, tape
+    from helpers.tape import FullTape
+
+    from mi_nerfattack.rollout import adjoint
 
     if name == "tape":
-        return tape.FullTape()
+        return FullTape()
     if name == "checkpointed":
         return adjoint.Checkpointed(3)
     return adjoint.Replay() if name == "replay" else adjoint.KeptBackgrounds()

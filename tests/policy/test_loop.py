@@ -21,7 +21,6 @@ from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.rollout.objective import AbstractObjective
-from mi_nerfattack.rollout.tape import FullTape
 from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -171,13 +170,6 @@ def test_memory_matters_to_the_gradient(monkeypatch):
     rollout = Rollout(loop, Wave(), HORIZON)
     found = rollout.gradient(rollout.run(to_state(initial))).textures[0].numpy()
     assert np.linalg.norm(found - by_texture) > 0.05 * np.linalg.norm(by_texture)
-
-
-def test_the_full_tape_refuses_memory():
-    loop, _, initial = make("recurrent")
-    rollout = Rollout(loop, Wave(), HORIZON, adjoint=FullTape())
-    with pytest.raises(TypeError, match="memory of TorchPolicy"):
-        rollout.gradient(rollout.run(to_state(initial)))
 
 
 def test_black_boxes_drive_and_are_refused():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -86,23 +85,6 @@ def test_sensor_tangent_is_the_transpose(rng, follow):
     if follow:
         right += (by_state.numpy().T * tangents[0]).sum()
     assert (image.numpy() * cotangent).sum() == pytest.approx(right, rel=1e-11)
-
-
-def test_traced_image_has_the_same_derivatives(rng):
-    loop, _ = analytic.make_pair()
-    sensor, state = loop.sensor, to_state(analytic.random_poses(2))
-    seen = sensor.observe(state, 2)
-    cotangent = analytic.tensor(rng.normal(size=seen.image.shape))
-    sensor.start_gradient()
-    by_state = sensor.vjp(seen, state, cotangent, True)
-    texture = sensor.textures()[0]
-    dr.enable_grad(state, texture)
-    image = sensor.trace(state, 2, [texture], None)
-    np.testing.assert_array_equal(image.numpy(), seen.image.numpy())
-    dr.backward(dr.sum(image.array * cotangent.array))
-    np.testing.assert_allclose(dr.grad(state).numpy(), by_state.numpy(), rtol=1e-12)
-    expected = sensor.texture_gradients()[0].numpy()
-    np.testing.assert_allclose(dr.grad(texture).numpy(), expected, rtol=1e-12)
 
 
 def test_the_torch_policy_keeps_double_precision(rng):
