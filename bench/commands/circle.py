@@ -35,9 +35,7 @@ class BenchCircle:
         from mi_nerfattack.commands.shared.progress import StageBars
 
         with StageBars() as bars:
-            circles = circle.run(
-                lambda done, total: bars.show("circles", done, total, f"{done}/{total}")
-            )
+            circles = circle.run(bars.counter("circles"))
         circle.write_figure(self.output, circles)
         document = circle.to_document(circles)
         if self.json:

@@ -29,9 +29,7 @@ class BenchExperts:
         from mi_nerfattack.commands.shared.progress import StageBars
 
         with StageBars() as bars:
-            results = experts.run(
-                lambda done, total: bars.show("drives", done, total, f"{done}/{total}")
-            )
+            results = experts.run(bars.counter("drives"))
         document = experts.to_document(results)
         if self.json:
             print(json.dumps(document, allow_nan=False))

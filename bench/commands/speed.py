@@ -86,12 +86,7 @@ class BenchComposite:
         from mi_nerfattack.commands.shared.progress import StageBars
 
         with StageBars() as bars:
-            results, pictures = composite.run(
-                size,
-                lambda done, total: bars.show(
-                    "heights", done, total, f"{done}/{total}"
-                ),
-            )
+            results, pictures = composite.run(size, bars.counter("heights"))
         composite.write_figure(self.output, results, pictures)
         if self.json:
             print(json.dumps(composite.to_document(results, size), allow_nan=False))

@@ -87,7 +87,7 @@ def _rate(settings: Settings, count: int, stage: str, show: OnStage) -> float:
     wanted = CollectSettings(frames=settings.frames, shard=settings.shard)
     times = {}
 
-    def note(done: int, total: int, left_s: float) -> None:
+    def note(done: int, total: int) -> None:
         times[done] = time.monotonic()
         show(stage, done, total, "frames")
 

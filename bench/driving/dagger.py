@@ -228,7 +228,7 @@ class _Bench:
             replace(self.settings.collecting, frames=count, seed=seed),
             self.folder / name,
             self.workers,
-            lambda done, total, left_s: self.show(f"{name} frames", done, total),
+            lambda done, total: self.show(f"{name} frames", done, total),
         )
 
     def _module(self, seed: int) -> PilotNet:

@@ -147,7 +147,6 @@ class Asset:
             read_views,
             render_views,
         )
-        from mi_nerfattack.commands.shared.fit_report import show_views
 
         placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
         is_cube, is_folder = self.source == "cube", Path(self.source).is_dir()
@@ -166,7 +165,7 @@ class Asset:
             200 * self.resolution // 64 if self.size is None else self.size,
             self.seed,
             Lighting() if self.ambient is None else Lighting(self.ambient),
-            partial(show_views, bars),
+            bars.counter("rendering views"),
         )
 
     def _refuse_unused(self, is_cube: bool, is_folder: bool) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +37,6 @@ class Capture:
         """Render and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.scene import capture_scene
-        from mi_nerfattack.commands.shared.fit_report import show_views
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.render.camera.intrinsics import from_fov
@@ -57,7 +55,7 @@ class Capture:
                 camera,
                 self.spp,
                 self.seed,
-                partial(show_views, bars),
+                bars.counter("rendering views"),
             )
         print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
         folder = shlex.quote(str(path.parent))

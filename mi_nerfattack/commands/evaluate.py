@@ -21,7 +21,6 @@ from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
@@ -102,7 +101,7 @@ class Evaluate:
             if self.objects and not work.place.objects:
                 town = "a town its --scene, " * (self.where.server is not None)
                 bars.say(f"no drives past objects: {town}a scene its --object FILE")
-            found = run_evaluation(work, workers, _Progress(bars).show)
+            found = run_evaluation(work, workers, bars.counter("driving", "step "))
         if self.output is not None:
             files.write_json(self.output, found.card)
         if self.page is not None:
@@ -198,23 +197,6 @@ class Evaluate:
         default = 1 if alone else available_cores()
         count = default if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
-
-
-class _Progress:
-    """Shows steps, and how long it still takes."""
-
-    def __init__(self, bars: StageBars) -> None:
-        self._bars, self._first = bars, (0, 0.0)
-
-    def show(self, done: int, total: int) -> None:
-        """Show control periods done and wanted."""
-        now = time.monotonic()
-        if self._first == (0, 0.0):
-            self._first = done - 1, now
-        before, start = self._first
-        left = (now - start) / (done - before) * (total - done)
-        state = f"step {done}/{total}, {left / 60:.1f} min left"
-        self._bars.show("driving", done, total, state)
 
 
 def _check_different(option: str, names: tuple[str, ...]) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -14,45 +12,8 @@ import tyro
 if TYPE_CHECKING:
     import numpy as np
 
-    from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.render.pathtrace.frames import FrameRenderer
     from mi_nerfattack.render.pathtrace.sequence import Shot
-
-
-class _Pace:
-    """Shows how far a path is, and at an early end how to continue."""
-
-    def __init__(self, bars: StageBars, folder: Path) -> None:
-        self.finished = False
-        self._bars, self._folder = bars, folder
-        self._done = self._total = self._rendered = 0
-        self._start = time.monotonic()
-
-    def __enter__(self) -> _Pace:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if not self.finished and self._done:
-            print(
-                f"{self._done} of {self._total} frames are in {self._folder}; the same "
-                "command with --skip-existing continues",
-                file=sys.stderr,
-            )
-
-    def show(self, done: int, total: int, kept: bool) -> None:
-        """Take note of a frame."""
-        self._done, self._total = done, total
-        self._rendered += not kept
-        pace = (time.monotonic() - self._start) / max(self._rendered, 1)
-        state = f"{done}/{total}"
-        if not kept:
-            state += f"  {pace:.2f} s a frame, {pace * (total - done):.0f} s left"
-        self._bars.show("rendering", done, total, state)
 
 
 @dataclass(frozen=True)
@@ -196,14 +157,27 @@ class Render:
 
         is_video = self.output.suffix.lower() == ".mp4"
         folder = working_folder(self.output) if is_video else self.output
-        with StageBars() as bars, _Pace(bars, folder) as pace:
-            if is_video:
-                size = render_video(shot, self.output, self.fps, pace.show)
-            else:
-                size = shot.renderer.size_px
-                render_folder(shot, folder, pace.show)
-            pace.finished = True
-        count = len(shot.camera_to_world)
+        count, written = len(shot.camera_to_world), 0
+        with StageBars() as bars:
+
+            def show(done: int, total: int, kept: bool) -> None:
+                nonlocal written
+                written = done
+                bars.show("rendering", done, total, f"{done}/{total}", kept)
+
+            try:
+                if is_video:
+                    size = render_video(shot, self.output, self.fps, show)
+                else:
+                    size = shot.renderer.size_px
+                    render_folder(shot, folder, show)
+            except BaseException:
+                if written:
+                    bars.say(
+                        f"{written} of {count} frames are in {folder}; the same "
+                        "command with --skip-existing continues"
+                    )
+                raise
         print(f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px")
         if size != shot.renderer.size_px:
             width, height = shot.renderer.size_px

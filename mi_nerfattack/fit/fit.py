@@ -234,16 +234,14 @@ class _Clock:
             )
         steps = max(1, self.training.step - self._reported)
         self._reported = self.training.step
-        fraction = self.fraction()
         square = float(total.square[0]) / rays
         at = FitProgress(
             self.training.step,
             self.options.steps,
-            fraction,
+            self.fraction(),
             float(total.loss[0]) / rays,
             -10 * float(np.log10(max(square, 1e-12))),
             self.elapsed,
-            self.elapsed * (1 - fraction) / max(fraction, 1e-9),
             self.training.field.occupancy.fraction,
             rays / steps,
             int(total.kept[0]) / steps,

@@ -102,7 +102,7 @@ class FitProgress:
         fraction: of the whole fit, by steps or by time, whichever is further.
         loss: mean over the last steps.
         psnr_db: of the last batches, sRGB.
-        elapsed_s, remaining_s: wall time.
+        elapsed_s: wall time.
         occupied: share of cells that are marched through.
         rays: of a step, mean over the last steps.
         samples: of a step that light reaches the eye from, likewise.
@@ -114,7 +114,6 @@ class FitProgress:
     loss: float
     psnr_db: float
     elapsed_s: float
-    remaining_s: float
     occupied: float
     rays: float = 0.0
     samples: float = 0.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,8 +23,8 @@ from mi_nerfattack.training.dataset import write_shard
 from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
 from mi_nerfattack.vehicle.route.route import Route
 
-#: Called with frames done, frames wanted, and the remaining time in seconds.
-OnFrames = Callable[[int, int, float], None]
+#: Called with frames done and frames wanted.
+OnFrames = Callable[[int, int], None]
 
 _DONE = "shard.json"
 _MANIFEST = "manifest.json"
@@ -92,7 +91,7 @@ def collect(
     settings: CollectSettings,
     folder: str | Path,
     workers: AbstractWorkers,
-    progress: OnFrames = lambda done, total, left_s: None,
+    progress: OnFrames = lambda done, total: None,
 ) -> list[Path]:
     """Render what vehicles near the routes see, and label it by the expert.
 
@@ -126,9 +125,16 @@ def collect(
     _claim(root, about)
     paths = [root / f"shard_{index:04d}" for index in range(settings.shards)]
     missing = [i for i, path in enumerate(paths) if not _is_done(path)]
-    counter = _Counter(settings, missing, progress)
+    done = settings.frames - sum(map(settings.size, missing))
+    progress(done, settings.frames)
+
+    def count(frames: int) -> None:
+        nonlocal done
+        done += frames
+        progress(done, settings.frames)
+
     work = _Shards(site, tuple(routes), source, settings, root)
-    workers.run(work, missing, counter.add)
+    workers.run(work, missing, count)
     return paths
 
 
@@ -265,27 +271,6 @@ class _Stage:
             pose = settings.roadside.place(chosen, route, reach, self.ground, rng)
             posed = [PosedField(chosen, pose)]
         environment.show(posed)
-
-
-class _Counter:
-    """Adds up the frames of all workers, and tells how long the rest will take."""
-
-    def __init__(
-        self, settings: CollectSettings, missing: Sequence[int], progress: OnFrames
-    ) -> None:
-        self.total, self.progress = settings.frames, progress
-        self.done = self.total - sum(settings.size(index) for index in missing)
-        self.first, self.start = self.done, time.monotonic()
-        if missing:
-            progress(self.done, self.total, float("nan"))
-        else:
-            progress(self.total, self.total, 0.0)
-
-    def add(self, frames: int) -> None:
-        """Count frames that were just rendered."""
-        self.done += frames
-        pace = (time.monotonic() - self.start) / (self.done - self.first)
-        self.progress(self.done, self.total, pace * (self.total - self.done))
 
 
 def _draw_states(

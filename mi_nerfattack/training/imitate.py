@@ -247,11 +247,9 @@ class _Imitation:
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def _frames(self, stage: str) -> OnFrames:
-        def show(done: int, total: int, left_s: float) -> None:
-            left = "" if left_s != left_s else f"  {_clock(left_s)} left"
-            self.progress(stage, done, total, f"{done}/{total} frames{left}")
-
-        return show
+        return lambda done, total: self.progress(
+            stage, done, total, f"{done}/{total} frames"
+        )
 
     def _steps(self, stage: str) -> Callable[[int, int], None]:
         return lambda done, total: self.progress(
@@ -332,9 +330,3 @@ def _take_weights(module: PilotNet, start: PilotNet) -> None:
             "are needed here"
         )
     module.load_state_dict(start.state_dict())
-
-
-def _clock(seconds: float) -> str:
-    """Return a time as minutes and seconds."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"

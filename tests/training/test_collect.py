@@ -118,7 +118,7 @@ def test_interrupted_collection_continues_with_the_same_frames(site, tmp_path):
     whole = collect(site, routes, Scattered(), settings, tmp_path / "whole", HERE)
     part = tmp_path / "part"
 
-    def stop(done, total, left_s):
+    def stop(done, total):
         if done == 20:
             raise KeyboardInterrupt
 
@@ -135,7 +135,7 @@ def test_interrupted_collection_continues_with_the_same_frames(site, tmp_path):
         settings,
         part,
         HERE,
-        lambda done, total, left_s: seen.append((done, total)),
+        lambda done, total: seen.append((done, total)),
     )
     assert (first / "frames.npy").stat().st_mtime_ns == written
     assert seen == [(done, 36) for done in range(12, 37)]

@@ -12,7 +12,6 @@ import torch
 from helpers.roadside import PaintedSite, bent, flat_ground, small, straight
 
 from mi_nerfattack import cli
-from mi_nerfattack.commands.shared.progress import StageBars
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.errors import InputError
@@ -376,12 +375,3 @@ def test_train_names_a_missing_scene(tmp_path, capsys):
     assert run_train(tmp_path, *arguments) == 2
     assert f"{missing}: does not exist" in capsys.readouterr().err
     assert not (tmp_path / "policy.safetensors").exists()
-
-
-def test_bars_print_plain_lines_where_there_is_no_terminal(capsys):
-    with StageBars() as bars:
-        for done in range(1, 5):
-            bars.show("frames", done, 4, f"{done}/4")
-    lines = capsys.readouterr().err.splitlines()
-    assert "frames: 4/4" in lines[-1]
-    assert len(lines) <= 2  # not one for each call

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.evaluation.field_and_scene import CompareOptions, Comparison
     from mi_nerfattack.fields import AbstractField
 
@@ -84,8 +82,9 @@ class CompareArguments:
         if self.compare is None or self.routes is None:
             return None
         with StageBars() as bars:
+            show = bars.counter("comparing with the scene")
             comparison = compare_with_scene(
-                field, self.compare, self.routes, self.options(), partial(_show, bars)
+                field, self.compare, self.routes, self.options(), show
             )
         title = f"{output.name} against {self.compare.name}"
         write_compare_report(compare_folder(output), comparison, title)
@@ -142,7 +141,3 @@ def print_comparison(comparison: Comparison, output: Path) -> None:
     page = compare_folder(output) / "report.html"
     for line in (settings_line(comparison), verdict(comparison), f"Wrote {page}."):
         console.print(line, soft_wrap=True, highlight=False)
-
-
-def _show(bars: StageBars, done: int, total: int) -> None:
-    bars.show("comparing with the scene", done, total, f"{done}/{total}")

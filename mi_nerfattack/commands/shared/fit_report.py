@@ -22,16 +22,8 @@ if TYPE_CHECKING:
 
 def show_fit(bars: StageBars, at: FitProgress) -> None:
     """Show the state of a fit."""
-    state = (
-        f"step {at.step}  loss {at.loss:.4f}  PSNR {at.psnr_db:.2f} dB  "
-        f"{at.remaining_s:.0f} s left"
-    )
+    state = f"step {at.step}  loss {at.loss:.4f}  PSNR {at.psnr_db:.2f} dB"
     bars.show("fitting", at.fraction, 1.0, state)
-
-
-def show_views(bars: StageBars, done: int, total: int) -> None:
-    """Show how many views are rendered."""
-    bars.show("rendering views", done, total, f"{done}/{total}")
 
 
 def check_output(path: Path) -> None:

@@ -50,7 +50,7 @@ def solid_box():
 def a_result(field, images: PosedImages, **changes) -> FitResult:
     scores = evaluate(field, images, held_out(len(images)))
     history = tuple(
-        FitProgress(25 * i, 100, i / 4, 0.1 / i, 20.0 + i, 2.0 * i, 1.0, 0.1)
+        FitProgress(25 * i, 100, i / 4, 0.1 / i, 20.0 + i, 2.0 * i, 0.1)
         for i in range(1, 5)
     )
     values = {
