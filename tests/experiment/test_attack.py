@@ -19,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.mark.slow
-def test_attack_writes_a_complete_run_folder(folder, tmp_path):
+def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     from mi_nerfattack.evaluation.metrics import validate
     from mi_nerfattack.fields import load_grid
     from mi_nerfattack.io.exr import read_layers
 
     output = tmp_path / "run"
     result = run(
-        "attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
+        "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
     )
     assert "gradient" in result.stdout and str(output) in result.stdout
     document = json.loads((output / "metrics.json").read_text())
@@ -41,7 +41,7 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
     rows = (output / "steps.csv").read_text().splitlines()
     assert len(rows) == 1 + 4 * 2 * (2 + 3 + 2)
     attacked = load_grid(output / "objects" / "ball.safetensors")
-    original = load_grid(folder / "object.safetensors")
+    original = load_grid(scenario_folder / "object.safetensors")
     change = attacked.texture.numpy() - original.texture.numpy()
     assert np.abs(change).max() > 0.1
     density = attacked.parameters()["density"].numpy()
@@ -58,18 +58,20 @@ def test_attack_writes_a_complete_run_folder(folder, tmp_path):
     assert "<html" in (output / "report.html").read_text()
     # a second run into the same folder is refused and changes nothing
     before = (output / "metrics.json").read_bytes()
-    again = run("attack", folder / "scenario.toml", "-o", output, cwd=tmp_path, check=2)
+    again = run(
+        "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=2
+    )
     assert "not an empty folder" in again.stderr
     assert (output / "metrics.json").read_bytes() == before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_attack_resumes(folder, tmp_path, number):
+def test_interrupted_attack_resumes(scenario_folder, tmp_path, number):
     output = tmp_path / "run"
     text = SCENARIO.replace("iterations = 3", "iterations = 10")
     text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
-    path = folder / f"long_{number}.toml"
+    path = scenario_folder / f"long_{number}.toml"
     path.write_text(text)
     process = subprocess.Popen(
         [sys.executable, "-m", "mi_nerfattack.cli", "attack", path, "-o", output],
@@ -90,7 +92,7 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
     assert not (output / "metrics.json").exists()
     # another scenario may not continue it, and changes nothing
     kept = (output / "scenario.toml").read_text()
-    other = folder / "scenario.toml"
+    other = scenario_folder / "scenario.toml"
     refused = run("attack", other, "-o", output, "--resume", cwd=tmp_path, check=2)
     assert "checkpoint.safetensors" in refused.stderr
     assert (output / "scenario.toml").read_text() == kept
@@ -102,8 +104,8 @@ def test_interrupted_attack_resumes(folder, tmp_path, number):
     assert (output / "metrics.json").exists()
 
 
-def test_attack_raises_its_objective(folder):
-    attack = make_attack(folder)
+def test_attack_raises_its_objective(scenario_folder):
+    attack = make_attack(scenario_folder)
     for _ in range(8):
         attack.step()
     last = attack.measure()
@@ -112,30 +114,30 @@ def test_attack_raises_its_objective(folder):
     assert attack.best_mean_m >= last.cross_track_mean_m
 
 
-def make_attack(folder):
+def make_attack(scenario_folder):
     from mi_nerfattack.policy.pilotnet import PilotNet
     from mi_nerfattack.policy.torch_policy import TorchPolicy
     from mi_nerfattack.scenario.build.attack import build_attack
     from mi_nerfattack.scenario.build.world import build_world
     from mi_nerfattack.scenario.scenario import load_scenario
 
-    scenario, _ = load_scenario(folder / "scenario.toml")
-    policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
-    return build_attack(build_world(scenario, folder, policy))
+    scenario, _ = load_scenario(scenario_folder / "scenario.toml")
+    policy = TorchPolicy(PilotNet.load(scenario_folder / "policy.safetensors"))
+    return build_attack(build_world(scenario, scenario_folder, policy))
 
 
-def test_a_checkpoint_continues_bit_for_bit(folder, tmp_path, single_thread):
+def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_thread):
     from mi_nerfattack.attack.checkpoint import CheckpointFile
 
-    whole = make_attack(folder)
+    whole = make_attack(scenario_folder)
     for _ in range(4):
         whole.step()
-    half = make_attack(folder)
+    half = make_attack(scenario_folder)
     for _ in range(2):
         half.step()
     path = tmp_path / "checkpoint.safetensors"
     CheckpointFile(path, {}).save(half, {})
-    resumed, kept = make_attack(folder), CheckpointFile(path, {})
+    resumed, kept = make_attack(scenario_folder), CheckpointFile(path, {})
     kept.read()
     kept.restore(resumed)
     for _ in range(2):
@@ -160,16 +162,16 @@ def test_a_checkpoint_continues_bit_for_bit(folder, tmp_path, single_thread):
         ),
     ],
 )
-def test_bad_input_is_named(folder, tmp_path, capsys, change, words):
+def test_bad_input_is_named(scenario_folder, tmp_path, capsys, change, words):
     from mi_nerfattack import cli
     from mi_nerfattack.io import files
 
-    raw = (folder / "object.safetensors").read_bytes()
-    (folder / "truncated.safetensors").write_bytes(raw[: len(raw) // 2])
-    tensors, metadata = files.read_safetensors(folder / "object.safetensors")
+    raw = (scenario_folder / "object.safetensors").read_bytes()
+    (scenario_folder / "truncated.safetensors").write_bytes(raw[: len(raw) // 2])
+    tensors, metadata = files.read_safetensors(scenario_folder / "object.safetensors")
     tensors["texture"] = np.full_like(tensors["texture"], np.nan)
-    files.write_safetensors(folder / "nan.safetensors", tensors, metadata)
-    path = folder / "bad.toml"
+    files.write_safetensors(scenario_folder / "nan.safetensors", tensors, metadata)
+    path = scenario_folder / "bad.toml"
     path.write_text(SCENARIO.replace(*change))
     assert cli.main(["attack", str(path), "-o", str(tmp_path / "run")]) == 2
     message = capsys.readouterr().err
@@ -182,7 +184,7 @@ def test_bad_input_is_named(folder, tmp_path, capsys, change, words):
 def test_an_interrupt_inside_a_recorded_loop_is_one(monkeypatch, capsys):
     from mi_nerfattack import cli
 
-    def interrupted(arguments):
+    def interrupted(*arguments):
         del arguments
         try:
             raise KeyboardInterrupt

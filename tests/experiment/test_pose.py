@@ -60,9 +60,9 @@ def test_both_at_once_go_on_from_their_tensors(single_thread):
     assert whole.best_offsets.any()
 
 
-def test_a_run_says_where_the_objects_stand(folder, tmp_path):
-    text = (folder / "scenario.toml").read_text()
-    scenario = folder / "both.toml"
+def test_a_run_says_where_the_objects_stand(scenario_folder, tmp_path):
+    text = (scenario_folder / "scenario.toml").read_text()
+    scenario = scenario_folder / "both.toml"
     scenario.write_text(text.replace("[attack]", '[attack]\nparameters = "both"'))
     run("attack", scenario, "-o", tmp_path / "run", cwd=tmp_path)
     document = json.loads((tmp_path / "run/metrics.json").read_text())

@@ -48,7 +48,7 @@ XML = """\
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def scenario_folder(tmp_path_factory):
     """A complete scenario with tiny fields and an untrained policy."""
     import mitsuba as mi
 
