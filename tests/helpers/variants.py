@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import pytest
 
 _BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 _NAMES = [f"{backend}_ad_" for backend in _BACKENDS]
@@ -11,4 +12,9 @@ _NAMES = [f"{backend}_ad_" for backend in _BACKENDS]
 MONO = [name + "mono" for name in _NAMES if name + "mono" in mi.variants()]
 RGB = [name + "rgb" for name in _NAMES if name + "rgb" in mi.variants()]
 SPECTRAL = [name + "spectral" for name in _NAMES if name + "spectral" in mi.variants()]
-VARIANTS = RGB + MONO + SPECTRAL
+#: What mono does of its own, tests of colour say; `make test-all` runs all of it.
+VARIANTS = [
+    *RGB,
+    *SPECTRAL,
+    *(pytest.param(name, marks=pytest.mark.slow) for name in MONO),
+]

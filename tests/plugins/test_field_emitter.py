@@ -73,9 +73,16 @@ def estimate(loaded: mi.Scene, spp: int, runs: int = 16) -> tuple[np.ndarray, An
     return np.mean(images, 0), np.std(images, 0, ddof=1) / np.sqrt(runs)
 
 
-@pytest.mark.parametrize("inside", [False, True], ids=["outside", "inside"])
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("integrator", [BOTH, BY_EMITTER], ids=["path", "emitter"])
+@pytest.mark.parametrize(
+    ("integrator", "shape", "inside"),
+    [
+        (BOTH, "cube", False),
+        (BY_EMITTER, "sphere", False),
+        (BOTH, "sphere", True),
+        (BY_EMITTER, "cube", True),
+    ],
+    ids=["path cube", "emitter sphere", "path in sphere", "emitter in cube"],
+)
 def test_emitter_sampling_agrees_with_bsdf_sampling(
     grid: Path, shape: str, integrator: dict, inside: bool
 ) -> None:
@@ -90,8 +97,9 @@ def test_emitter_sampling_agrees_with_bsdf_sampling(
     assert abs(found.mean() - expected.mean()) < bound < 0.15 * expected.mean()
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("eye", [(3.0, 0.4, 0.2), (0.3, 0.2, 0.1)], ids=str)
+@pytest.mark.parametrize(
+    ("shape", "eye"), [("cube", (3.0, 0.4, 0.2)), ("sphere", (0.3, 0.2, 0.1))]
+)
 def test_sampled_directions_carry_their_density(grid: Path, shape: str, eye) -> None:
     # sum(radiance / density) over samples is the irradiance of a whole sphere.
     loaded = scene(grid, shape, BOTH, False)

@@ -20,9 +20,12 @@ from mi_nerfattack.fields import save_field
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
 CROP = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_height": 5}
-WINDOWS = pytest.mark.parametrize("window", [{}, CROP], ids=["whole", "crop"])
+FILMS = pytest.mark.parametrize(
+    ("rfilter", "window"),
+    [("box", {}), ("box", CROP), ("gaussian", CROP), ("lanczos", {})],
+    ids=["box", "box crop", "gaussian crop", "lanczos"],
+)
 EYE = (-0.4, 0.2, 0.1)
 BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 
@@ -60,8 +63,7 @@ def stock(sensor: dict, grid: dict) -> mi.Scene:
     )
 
 
-@WINDOWS
-@pytest.mark.parametrize("rfilter", FILTERS)
+@FILMS
 def test_filters_and_crops_are_those_of_the_path_tracer(grid, rfilter, window) -> None:
     sensor = camera(rfilter=rfilter, sample_border=rfilter == "gaussian", **window)
     found = np.array(mi.render(fields(sensor, object=grid), spp=3, seed=5))
@@ -79,8 +81,7 @@ def test_crop_is_a_part_of_the_whole(grid) -> None:
     np.testing.assert_allclose(np.array(part)[..., :4], expected, atol=4e-3)
 
 
-@WINDOWS
-@pytest.mark.parametrize("rfilter", FILTERS)
+@FILMS
 def test_derivatives_pass_through_filters_and_crops(grid, rfilter, window, rng) -> None:
     loaded = fields(camera(rfilter=rfilter, **window), object=grid)
     found = derivatives(loaded, 3, 3)
@@ -103,7 +104,7 @@ def derivatives(loaded: mi.Scene, channels: int, spp: int, **view) -> Derivative
 
 @pytest.mark.parametrize(
     ("pixel_format", "channels"),
-    [("luminance", 1), ("luminance_alpha", 2), ("rgb", 3), ("rgba", 4), ("xyz", 3)],
+    [("luminance_alpha", 2), ("rgba", 4), ("xyz", 3)],
 )
 def test_pixel_formats(grid, pixel_format: str, channels: int, rng) -> None:
     sensor = camera(pixel_format=pixel_format)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import Derivatives, images
+from helpers.variants import MONO, RGB, SPECTRAL
 
 from mi_nerfattack.fields import GridField, NGPField, save_field
 from mi_nerfattack.render.lighting.spectrum import emission
@@ -163,6 +164,7 @@ def test_ngp_field(ngp: str, rng, name: str) -> None:
     check_network(found, rng, name)
 
 
+@pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
 def test_spectra_of_volumes_are_those_of_their_colours(grid: str, rng) -> None:
     loaded = mi.load_dict(volume(grid, quantity="radiance"))
     it = interactions(rng)
@@ -220,8 +222,11 @@ def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=atol)
 
 
-@pytest.mark.parametrize("seeing", ["path", "direct", "prb"])
-@pytest.mark.parametrize("eye", [(3, 2, 1), (0.7, 0.5, 0)], ids=["outside", "inside"])
+@pytest.mark.parametrize(
+    ("seeing", "eye"),
+    [("path", (3, 2, 1)), ("direct", (0.7, 0.5, 0)), ("prb", (3, 2, 1))],
+    ids=["path outside", "direct inside", "prb outside"],
+)
 def test_field_emitter(grid: str, rng, seeing: str, eye) -> None:
     fields = emitter(object=volume(grid))
     found = problem(scene({"type": seeing}, eye, (0, 0, -0.4), **fields), "texture", 4)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import Derivatives, images
-from helpers.variants import MONO
+from helpers.variants import MONO, RGB, SPECTRAL
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, save_field
@@ -92,6 +92,7 @@ def test_sun_on_a_box_is_lamberts_law(box: str, angle_deg: float) -> None:
     np.testing.assert_allclose(found, wanted, rtol=1e-2)
 
 
+@pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
 def test_every_variant(each_variant: str, tmp_path: Path) -> None:
     name = str(tmp_path / "box.safetensors")
     save_field(name, small.homogeneous(1e4, RAW))

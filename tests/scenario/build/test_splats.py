@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers import splat_files as made
+from helpers.variants import MONO, RGB, SPECTRAL
 
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
@@ -103,6 +104,7 @@ def test_a_texture_in_front_of_splats_has_a_gradient(paths) -> None:
     assert float(np.abs(dr.grad(params[key]).numpy()).max()) > 0
 
 
+@pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
 def test_every_variant_shows_splats(paths, each_variant: str) -> None:
     world = scene(paths, -20.0)
     image = mi.render(world, spp=64)  # every pixel shows the wall
