@@ -1,4 +1,4 @@
-"""Processes that work for this one: what they import."""
+"""Processes that work for this one: what they import, and what memory is theirs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
+from mi_nerfattack.system.memory import peak_memory_mb
 from mi_nerfattack.system.processes import module_command, safe_path
 
 
@@ -38,3 +40,12 @@ def test_worker_starts_by_pythons_own_modules(shadows):
     process.join(50)
     assert process.exitcode == 0
     assert "PYTHONSAFEPATH" not in os.environ
+
+
+def test_a_process_does_not_inherit_the_peak_of_its_parent():
+    """A child that only imports the package, of a parent that holds 800 MB more."""
+    ballast = np.ones(100_000_000)
+    code = "from mi_nerfattack.system import memory; print(memory.peak_memory_mb())"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert 20 < float(run.stdout) < 700
+    assert peak_memory_mb() > ballast.nbytes / 1e6

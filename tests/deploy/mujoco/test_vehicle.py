@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
@@ -10,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.__main__ import main
 from bench.driving import circle
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR
 from mi_nerfattack.deploy.mujoco import car as mjcf_car
@@ -22,7 +20,6 @@ from mi_nerfattack.deploy.mujoco.vehicle import (
     steering_of,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io import files
 
 CARS = pytest.mark.parametrize("car", [CAR, SMALL_CAR], ids=["full", "small"])
 
@@ -253,23 +250,3 @@ def test_the_mass_is_the_cars():
     model = MujocoVehicle(CAR)._model
     column = model.body(mjcf_car.COLUMN).mass[0]
     assert mujoco.mj_getTotalmass(model) - column == pytest.approx(CAR.mass)
-
-
-def test_circle_command(tmp_path, monkeypatch, capsys):
-    cases = circle.CASES[1:2] + circle.CASES[6:7]
-    monkeypatch.setattr(circle.run, "__defaults__", (cases,))
-    figure = tmp_path / "circle.png"
-    assert main(["circle", "-o", str(figure), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    held, slid = document["circles"]
-    assert abs(held["error"]) < 0.05
-    assert slid["error"] > 0.05 and slid["friction_demand"] > 1
-    assert min(files.read_image(figure).shape[:2]) > 500
-
-
-def test_circle_fit_is_exact_on_a_circle(rng):
-    angle = rng.uniform(0, 2, 20)
-    points = np.stack([3 + 4 * np.cos(angle), -1 + 4 * np.sin(angle)], axis=1)
-    centre, radius = circle.fit_circle(points)
-    np.testing.assert_allclose(centre, (3, -1), atol=1e-9)
-    assert radius == pytest.approx(4)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
-from bench.__main__ import main
 from bench.driving import experts
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle import Route
@@ -188,14 +185,3 @@ def test_pid_wants_a_reset_before_other_vehicles():
         expert.control(np.zeros((2, 3)))
     expert.reset()
     assert expert.control(np.zeros((2, 5))).shape == (2,)
-
-
-def test_bench_prints_a_row_for_each_route(monkeypatch, capsys):
-    drives = experts.Drives("mujoco", "left", "PIDExpert", 0.1, 0.1, 0.02, 0.01, np.inf)
-    monkeypatch.setattr(experts, "run", lambda show: [drives])
-    assert main(["experts"]) == 0
-    assert "never" in capsys.readouterr().out
-    assert main(["experts", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["drives"][0]["recovered_s"] is None
-    assert document["limit_m"] == 0.1

@@ -1,0 +1,311 @@
+"""The PyTorch peers see, learn, drive and differentiate what we do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from helpers.small_fields import blob, small_ngp
+
+from bench.full_ngp import NGPData, enlarge
+from bench.torch.encoding import PlainHashGrid, TunedHashGrid
+from bench.torch.fit import BELOW_WHITE, Pictures, Plan, TorchFit
+from bench.torch.loop import (
+    Resized,
+    TorchCamera,
+    TorchLoop,
+    TorchRoute,
+    TorchVehicle,
+    TorchView,
+)
+from bench.torch.ngp import TorchNGP
+from bench.torch.object import BagLookup, ObjectData, SelectLookup, TorchObject
+from mi_nerfattack.attack.objectives import CrossTrackDeviation
+from mi_nerfattack.backend.colour import linear_to_srgb
+from mi_nerfattack.fields import NGPLayout, Occupancy
+from mi_nerfattack.fit.loss import huber
+from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import ClosedLoop
+from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.vehicle.dynamics import Dubins
+from mi_nerfattack.vehicle.integrators import RK4
+from mi_nerfattack.vehicle.route.route import Route
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
+STOP = 1e-3
+GRIDS = [PlainHashGrid, TunedHashGrid]
+IMAGES, PIXELS = 3, 40
+WIDTH, HEIGHT, HORIZON = 24, 14, 4
+CAMERA = from_fov(WIDTH, HEIGHT, 80.0)
+MOUNT = CameraMount(1.2, 0.3, 4.0)
+POSE = Pose.upright((5.5, 0.7, 1.1), 0.3, 1.3)
+ROUTE = Route("bend", 0, np.array([[-9.0, 0.0], [1.0, 0.1], [9.0, 2.0]]))
+STAGES = [Crop(2, 2, 0, 0), Resize(16, 8)]
+INITIAL = np.array([[0.0, 0.1, 0.05], [0.4, -0.2, 0.0], [-0.2, 0.3, -0.1]])
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Let PyTorch's threads not wait for each other in tiny operations."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def relative(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+# The image
+
+
+def peer_field(rng: np.random.Generator) -> NGPData:
+    """Make a field with holes, a growing step, and densities up to opaque."""
+    field = small_ngp(cone=1 / 64)
+    field.occupancy = Occupancy(rng.random((6, 5, 4)) < 0.6)
+    data = NGPData.of(field)
+    data.tensors["density_net.1"][0] *= 3
+    return data
+
+
+def fan(rng: np.random.Generator, count: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Make rays from inside and outside of the box, in all directions."""
+    origin = rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return origin, direction.astype(np.float32)
+
+
+def our_image(field, origin, direction):
+    rays = Rays(mi.Point3f(origin.T.copy()), mi.Vector3f(direction.T.copy()))
+    posed = PosedField(field)
+    seen = InterleavedComposite().render([posed], rays, STOP)
+    behind = field.background(rays.direction)
+    image = seen.total.radiance + (1 - seen.total.opacity) * behind
+    return posed, rays, seen, behind, image.numpy().T
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_peer_sees_the_same_image(rng, grid):
+    data = peer_field(rng)
+    origin, direction = fan(rng)
+    image = our_image(data.field(), origin, direction)[-1]
+    peer = TorchNGP(data, grid(data.layout), STOP)
+    found = peer.render(torch.tensor(origin), torch.tensor(direction)).numpy()
+    assert image.std() > 0.05
+    assert np.abs(found - image).max() < 1e-3
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_peer_has_the_same_gradients(rng, grid):
+    data = peer_field(rng)
+    origin, direction = fan(rng)
+    cotangent = rng.normal(size=origin.shape).astype(np.float32)
+    field = data.field()
+    for name in ("table", "density_weights", "colour_weights"):
+        dr.enable_grad(field.parameters()[name])
+    posed, rays, seen, behind, _ = our_image(field, origin, direction)
+    by_radiance = mi.Color3f(cotangent.T.copy())
+    by_total = March(by_radiance, -dr.dot(by_radiance, dr.detach(behind)), mi.Float(0))
+    InterleavedComposite().backward([posed], rays, seen, by_total, STOP)
+
+    peer = TorchNGP(data, grid(data.layout), STOP)
+    for value in peer.parameters.values():
+        value.requires_grad_(True)
+    image = peer.render(torch.tensor(origin), torch.tensor(direction))
+    (image * torch.tensor(cotangent)).sum().backward()
+    table = dr.grad(field.parameters()["table"]).numpy()
+    assert relative(peer.parameters["table"].grad.numpy().ravel(), table) < 1e-2
+    for name, net in (("density", field.density_net), ("colour", field.colour_net)):
+        packed = dr.grad(net["weights"])
+        ours = np.linalg.norm(packed.numpy())
+        theirs = [
+            value.grad.numpy().ravel()
+            for key, value in peer.parameters.items()
+            if key.startswith(name)
+        ]
+        assert np.linalg.norm(np.concatenate(theirs)) == pytest.approx(ours, rel=1e-2)
+
+
+def test_both_encodings_agree_where_levels_are_hashed(rng):
+    layout = NGPLayout(6, 2, 9, 4, 64, 16)
+    plain, tuned = PlainHashGrid(layout), TunedHashGrid(layout)
+    assert 0 < plain.dense < layout.levels
+    table = torch.tensor(rng.normal(size=(plain.rows, 2)), dtype=torch.float32)
+    unit = torch.tensor(rng.random((50, 3)), dtype=torch.float32)
+    assert torch.allclose(plain(table, unit), tuned(table, unit), atol=1e-5)
+
+
+def test_an_enlarged_field_shows_the_same(rng):
+    data = peer_field(rng)
+    full = NGPLayout(7, 2, 12, 4, 16, 32)
+    large = enlarge(data, full)
+    assert (large.layout.levels, large.layout.width) == (7, 32)
+    origin, direction = fan(rng)
+    small_image = our_image(data.field(), origin, direction)[-1]
+    large_image = our_image(large.field(), origin, direction)[-1]
+    assert np.abs(small_image - large_image).max() < 2e-3
+
+
+# The fit
+
+
+@pytest.fixture
+def data(rng) -> NGPData:
+    """Return a field with holes and a growing step."""
+    field = small_ngp(cone=1 / 64)
+    field.occupancy = Occupancy(rng.random((6, 5, 4)) < 0.6)
+    return NGPData.of(field)
+
+
+@pytest.fixture
+def pictures(rng) -> Pictures:
+    """Return random pixels on random rays around the field."""
+    direction = rng.normal(size=(IMAGES, PIXELS, 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    return Pictures(
+        rng.integers(0, 256, (IMAGES, PIXELS, 3), dtype=np.uint8),
+        rng.uniform(-1.2, 1.2, (IMAGES, 3)).astype(np.float32),
+        direction.astype(np.float32),
+    )
+
+
+def every_pixel(rng) -> tuple[torch.Tensor, torch.Tensor]:
+    count = IMAGES * PIXELS
+    jitter = torch.tensor(rng.random(count), dtype=torch.float32)
+    return torch.arange(count), jitter
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures, grid):
+    """Ours: the exact composite, which no fit uses, and its replayed derivative."""
+    index, jitter = every_pixel(rng)
+    fit = TorchFit(data, grid(data.layout), pictures, len(index))
+    loss = fit.gradients(index, jitter)
+
+    field = data.field()
+    names = ("table", "density_weights", "colour_weights", "sky")
+    for name in names:
+        dr.enable_grad(field.parameters()[name])
+    rays = Rays(
+        mi.Point3f(np.repeat(pictures.origin, PIXELS, axis=0).T.copy()),
+        mi.Vector3f(pictures.direction.reshape(-1, 3).T.copy()),
+        mi.Float(dr.inf),
+        mi.Float(jitter.numpy().copy()),
+    )
+    posed, composite = [PosedField(field)], InterleavedComposite()
+    seen = composite.render(posed, rays, STOP)
+    radiance = mi.Color3f(seen.total.radiance)
+    opacity = mi.Float(seen.total.opacity)
+    dr.enable_grad(radiance, opacity)
+    image = radiance + (1 - opacity) * field.background(rays.direction)
+    wanted = mi.Color3f(pictures.colour.reshape(-1, 3).T.astype(np.float32) / 255)
+    error = linear_to_srgb(image * BELOW_WHITE) - wanted
+    objective = dr.mean(sum(huber(channel, 0.1) for channel in error)) / 3
+    dr.backward(objective)
+    total = March(dr.grad(radiance), dr.grad(opacity), dr.zeros(mi.Float, len(index)))
+    composite.backward(posed, rays, seen, total, STOP)
+
+    assert loss == pytest.approx(float(objective[0]), rel=1e-3)
+    ours = {name: dr.grad(field.parameters()[name]).numpy() for name in names}
+    theirs = fit.model.parameters["table"].grad.numpy().ravel()
+    assert relative(theirs, ours["table"]) < 1e-2
+    assert relative(fit.model.sky.grad.numpy().ravel(), ours["sky"]) < 1e-2
+    for net in ("density", "colour"):
+        parts = [
+            value.grad.numpy().ravel()
+            for key, value in fit.model.parameters.items()
+            if key.startswith(net)
+        ]
+        packed = np.linalg.norm(ours[f"{net}_weights"])
+        assert np.linalg.norm(np.concatenate(parts)) == pytest.approx(packed, rel=1e-2)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_gradients_do_not_depend_on_the_plan(rng, data, pictures, grid):
+    index, jitter = every_pixel(rng)
+    fit = TorchFit(data, grid(data.layout), pictures, len(index))
+    results = []
+    for plan in Plan.candidates(len(index)):
+        fit.plan = plan
+        loss = fit.gradients(index, jitter)
+        results.append((loss, [leaf.grad.clone() for leaf in fit.leaves]))
+    assert len(results) > 2
+    for loss, gradients in results[1:]:
+        assert loss == pytest.approx(results[0][0], rel=1e-4)
+        for found, expected in zip(gradients, results[0][1], strict=True):
+            assert (found - expected).norm() < 1e-3 * expected.norm()
+
+
+# The closed loop
+
+
+class Gain(torch.nn.Module):
+    """A smooth functional of the image."""
+
+    goals = 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(3)
+        weight = torch.randn(1, 3, 8, 16, generator=generator)
+        self.weight = torch.nn.Parameter(0.05 * weight)
+
+    def forward(self, image: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        return 1.4 * torch.tanh((image * self.weight).sum((1, 2, 3)))
+
+
+@pytest.fixture
+def scene() -> NGPData:
+    """Return fog of many colours all around, some of it in front of the object."""
+    data = NGPData.of(small_ngp(cone=1 / 64))
+    data.tensors["density_net.1"][0] *= 12
+    corner = np.array([20.0, 20.0, 6.0])
+    return replace(data, lower=-corner, upper=corner, step_m=0.4)
+
+
+def peer(scene: NGPData, item: ObjectData, grid=TunedHashGrid, lookup=None):
+    seen = TorchObject(item, lookup or BagLookup(), STOP)
+    seen.texture.requires_grad_(True)
+    ngp = TorchNGP(scene, grid(scene.layout), STOP)
+    view = TorchView(ngp, seen, TorchCamera(CAMERA, MOUNT), 100)
+    vehicle, route = TorchVehicle(5.0, 1.5, 0.1), TorchRoute(ROUTE.points, 0.05)
+    return TorchLoop(view, Resized(Gain(), STAGES), 0, vehicle, route)
+
+
+@pytest.mark.parametrize(
+    ("grid", "lookup"), [(PlainHashGrid, BagLookup()), (TunedHashGrid, SelectLookup())]
+)
+def test_the_peer_drives_and_differentiates_as_we_do(rng, scene, grid, lookup):
+    item = PosedField(blob(rng, peak=4.0), POSE)
+    sensor = FieldSensor(PosedField(scene.field()), [item], CAMERA, MOUNT, stop=STOP)
+    policy = TorchPolicy(Gain(), preprocess=Preprocess(STAGES))
+    loop = ClosedLoop(sensor, policy, 0, Dubins(5.0, 1.5), RK4(), 0.1)
+    rollout = Rollout(loop, StageSum(CrossTrackDeviation(ROUTE, 0.05)), HORIZON)
+    evaluation = rollout.run(loop.initial(INITIAL))
+    expected = rollout.gradient(evaluation).textures[0].numpy()
+
+    other = peer(scene, ObjectData.of(item), grid, lookup)
+    states = other.drive(torch.tensor(INITIAL), HORIZON)
+    cost = other.objective(states)
+    cost.backward()
+    ours = evaluation.trajectory.states_numpy()[:, 1:].transpose(1, 0, 2)
+    assert np.ptp(ours[-1, :, 2] - INITIAL[:, 2]) > 1e-3  # the images do steer
+    assert np.abs(states.detach().numpy() - ours).max() < 1e-3
+    assert cost.item() == pytest.approx(evaluation.value, abs=1e-3)
+    found = other.view.item.texture.grad.numpy()
+    assert np.linalg.norm(expected) > 1e-6
+    assert np.linalg.norm(found - expected) < 1e-2 * np.linalg.norm(expected)
