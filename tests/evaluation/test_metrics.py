@@ -123,7 +123,7 @@ def test_sums_by_hand():
     assert figures["cross_track_max_m"] == 1.0
     assert figures["cross_track_total"] == pytest.approx((0.6 + 2.4) / 2)
     assert figures["steps_departed"] == 2
-    assert figures["runs_departed"] == 1
+    assert figures["drives_departed"] == 1
     assert figures["cross_track_mean_worst_run_m"] == pytest.approx(0.8)
     first, second = figures["per_run"]
     assert (first["run"], first["seed"], second["run"]) == (0, 100, 1)
