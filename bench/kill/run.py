@@ -225,7 +225,7 @@ class Campaign:
         self.landed[life.place()] += 1
         names = list(output.rglob(".*.tmp")) if output.exists() else []
         self.partial += any(map(locks.is_partial, names))
-        for path in output.glob("*.safetensors"):
+        for path in output.rglob("*.safetensors"):
             files.read_safetensors(path)  # what has a name is whole
 
     def _check(self, output: Path, seen: Life, life: Life) -> None:

@@ -19,7 +19,7 @@ from mi_nerfattack.scenario.sections import PolicySection
 from mi_nerfattack.scenario.user_code import split_reference
 from mi_nerfattack.vehicle.route.route import Route
 
-FORMAT = "mi_nerfattack evaluated drive 1"
+FORMAT = "mi_nerfattack evaluated drive 2"
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def identify(
         settings: the number of runs does not count.
 
     Returns:
-        by label of the environment and name of the route, for `resumable.write_kept`.
+        by label of the environment and name of the route, for `resumable.Unit`.
 
     Raises:
         InputError: a file cannot be read.

@@ -34,7 +34,7 @@ from mi_nerfattack.evaluation.identity import (
     short_digest,
 )
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import read_kept, write_kept
+from mi_nerfattack.io.resumable import Record, Unit
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -51,10 +51,16 @@ from mi_nerfattack.system.workers import (
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
-_ARRAYS = ("states", "controls", "cross_track_m", "time_s")
 _REMEDY = "choose another folder for the drives, or remove this one"
 #: The expert sees no image: the smallest are rendered for it, of square pixels.
 _EXPERT_CAMERA = from_fov(8, 3, 90.0)
+
+
+class DriveRecord(Record):
+    """What a kept drive does not say: its seed, and the seconds that it took."""
+
+    seed: int
+    wall_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +123,9 @@ class EvaluateWork(AbstractWork):
         job, start = self.jobs[index], time.monotonic()
         result = opened.drive(job, lambda step: report(1))
         seconds = time.monotonic() - start
-        about = {"wall_s": f"{seconds:.3f}", "seed": f"{result.seed}"}
-        path = self.path(job)
-        files.make_folder(path.parent)
-        tensors = {name: getattr(result, name) for name in _ARRAYS}
-        write_kept(path, tensors, self._identity(job), about)
+        unit = self._unit(job)
+        files.make_folder(unit.path.parent)
+        unit.write(result.arrays(), DriveRecord(seed=result.seed, wall_s=seconds))
 
     def close(self, opened: Opened) -> None:
         """Close the environment."""
@@ -144,19 +148,18 @@ class EvaluateWork(AbstractWork):
         Raises:
             InputError: the file is damaged, or of another evaluation.
         """
-        path = self.path(job)
-        if not path.is_file():
+        kept = self._unit(job).read()
+        if kept is None:
             return None
-        kept = read_kept(path, self._identity(job), _REMEDY)
         found = Drive(
             environment=job.environment.name,
             route=job.route.name,
             case=CLEAN if job.case == EXPERT else job.case,
             run=job.run,
-            seed=int(kept.about["seed"]),
-            **{name: kept.tensors[name] for name in _ARRAYS},
+            seed=kept.record.seed,
+            **kept.tensors,
         )
-        return found, float(kept.about["wall_s"])
+        return found, kept.record.wall_s
 
     def describe(self) -> dict[str, Any]:
         """Return policy, place, routes, environments and settings, as JSON."""
@@ -187,9 +190,10 @@ class EvaluateWork(AbstractWork):
             },
         }
 
-    def _identity(self, job: Job) -> dict[str, str]:
+    def _unit(self, job: Job) -> Unit[DriveRecord]:
         shared = self.identities[job.environment.label, job.route.name]
-        return {**shared, "case": job.case, "run": f"{job.run}"}
+        identity = {**shared, "case": job.case, "run": f"{job.run}"}
+        return Unit(self.path(job), identity, DriveRecord, _REMEDY)
 
 
 class Opened:

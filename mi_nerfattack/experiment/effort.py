@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
 
+from mi_nerfattack.io.resumable import Record
 from mi_nerfattack.system.memory import peak_memory_mb
 
 
-@dataclass(frozen=True)
-class Effort:
+class Effort(Record):
     """Cost of a run.
 
     Attributes:
@@ -28,16 +25,6 @@ class Effort:
     renders: int = 0
     checkpoint_s: float = 0.0
     processes: int = 0
-
-    def about(self) -> dict[str, str]:
-        """Write the numbers as remarks of a kept file."""
-        return {key: repr(value) for key, value in asdict(self).items()}
-
-    @classmethod
-    def from_about(cls, about: Mapping[str, str]) -> Effort:
-        """Read the remarks of a kept file; what is missing counts 0."""
-        whole = asdict(cls())
-        return cls(**{k: type(v)(about.get(k, v)) for k, v in whole.items()})
 
 
 class Account:
@@ -60,14 +47,9 @@ class Account:
         """
         before = self._before
         return Effort(
-            before.wall_s + time.perf_counter() - self._started,
-            max(before.peak_memory_mb, peak_memory_mb()),
-            before.renders + renders,
-            before.checkpoint_s + checkpoint_s,
-            before.processes + 1,
+            wall_s=before.wall_s + time.perf_counter() - self._started,
+            peak_memory_mb=max(before.peak_memory_mb, peak_memory_mb()),
+            renders=before.renders + renders,
+            checkpoint_s=before.checkpoint_s + checkpoint_s,
+            processes=before.processes + 1,
         )
-
-
-def latest(*abouts: Mapping[str, Any]) -> Effort:
-    """Return the effort of the file that was written last."""
-    return max(map(Effort.from_about, abouts), key=lambda effort: effort.wall_s)

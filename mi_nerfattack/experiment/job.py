@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -93,15 +93,12 @@ class Job:
             renders = world.surrogate.renders + world.deployment.renders
             return account.total(renders, folder.checkpoint.seconds)
 
-        def remarks() -> dict[str, str]:
-            return effort().about()
-
-        stages = Stages(world, folder.drives, self.on_progress, remarks)
+        stages = Stages(world, folder.drives, self.on_progress, effort)
         original = world.appearance()
         stages.drive_all(world.surrogate, "unperturbed")
         stages.drive_random(world.surrogate)
         world.show(original)
-        attack = self._attack(world, folder, remarks)
+        attack = self._attack(world, folder, effort)
         attacked = world.appearance()
         stages.drive_all(world.surrogate, "gradient")
         world.show(original)
@@ -118,7 +115,7 @@ class Job:
             attack,
             {"unperturbed": original, "gradient": attacked},
             self.text,
-            asdict(effort()),
+            effort().model_dump(),
             folder.checkpoint.ignored,
             self._counter("surrogate: attribution", 3),
         )
@@ -136,7 +133,7 @@ class Job:
         return on_step
 
     def _attack(
-        self, world: World, folder: RunFolder, remarks: Callable[[], dict[str, str]]
+        self, world: World, folder: RunFolder, effort: Callable[[], Effort]
     ) -> GradientAttack:
         """Do the iterations that are missing; whatever stops them, keep those done."""
         attack = build_attack(world)
@@ -145,18 +142,18 @@ class Job:
             checkpoint.restore(attack)
         if not attack.best_is_judged:
             attack.judge_best(self._counter("surrogate: best so far", 1))
-            checkpoint.save(attack, remarks())
+            checkpoint.save(attack, effort())
         try:
             with held_interrupts() as check:
                 while attack.iteration < section.iterations:
                     self._iterate(attack, check)
                     if attack.iteration % section.checkpoint_every == 0:
-                        checkpoint.save(attack, remarks())
+                        checkpoint.save(attack, effort())
                     check()
         finally:
             done = attack.iteration > checkpoint.iteration
             if done and attack.whole and not checkpoint.failed:
-                checkpoint.save(attack, remarks())
+                checkpoint.save(attack, effort())
         attack.measure()
         attack.restore_best()
         return attack

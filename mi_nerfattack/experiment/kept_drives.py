@@ -1,61 +1,83 @@
-"""Drives that are finished: kept in the run folder, so that none is repeated."""
+"""Drives that are finished: files of the run folder, so that none is repeated."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from mi_nerfattack.attack.checkpoint import REMEDY
-from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.resumable import read_kept, write_kept
+from mi_nerfattack.experiment.checkpoint import REMEDY
+from mi_nerfattack.experiment.effort import Effort
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit
 from mi_nerfattack.rollout.drive import Drive
 
-FORMAT = "mi_nerfattack drives 1"
-_ARRAYS = ("states", "controls", "cross_track_m", "time_s")
+FORMAT = "mi_nerfattack attack drive 1"
+
+
+class DriveRecord(Record):
+    """Which drive of the run it is, and the cost of the run so far."""
+
+    environment: str
+    case: str
+    run: int
+    effort: Effort
 
 
 class KeptDrives:
-    """A file of finished drives, replaced atomically with each that is added.
+    """The finished drives of a run, a file each.
 
     Args:
-        path: the file.
+        folder: of the files; made with the first.
         identity: versions and scenario, see :meth:`Scenario.identity`.
         route: that all drives follow.
         seed: of all drives.
     """
 
     def __init__(
-        self, path: Path, identity: Mapping[str, str], route: str, seed: int
+        self, folder: Path, identity: Mapping[str, str], route: str, seed: int
     ) -> None:
-        self.path = path
-        self.identity = {"format": FORMAT, **identity}
+        self.folder = folder
+        self._identity = {"format": FORMAT, **identity}
         self._route, self._seed = route, seed
         self._drives: dict[tuple[str, str, int], Drive] = {}
 
-    def read(self, force: bool = False) -> tuple[dict[str, str], list[str]]:
-        """Take up the drives of the file, where there is one.
+    def paths(self) -> list[Path]:
+        """Return the files of drives that are there."""
+        return sorted(self.folder.glob("*.safetensors"))
+
+    def read(self, force: bool = False) -> tuple[Effort, list[str]]:
+        """Take up the drives that are there.
 
         Args:
-            force: where the file belongs to another scenario or other versions, take
-                up none, in place of an error.
+            force: leave out those of another scenario or other versions, in place of
+                an error.
 
         Returns:
-            remarks that were saved with it, and the differences that were ignored.
+            the cost until the last was saved, and the differences that were ignored.
 
         Raises:
-            InputError: the file is damaged, of another format, or belongs to another
+            InputError: a file is damaged, of another format, or belongs to another
                 scenario or other versions.
         """
-        if not self.path.exists():
-            return {}, []
-        kept = read_kept(self.path, self.identity, REMEDY, force)
-        if not kept.ignored:
-            for name in kept.tensors:
-                if name.endswith("/states"):
-                    self._add(self._drive(name.rpartition("/")[0], kept.tensors))
-        return kept.about, kept.ignored
+        efforts, ignored = [Effort()], []
+        for path in self.paths():
+            kept = self._unit(path).read(force)
+            assert kept is not None, "no other process works in the folder"
+            record = kept.record
+            efforts.append(record.effort)
+            ignored += kept.ignored
+            if not kept.ignored:
+                self._take_up(
+                    Drive(
+                        record.environment,
+                        self._route,
+                        record.case,
+                        record.run,
+                        self._seed,
+                        **kept.tensors,
+                    )
+                )
+        return max(efforts, key=lambda effort: effort.wall_s), ignored
 
     def take(
         self, environment: str, case: str, runs: Sequence[int]
@@ -70,32 +92,36 @@ class KeptDrives:
         for key in [key for key in self._drives if key[1] == case]:
             del self._drives[key]
 
-    def add(self, drives: Sequence[Drive], about: Mapping[str, str]) -> None:
-        """Keep drives on disk.
+    def remove_others(self) -> None:
+        """Remove the files of drives that were not taken up."""
+        kept = {self._path(*key) for key in self._drives}
+        for path in set(self.paths()) - kept:
+            path.unlink()
+
+    def add(self, drives: Sequence[Drive], effort: Effort) -> None:
+        """Write drives, one after the other.
 
         Args:
-            drives: may be empty.
-            about: remarks to keep with them.
+            drives: of this run.
+            effort: of the run so far.
         """
+        files.make_folder(self.folder)
         for drive in drives:
-            self._add(drive)
-        tensors = {
-            f"{'/'.join(map(str, key))}/{name}": getattr(drive, name)
-            for key, drive in self._drives.items()
-            for name in _ARRAYS
-        }
-        write_kept(self.path, tensors, self.identity, about)
+            record = DriveRecord(
+                environment=drive.environment,
+                case=drive.case,
+                run=drive.run,
+                effort=effort,
+            )
+            path = self._path(drive.environment, drive.case, drive.run)
+            self._unit(path).write(drive.arrays(), record)
+            self._take_up(drive)
 
-    def _add(self, drive: Drive) -> None:
+    def _take_up(self, drive: Drive) -> None:
         self._drives[drive.environment, drive.case, drive.run] = drive
 
-    def _drive(self, key: str, tensors: Mapping[str, np.ndarray]) -> Drive:
-        try:
-            environment, case, run = key.split("/")
-            arrays = {name: tensors[f"{key}/{name}"] for name in _ARRAYS}
-            return Drive(environment, self._route, case, int(run), self._seed, **arrays)
-        except (KeyError, ValueError) as err:
-            raise InputError(
-                f"{self.path}: drive {key!r} is damaged ({err}); start again without "
-                "the file"
-            ) from err
+    def _unit(self, path: Path) -> Unit[DriveRecord]:
+        return Unit(path, self._identity, DriveRecord, REMEDY)
+
+    def _path(self, environment: str, case: str, run: int) -> Path:
+        return self.folder / f"{environment}_{case}_{run:04d}.safetensors"

@@ -6,23 +6,23 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from mi_nerfattack.attack.checkpoint import CheckpointFile
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.effort import Effort, latest
+from mi_nerfattack.experiment.checkpoint import CheckpointFile
+from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.io import files, locks
 
 CHECKPOINT = "checkpoint.safetensors"
-DRIVES = "drives.safetensors"
+DRIVES = "drives"
 SCENARIO = "scenario.toml"
 
 
 class RunFolder:
     """A folder that one process at a time works in; a context manager.
 
-    Its files appear in this order: ``scenario.toml``, ``drives.safetensors`` (without
-    drives), ``checkpoint.safetensors``, results. A process may be killed between any
-    two of them, or before the folder exists.
+    Its files appear in this order: ``scenario.toml``, ``drives/`` with a file a drive
+    and, among them, ``checkpoint.safetensors``, results. A process may be killed
+    between any two of them, or before the folder exists.
 
     Args:
         path: the folder, may be missing.
@@ -77,9 +77,9 @@ class RunFolder:
             on_notice(f"{self.path}: holds no run yet; it starts from the beginning")
             return
         self._enter()
-        about = self.checkpoint.read(force)
+        of_attack = self.checkpoint.read(force)
         of_drives, ignored = self.drives.read(force)
-        self.effort = latest(about, of_drives)
+        self.effort = max(of_attack, of_drives, key=lambda effort: effort.wall_s)
         if not self.checkpoint.found:
             self.drives.drop("gradient")
         for line in dict.fromkeys([*self.checkpoint.ignored, *ignored]):
@@ -91,7 +91,7 @@ class RunFolder:
         self._enter()
         locks.remove_partial(self.path)
         files.write_text(self.path / SCENARIO, self._text)
-        self.drives.add([], self.effort.about())
+        self.drives.remove_others()
 
     def _enter(self) -> None:
         if not self._locked:
@@ -110,8 +110,8 @@ class RunFolder:
             raise InputError(
                 f"{self.path}: is no run folder; there is nothing to resume"
             )
-        kept = {self.checkpoint.path, self.drives.path}
-        if present and not kept & set(present):
+        done = self.checkpoint.path.exists() or self.drives.paths()
+        if present and not done:
             if files.read_text(scenario) != self._text:
                 what = f"{scenario}: is another scenario, and nothing was done of it"
                 if not force:

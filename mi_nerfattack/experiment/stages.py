@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.rollout.drive import Drive
@@ -27,14 +28,14 @@ class Stages:
         world: fields, sensors, policy.
         kept: drives that are finished.
         on_progress: told about every time step.
-        remarks: gives what is kept beside the drives.
+        effort: tells what the run has cost so far.
         drives: all drives that were asked for so far.
     """
 
     world: World
     kept: KeptDrives
     on_progress: OnProgress
-    remarks: Callable[[], Mapping[str, str]]
+    effort: Callable[[], Effort]
     drives: list[Drive] = field(default_factory=list)
 
     @property
@@ -104,7 +105,7 @@ class Stages:
         loop = self.world.loop(sensor)
         trajectory = simulate(loop, loop.initial(initial), horizon, on_step)
         drives = self._records(trajectory, self._environment(sensor), case, first_run)
-        self.kept.add(drives, self.remarks())
+        self.kept.add(drives, self.effort())
         self.drives += drives
 
     def _records(

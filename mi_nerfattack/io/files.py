@@ -150,8 +150,10 @@ def read_image16(path: str | Path) -> np.ndarray:
     return np.array(image).astype(np.uint16)
 
 
-def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read all tensors of a safetensors file.
+def read_safetensors(
+    path: str | Path, names: Sequence[str] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read tensors of a safetensors file: those of some names, or all.
 
     The format's checks (header length, offsets, shapes, types, file size) pass
     before a tensor is allocated. Values are not checked: NaN is the caller's matter.
@@ -167,7 +169,8 @@ def read_safetensors(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str,
     _check_tensor_header(path, start, size)
     try:
         with safetensors.safe_open(str(path), framework="numpy") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            wanted = file.keys() if names is None else names
+            tensors = {name: file.get_tensor(name) for name in wanted}
             return tensors, dict(file.metadata() or {})
     except safetensors.SafetensorError as err:
         raise InputError(

@@ -1,103 +1,169 @@
-"""Files that an interrupted job goes on from: what they belong to is checked.
+"""Work that is done, kept in files that an interrupted job goes on from.
 
-Such a file is a safetensors file whose metadata hold the *identity* of the job (its
-format, versions and all values that decide its result, each under a key of its own),
-remarks that decide nothing, and a checksum of the tensors.
+A unit of work is one safetensors file, written whole or not at all and never changed
+in part. Its metadata hold the *identity* of the unit (its format, versions and all
+values that decide its result, each under a key of its own), a record that decides
+nothing, and a checksum of the tensors.
 """
 
 from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import pydantic
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
-_ABOUT = "about."  # prefix of the remarks' keys
-_CHECKSUM = "about.crc32"
+_RECORD = "kept.record"
+_CHECKSUM = "kept.crc32"
 _NONE = "(none)"
 
 
+class Record(pydantic.BaseModel):
+    """What is kept beside tensors; written and read as JSON."""
+
+    model_config = pydantic.ConfigDict(
+        extra="forbid", frozen=True, strict=True, ser_json_inf_nan="constants"
+    )
+
+
+R = TypeVar("R", bound=Record)
+
+
 @dataclass(frozen=True, eq=False)
-class Kept:
+class Kept(Generic[R]):
     """What a file held.
 
     Attributes:
         tensors: by name.
-        about: the remarks.
+        record: likewise of the unit.
         ignored: differences that were ignored, one line each.
     """
 
     tensors: dict[str, np.ndarray]
-    about: dict[str, str]
+    record: R
     ignored: list[str]
 
 
-def write_kept(
-    path: str | Path,
-    tensors: Mapping[str, np.ndarray],
-    identity: Mapping[str, str],
-    about: Mapping[str, str],
-) -> None:
-    """Replace a file atomically.
+@dataclass(frozen=True, eq=False)
+class Unit(Generic[R]):
+    """One unit of work and its file.
 
     Args:
-        path: the file.
-        tensors: by name.
+        path: the file; there when the unit is done.
         identity: values that decide the result; ``format`` among them.
-        about: remarks.
-
-    Raises:
-        InputError: it cannot be written; the file that was there is intact.
+        model: of the record.
+        remedy: what to do where the file belongs to something else.
     """
-    remarks = {_ABOUT + key: value for key, value in about.items()}
-    checksum = {_CHECKSUM: _checksum(tensors)}
-    files.write_safetensors(path, tensors, {**identity, **remarks, **checksum})
+
+    path: Path
+    identity: Mapping[str, str]
+    model: type[R]
+    remedy: str
+
+    def write(self, tensors: Mapping[str, np.ndarray], record: R) -> None:
+        """Replace the file atomically.
+
+        Raises:
+            InputError: it cannot be written; the file that was there is intact.
+        """
+        about = {_RECORD: record.model_dump_json(), _CHECKSUM: _checksum(tensors)}
+        files.write_safetensors(self.path, tensors, {**self.identity, **about})
+
+    def read(self, force: bool = False) -> Kept[R] | None:
+        """Read the file; None where the unit is not done.
+
+        Args:
+            force: ignore differences but that of the format.
+
+        Raises:
+            InputError: the file cannot be read, is damaged, of another format, or
+                belongs to something else; the message then lists the differences.
+        """
+        if not self.path.exists():
+            return None
+        tensors, metadata = files.read_safetensors(self.path)
+        self._check_format(metadata)
+        if metadata.get(_CHECKSUM) != _checksum(tensors):
+            raise InputError(
+                f"{self.path}: damaged, its checksum is wrong; copy it again, or start "
+                "again without the file"
+            )
+        return Kept(tensors, *self._judge(metadata, force))
+
+    def read_record(self) -> R | None:
+        """Read the record alone; None where the unit is not done.
+
+        Costs nothing but the header, and does not notice damaged tensors.
+
+        Raises:
+            InputError: as of :meth:`read`.
+        """
+        if not self.path.exists():
+            return None
+        _, metadata = files.read_safetensors(self.path, ())
+        self._check_format(metadata)
+        return self._judge(metadata, False)[0]
+
+    def _check_format(self, metadata: Mapping[str, str]) -> None:
+        wanted = self.identity["format"]
+        if metadata.get("format") != wanted or _RECORD not in metadata:
+            raise InputError(
+                f"{self.path}: format {metadata.get('format')!r}, this program reads "
+                f"{wanted!r}; start again without the file"
+            )
+
+    def _judge(self, metadata: dict[str, str], force: bool) -> tuple[R, list[str]]:
+        identity = {
+            key: value
+            for key, value in metadata.items()
+            if key not in (_RECORD, _CHECKSUM)
+        }
+        found = differences(identity, self.identity)
+        if not force:
+            refuse(self.path, found, self.remedy)
+        try:
+            return self.model.model_validate_json(metadata[_RECORD]), found
+        except pydantic.ValidationError as err:
+            raise InputError(
+                f"{self.path}: its record is damaged ({err.errors()[0]['msg']}); start "
+                "again without the file"
+            ) from err
 
 
-def read_kept(
-    path: str | Path, identity: Mapping[str, str], remedy: str, force: bool = False
-) -> Kept:
-    """Read a file that belongs to a job.
+def refuse(path: str | Path, found: Sequence[str], remedy: str) -> None:
+    """Raise InputError if a file differs from what is wanted.
 
     Args:
         path: the file.
-        identity: of the job that reads, as for :func:`write_kept`.
-        remedy: what to do where the file belongs to another job.
-        force: ignore differences but that of the format.
-
-    Raises:
-        InputError: the file cannot be read, is damaged, of another format, or belongs
-            to another job; the message then lists the differences.
+        found: of :func:`differences`.
+        remedy: what to do.
     """
-    tensors, metadata = files.read_safetensors(path)
-    if metadata.get("format") != identity["format"]:
-        raise InputError(
-            f"{path}: format {metadata.get('format')!r}, this program reads "
-            f"{identity['format']!r}; start again without the file"
-        )
-    if metadata.pop(_CHECKSUM, "") != _checksum(tensors):
-        raise InputError(
-            f"{path}: damaged, its checksum is wrong; copy it again, or start again "
-            "without the file"
-        )
-    size = len(_ABOUT)
-    about = {k[size:]: v for k, v in metadata.items() if k.startswith(_ABOUT)}
-    kept = {k: v for k, v in metadata.items() if not k.startswith(_ABOUT)}
-    found = differences(kept, identity)
-    if found and not force:
+    if found:
         lines = "\n".join(f"  {line}" for line in found)
         raise InputError(
             f"{path}: belongs to something else (value there -> value here)\n"
             f"{lines}\n{remedy}"
         )
-    return Kept(tensors, about, found)
+
+
+def flatten(name: str, value: Any) -> dict[str, str]:
+    """Name each value of a JSON document for an identity.
+
+    Returns:
+        ``{"name.key": "1", ...}``; what is no object is one value.
+    """
+    if isinstance(value, dict) and value:
+        parts = [flatten(f"{name}.{key}", item) for key, item in value.items()]
+        return {key: text for part in parts for key, text in part.items()}
+    return {name: json.dumps(value, sort_keys=True)}
 
 
 def differences(kept: Mapping[str, str], present: Mapping[str, str]) -> list[str]:

@@ -82,6 +82,11 @@ class Drive:
         if np.any(np.diff(self.time_s) <= 0):
             raise InputError("Drive.time_s: not increasing; give seconds step by step")
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by name."""
+        names = ("states", "controls", "cross_track_m", "time_s")
+        return {name: getattr(self, name) for name in names}
+
     def _freeze(self, name: str, shape: tuple[int, ...]) -> None:
         array = np.array(getattr(self, name), dtype=np.float64)
         if array.shape != shape:

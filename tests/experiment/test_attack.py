@@ -127,7 +127,8 @@ def make_attack(scenario_folder):
 
 
 def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_thread):
-    from mi_nerfattack.attack.checkpoint import CheckpointFile
+    from mi_nerfattack.experiment.checkpoint import CheckpointFile
+    from mi_nerfattack.experiment.effort import Effort
 
     whole = make_attack(scenario_folder)
     for _ in range(4):
@@ -136,7 +137,7 @@ def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_th
     for _ in range(2):
         half.step()
     path = tmp_path / "checkpoint.safetensors"
-    CheckpointFile(path, {}).save(half, {})
+    CheckpointFile(path, {}).save(half, Effort())
     resumed, kept = make_attack(scenario_folder), CheckpointFile(path, {})
     kept.read()
     kept.restore(resumed)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
 
 import numpy as np
 import pytest
-from helpers.attack_jobs import checkpoint_of, interrupt, job
+from helpers.attack_jobs import checkpoint_of, contents, interrupt, job
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files, resumable
@@ -20,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path):
     output, notices = tmp_path / "run", []
     interrupt(folder, output, "surrogate: attack", 4 * 4 + 1)
-    before = {path: path.read_bytes() for path in output.iterdir()}
+    before = contents(output)
     change = ("learning_rate = 0.5", "learning_rate = 0.25\njitter = true")
     with pytest.raises(InputError) as refused:
         job(folder, output, change).run(resume=True)
@@ -29,7 +28,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     assert "scenario.attack.learning_rate: 0.5 -> 0.25" in message
     assert "scenario.attack.jitter: false -> true" in message
     assert "--force" in message and "seed" not in message
-    assert {path: path.read_bytes() for path in output.iterdir()} == before
+    assert contents(output) == before
     # forced, the attack goes on where it was, and the result says what was ignored
     first = []
 
@@ -44,7 +43,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     assert line in document["ignored_changes"]
     assert any(line in notice for notice in notices)
     assert "learning_rate = 0.25" in (output / "scenario.toml").read_text()
-    # from then on the run is that of the changed scenario
+    # from then on the run is that of the changed scenario, its drives too
     job(folder, output, change).run(resume=True)
     with pytest.raises(InputError, match=r"learning_rate: 0\.25 -> 0\.5"):
         job(folder, output).run(resume=True)
@@ -86,19 +85,6 @@ def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
     other = ('"object.safetensors"', '"scene.safetensors"')
     with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*shape"):
         job(folder, output, other).run(resume=True, force=True)
-
-
-def test_differences_are_told_key_by_key():
-    def file(name, digest):
-        return json.dumps({"file": name, "sha256": digest})
-
-    kept = {"same": "1", "gone": "2", "moved": file("a", "1"), "new": file("b", "1")}
-    present = {"same": "1", "moved": file("z", "1"), "new": file("b", "2"), "add": "3"}
-    assert resumable.differences(kept, present) == [
-        "new: the content of b has changed",
-        "add: (none) -> 3",
-        "gone: 2 -> (none)",
-    ]
 
 
 def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):

@@ -54,6 +54,9 @@ def test_what_is_finished_is_not_repeated(folder, tmp_path):
     interrupt(folder, output, "surrogate: random", 3)  # in the second of two drives
     interrupt(folder, output, "deployment: gradient", 1, resume=True)
     before = checkpoint_of(output)
+    written = {path: path.stat().st_mtime_ns for path in output.glob("drives/*")}
+    # 2 unperturbed and 2 random ones twice, 2 of the attack
+    assert len(written) == 10
 
     def watch(stage, done, total, remark):
         seen.append((stage, done, remark))
@@ -70,6 +73,8 @@ def test_what_is_finished_is_not_repeated(folder, tmp_path):
     }
     for name, value in checkpoint_of(output).items():
         assert np.array_equal(value, before[name], equal_nan=True), name
+    assert len(list(output.glob("drives/*"))) == 12
+    assert all(path.stat().st_mtime_ns == time for path, time in written.items())
     # 2 + 2 random + attack + 2, twice; the drives that were cut short count too
     assert document["cost"]["renders"] >= 2 * (2 + 2 + 2) * 2 + 6 * 2 * 2
     whole = job(folder, tmp_path / "whole").run()

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 
 import pytest
-from helpers.attack_jobs import checkpoint_of, interrupt, job, stop_at
+from helpers.attack_jobs import checkpoint_of, contents, interrupt, job, stop_at
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import locks
@@ -31,8 +31,8 @@ def test_run_killed_early_starts_from_the_beginning(folder, tmp_path, left):
         text = (whole / "scenario.toml").read_text()
         (output / "scenario.toml").write_text(text)
     if left == "drives":
-        interrupt(folder, tmp_path / "cut", "surrogate: unperturbed", 1)
-        shutil.copy(tmp_path / "cut" / "drives.safetensors", output)
+        interrupt(folder, tmp_path / "cut", "surrogate: random", 1)
+        shutil.copytree(tmp_path / "cut" / "drives", output / "drives")
     job(folder, output, notices=notices).run(resume=True)
     assert (output / "metrics.json").exists() and not partial.exists()
     begins = any("starts from the beginning" in notice for notice in notices)
@@ -73,7 +73,10 @@ def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("name", ["checkpoint.safetensors", "drives.safetensors"])
+@pytest.mark.parametrize(
+    "name",
+    ["checkpoint.safetensors", "drives/surrogate_unperturbed_0000.safetensors"],
+)
 @pytest.mark.parametrize("damage", ["cut", "bit", "foreign"])
 def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, damage):
     output = tmp_path / "run"
@@ -115,7 +118,7 @@ def test_failed_checkpoint_leaves_the_one_before(
         raise OSError(number, os.strerror(number))
 
     def fill():
-        kept.update({path: path.read_bytes() for path in output.iterdir()})
+        kept.update(contents(output))
         monkeypatch.setattr(os, call, fail)
 
     # checkpoint_every = 3: the disk fills up after the first checkpoint
@@ -128,7 +131,7 @@ def test_failed_checkpoint_leaves_the_one_before(
     assert ("no space left" if number == errno.ENOSPC else "read-only") in message
     assert "iteration 6 is not saved" in message
     assert "checkpoint of iteration 3 is intact" in message
-    assert {path: path.read_bytes() for path in output.iterdir()} == kept
+    assert contents(output) == kept
     job(folder, output).run(resume=True)
 
 

@@ -94,6 +94,10 @@ def checkpoint_of(output):
     return tensors
 
 
+def contents(output):
+    return {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+
+
 def assert_same_state(output, whole):
     expected, found = checkpoint_of(whole), checkpoint_of(output)
     assert set(expected) == set(found)

@@ -1,8 +1,7 @@
-"""Checkpoints of an attack: one safetensors file, replaced atomically."""
+"""Checkpoints of an attack: one file, replaced atomically."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,13 +11,21 @@ import numpy as np
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.determinism import random_states, restore_random_states
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io.resumable import Kept, read_kept, write_kept
+from mi_nerfattack.experiment.effort import Effort
+from mi_nerfattack.io.resumable import Kept, Record, Unit
 
-FORMAT = "mi_nerfattack attack checkpoint 3"
+FORMAT = "mi_nerfattack attack checkpoint 4"
 REMEDY = (
     "resume with the scenario.toml of the run folder and the same files and versions, "
     "start a new run folder, or ignore this (--force)"
 )
+
+
+class CheckpointRecord(Record):
+    """What is kept beside the state: cost so far, differences that were ignored."""
+
+    effort: Effort
+    ignored: list[str]
 
 
 class CheckpointFile:
@@ -42,32 +49,32 @@ class CheckpointFile:
 
     def __init__(self, path: Path, identity: Mapping[str, str]) -> None:
         self.path = path
-        self.identity = {"format": FORMAT, **identity}
+        identity = {"format": FORMAT, **identity}
+        self._unit = Unit(path, identity, CheckpointRecord, REMEDY)
         self.iteration = 0
         self.seconds = 0.0
         self.failed = False
         self.ignored: list[str] = []
-        self._kept: Kept | None = None
+        self._kept: Kept[CheckpointRecord] | None = None
 
-    def read(self, force: bool = False) -> dict[str, str]:
+    def read(self, force: bool = False) -> Effort:
         """Read and check the file, where there is one, for :meth:`restore`.
 
         Args:
             force: ignore what differs between the file and this run.
 
         Returns:
-            remarks that were saved with it.
+            the cost until it was saved.
 
         Raises:
             InputError: the file is damaged, no checkpoint, or belongs to another
                 scenario or other versions.
         """
-        if not self.path.exists():
-            return {}
-        self._kept = read_kept(self.path, self.identity, REMEDY, force)
-        earlier = json.loads(self._kept.about.get("ignored", "[]"))
-        self.ignored = [*earlier, *self._kept.ignored]
-        return self._kept.about
+        self._kept = self._unit.read(force)
+        if self._kept is None:
+            return Effort()
+        self.ignored = [*self._kept.record.ignored, *self._kept.ignored]
+        return self._kept.record.effort
 
     @property
     def found(self) -> bool:
@@ -81,42 +88,36 @@ class CheckpointFile:
         :meth:`GradientAttack.judge_best`.
 
         Raises:
-            InputError: an entry is missing, or does not fit the objects.
+            InputError: an entry does not fit the objects.
         """
         kept, self._kept = self._kept, None
         assert kept is not None, "read() has found a checkpoint"
         self._check_shapes(attack.tensors(), kept.tensors)
-        try:
-            if kept.ignored:
-                attack.go_on_from(kept.tensors)
-            else:
-                attack.load_tensors(kept.tensors)
-            restore_random_states(kept.tensors)
-        except KeyError as err:
-            raise InputError(
-                f"{self.path}: entry {err} is missing; the file is damaged, start a "
-                "new run folder"
-            ) from err
+        if kept.ignored:
+            attack.go_on_from(kept.tensors)
+        else:
+            attack.load_tensors(kept.tensors)
+        restore_random_states(kept.tensors)
         self.iteration = attack.iteration
         if kept.ignored:
-            self.save(attack, kept.about)
+            self.save(attack, kept.record.effort)
 
-    def save(self, attack: GradientAttack, about: Mapping[str, str]) -> None:
+    def save(self, attack: GradientAttack, effort: Effort) -> None:
         """Write the complete state.
 
         Args:
             attack: between two iterations.
-            about: remarks to keep with it.
+            effort: so far.
 
         Raises:
             InputError: the file cannot be written; the one before is intact.
         """
         start = time.perf_counter()
         tensors = {**attack.tensors(), **random_states()}
-        remarks = {**about, "ignored": json.dumps(self.ignored)}
         self.failed = True
         try:
-            write_kept(self.path, tensors, self.identity, remarks)
+            record = CheckpointRecord(effort=effort, ignored=self.ignored)
+            self._unit.write(tensors, record)
         except InputError as err:
             raise InputError(f"{err}\n{self._advice(attack)}") from err
         self.failed = False
