@@ -8,6 +8,8 @@ from typing import Any, NoReturn
 
 from mi_nerfattack.errors import SetupError
 
+__all__ = ["refuse", "register"]
+
 _MODULES = (
     "field_volume",
     "grid_field",

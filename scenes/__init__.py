@@ -8,6 +8,8 @@ from mi_nerfattack.errors import InputError
 
 from .listing import ROOT, data_files
 
+__all__ = ["bundled"]
+
 
 def bundled(name: str) -> Path:
     """Return the path of a bundled file or folder.

@@ -1,19 +1,19 @@
 """Radiance fields: data, point evaluation, occupancy, files."""
 
-from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.fields.io import load_field, load_grid, save_field
-from mi_nerfattack.fields.ngp import NGPField, NGPLayout
-from mi_nerfattack.fields.occupancy import Occupancy
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "AbstractField",
-    "GridField",
-    "GridLayout",
-    "NGPField",
-    "NGPLayout",
-    "Occupancy",
-    "load_field",
-    "load_grid",
-    "save_field",
-]
+from mi_nerfattack._lazy import lazy
+
+if TYPE_CHECKING:
+    from .base import AbstractField as AbstractField
+    from .grid import GridField as GridField
+    from .grid import GridLayout as GridLayout
+    from .io import load_field as load_field
+    from .io import load_grid as load_grid
+    from .io import save_field as save_field
+    from .ngp import NGPField as NGPField
+    from .ngp import NGPLayout as NGPLayout
+    from .occupancy import Occupancy as Occupancy
+    from .splats import read_splats as read_splats
+
+__getattr__, __dir__ = lazy(__name__)

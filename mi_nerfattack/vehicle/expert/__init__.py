@@ -1,14 +1,14 @@
 """Experts that follow a route: what policies imitate."""
 
-from mi_nerfattack.vehicle.expert.base import AbstractExpert
-from mi_nerfattack.vehicle.expert.choose import SteeringFollower, expert_for
-from mi_nerfattack.vehicle.expert.lane_follower import LaneFollower
-from mi_nerfattack.vehicle.expert.pid import PIDExpert
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "AbstractExpert",
-    "LaneFollower",
-    "PIDExpert",
-    "SteeringFollower",
-    "expert_for",
-]
+from mi_nerfattack._lazy import lazy
+
+if TYPE_CHECKING:
+    from .base import AbstractExpert as AbstractExpert
+    from .choose import expert_for as expert_for
+    from .lane_follower import LaneFollower as LaneFollower
+    from .lane_follower import SteeringFollower as SteeringFollower
+    from .pid import PIDExpert as PIDExpert
+
+__getattr__, __dir__ = lazy(__name__)

@@ -1,0 +1,77 @@
+"""What packages offer, and what stays unloaded until somebody asks for it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PARTS = sorted(
+    path.parent.name
+    for path in (ROOT / "mi_nerfattack").glob("*/__init__.py")
+    if path.parent.name != "commands"
+)
+RENDERING = """
+import sys
+import mi_nerfattack.deploy
+import mi_nerfattack.render
+import mi_nerfattack.vehicle
+import mi_nerfattack.backend
+mi_nerfattack.backend.ensure()
+import mitsuba as mi
+import numpy as np
+from mi_nerfattack.fields import GridField, GridLayout, save_field
+from mi_nerfattack.render import from_fov
+
+field = GridField(GridLayout(2, 4, 8), -np.ones(3), np.ones(3), step_m=0.1)
+field.set_parameter("density", np.full(field.n_vertices, 3.0, np.float32))
+save_field(sys.argv[1], field)
+grid = {"type": "grid_field", "filename": sys.argv[1]}
+film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgba"}
+pose = mi.ScalarTransform4f().look_at([-4, 0, 0], [0, 0, 0], [0, 0, 1])
+scene = {
+    "type": "scene",
+    "integrator": {"type": "field_integrator", "object": grid},
+    "sensor": {"type": "perspective", "fov": 10, "film": film, "to_world": pose},
+}
+image = np.array(mi.render(mi.load_dict(scene, parallel=False), spp=1))
+assert image[2, 2, 3] > 0.9, image
+assert from_fov(4, 4, 90.0).width == 4
+print(*sys.modules)
+"""
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_all_public_names_resolve(part):
+    package = import_module(f"mi_nerfattack.{part}")
+    folder = Path(package.__file__ or "").parent
+    assert package.__all__ and set(package.__all__) <= set(dir(package))
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+        # a module of that name would hide it as soon as it is loaded
+        assert not (folder / f"{name}.py").exists() and not (folder / name).exists()
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = package.nothing
+
+
+def test_rendering_loads_neither_policies_nor_other_worlds(tmp_path):
+    command = [sys.executable, "-c", RENDERING, str(tmp_path / "a.safetensors")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
+    assert "mi_nerfattack.render.camera.intrinsics" in loaded
+    assert not loaded & {"torch", "mujoco", "gymnasium", "pydantic", "matplotlib"}
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.stem
+)
+def test_what_the_documentation_imports_is_there(path):
+    imports = r"^from mi_nerfattack\S* import (?:\([^)]*\)|.+)$"
+    for line in re.findall(imports, path.read_text("utf-8"), re.MULTILINE):
+        exec(line, {})
