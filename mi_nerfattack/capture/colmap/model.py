@@ -129,7 +129,8 @@ def _read(model: Path, suffix: str) -> tuple[dict[str, Any], np.ndarray | None]:
             if suffix == ".bin":
                 raw = files.read_bytes(model / name, MAX_BYTES)
             else:
-                raw = files.read_text(model / name).encode()
+                text = files.read_text(model / name)
+                raw = f"{text}\n\n".encode()  # the last image may lack its second line
             (Path(work) / name).write_bytes(raw)
         stages = Stages(lambda *_: None)
         code = run_task({"work": work, "files": names}, stages)

@@ -82,7 +82,7 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
         (model.write_binary if binary else model.write_text)(again)
         understood = _length(again / name)
         if given != understood:
-            unit = "bytes" if binary else "words"
+            unit = "bytes" if binary else "words (names with blanks need .bin files)"
             raise ValueError(f"{given} {unit}, a model like it has {understood}")
         images = [_placed(image) for image in model.images.values()]
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]

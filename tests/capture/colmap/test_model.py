@@ -221,7 +221,12 @@ def test_nothing_there(tmp_path):
         ("cameras", "3 PINHOLE 40 30 -1 1 1 1", "camera 3: camera.fx: -1"),
         ("images", "1 1 0 0 0 nan 0 0 1 a.png\n\n", "Check failed.*copy it again"),
         ("images", "1 0 0 0 0 0 0 0 1 a.png\n\n", "'a.png': pose .*zero"),
-        ("images", "1 1 0 0 0 0 0 0 1 a\x07.png\n\n", "unprintable"),
+        ("images", "1 1 0 0 0 0 0 0 1 a\x07.png", "unprintable"),
+        (
+            "images",
+            "1 1 0 0 0 0 0 0 1 a b.png",
+            "11 words .names with blanks need .bin",
+        ),
         ("images", "# none", "holds no image"),
         ("images", "1 1 0 0 0 0 0 0 1 a\n\n2 1 0 0 0 0 0 0 1 a\n\n", "'a' occurs 2"),
         ("points3D", "1 1 2 3 1 2 3 4 7 0", "7 does not exist.*copy it again"),
