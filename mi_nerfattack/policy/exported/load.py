@@ -1,9 +1,15 @@
-"""Programs that were exported from torch: ``torch.export`` and TorchScript."""
+"""Programs that were exported from torch: ``torch.export`` and TorchScript.
+
+A program is code. torch unpickles parts of it, runs its guards as Python and calls
+whatever operators it names, those that write files too: no check of its text makes it
+safe. Load programs of people that you trust, as you run their Python files.
+"""
 
 from __future__ import annotations
 
 import io
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +17,6 @@ import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
-from mi_nerfattack.policy.exported.archive import check_archive, check_script
 
 MAX_PROGRAM_BYTES = 1 << 31
 
@@ -39,13 +44,12 @@ class ExportedNetwork(torch.nn.Module):
 
 
 def load_exported(path: Path) -> ExportedNetwork:
-    """Read a ``.pt2`` file of ``torch.export.save``.
+    """Read a ``.pt2`` file of ``torch.export.save``, which runs code in it.
 
     Raises:
-        InputError: no such file, another format, or one with pickled objects or code.
+        InputError: no such file, or another format.
     """
-    raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
-    check_archive(path, raw)
+    raw = _read_archive(path, "torch.export.save")
     try:
         program = torch.export.load(io.BytesIO(raw))
         network = ExportedNetwork(program)
@@ -60,13 +64,12 @@ def load_exported(path: Path) -> ExportedNetwork:
 
 
 def load_torchscript(path: Path) -> torch.nn.Module:
-    """Read a file of ``torch.jit.save``, onto the CPU.
+    """Read a file of ``torch.jit.save``, onto the CPU; running it runs its code.
 
     Raises:
-        InputError: no such file, another format, or a program that opens files.
+        InputError: no such file, or another format.
     """
-    raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
-    check_script(path, raw)
+    raw = _read_archive(path, "torch.jit.save")
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit.load`", DeprecationWarning)
@@ -77,6 +80,23 @@ def load_torchscript(path: Path) -> torch.nn.Module:
             f"{path}: is no TorchScript program ({reason}); save one with "
             "torch.jit.save, or give weights to a FILE.py:NAME as policy.weights_file"
         ) from err
+
+
+def _read_archive(path: Path, writer: str) -> bytes:
+    """Return a ZIP file whose content is not larger than a program may be."""
+    raw = files.read_bytes(path, MAX_PROGRAM_BYTES)
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+    except (zipfile.BadZipFile, NotImplementedError) as err:
+        raise InputError(
+            f"{path}: is no program ({err}); write it with {writer}"
+        ) from err
+    if size > MAX_PROGRAM_BYTES:
+        raise InputError(
+            f"{path}: unpacks to {size} bytes; {MAX_PROGRAM_BYTES} are allowed"
+        )
+    return raw
 
 
 def _batch(program: torch.export.ExportedProgram) -> int | None:
