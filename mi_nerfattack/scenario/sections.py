@@ -21,6 +21,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 NonZero = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
 Count = Annotated[int, Field(ge=1)]
 Whole = Annotated[int, Field(ge=0)]
+Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 Part = Annotated[float, Field(ge=0, lt=1)]
 Row = tuple[Finite, Finite, Finite, Finite]
 Matrix = tuple[Row, Row, Row, Row]
@@ -94,6 +95,7 @@ class PolicySection(Section):
         | None
     ) = None  # told by the suffix of the file: .safetensors .py .pt2 .pt .onnx
     file: str | None = None  # or FILE.py:NAME
+    trust_code: Trust = False  # it runs with all rights of the account
     weights_file: str | None = None  # of a module: .safetensors, or a state dict .pt
     url: str | None = None
     timeout_s: Positive = 10.0  # of an answer from the URL
@@ -149,6 +151,7 @@ class VehicleSection(Section):
     max_steer_rate_deg_s: Positive = 40.0
     steer_time_s: Positive = 0.1  # time constant of the steering's lag
     function: Annotated[str, Field(pattern=r"^.+:[A-Za-z_]\w*$")] | None = None
+    trust_code: Trust = False  # see PolicySection
     framework: Literal["drjit", "torch"] = "drjit"  # of the function
     state_size: Annotated[int, Field(ge=3, le=16)] = 3
     control_limit: Positive | None = None  # in the unit of the function's control
@@ -297,6 +300,7 @@ class AbstractTerm(Section):
     target: str | None = None  # JSON of routes
     target_route: str | None = None
     function: Annotated[str, Field(pattern=r"\.py:[A-Za-z_]\w*$")] | None = None
+    trust_code: Trust = False  # see PolicySection
     weight: Finite = 1.0
 
     @model_validator(mode="after")

@@ -28,6 +28,25 @@ def split_reference(reference: str) -> tuple[str, str]:
     return file, name
 
 
+def check_trust(key: str, name: str, trusted: bool) -> None:
+    """Refuse code that the user has not said to trust.
+
+    Args:
+        key: of the file that is code, ``section.key``.
+        name: of the file.
+        trusted: the section's `trust_code`.
+
+    Raises:
+        InputError: it is False.
+    """
+    if not trusted:
+        raise InputError(
+            f"{key}: {name}: is code and runs with all rights of your account; if you "
+            f"trust who wrote it, say so: trust_code = true beside {key}, or "
+            "--trust-code on the command line"
+        )
+
+
 def load_function(path: str | Path, name: str) -> Callable[..., Any]:
     """Run a Python file and return what it calls `name`.
 

@@ -43,6 +43,7 @@ SCENE = """<scene version="3.0.0">
 <scale x="90" y="90"/></transform></shape>
 <emitter type="constant"/>
 </scene>"""
+CALLABLE = ("--kind", "callable", "--trust-code")
 STILL = "def drive(image, goal, step):\n    return [0.0] * len(image)\n"
 
 
@@ -62,7 +63,7 @@ def place(tmp_path, monkeypatch) -> list[str]:
     monkeypatch.setattr(evaluate_work, "make_environment", make)
     monkeypatch.chdir(tmp_path)
     options = ["--scene", "scene.xml", "--routes-file", "routes.json"]
-    options += ["--workers", "1", "--kind", "callable", "--runs", "2"]
+    options += ["--workers", "1", *CALLABLE, "--runs", "2"]
     return ["evaluate", "still.py:drive", "--environments", "mitsuba", *options]
 
 
@@ -133,7 +134,7 @@ def test_drives_without_objects_are_announced(place, capsys):
 def test_a_damaged_record_is_found_before_the_first_drive(place, capsys):
     PilotNet(1, 0.6, "rad/s").save("net.safetensors")
     Path("net.json").write_text("{")
-    place = [word for word in place if word not in ("--kind", "callable")]
+    place = [word for word in place if word not in CALLABLE]
     place[1] = "net.safetensors"
     assert cli.main([*place, "--page", "out"]) == 2
     assert "net.json" in capsys.readouterr().err
@@ -338,8 +339,9 @@ def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message
     )
     Path("noise.bin").write_bytes(b"noise")
     Path("noise.safetensors").write_bytes(b"noise")
-    place = [word for word in place if word not in ("--kind", "callable")]
+    place = [word for word in place if word not in CALLABLE]
     place[1] = policy
+    place += ["--trust-code"] * policy.endswith((":Small", ":Bad"))
     assert cli.main(place) == 2
     errors = capsys.readouterr().err
     assert message in errors and "Traceback" not in errors
@@ -362,10 +364,10 @@ def test_the_experts_camera_suits_every_environment():
 
 def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
     Path("mine.toml").write_text(
-        '[policy]\nkind = "callable"\nfile = "still.py:drive"\n'
+        '[policy]\nkind = "callable"\nfile = "still.py:drive"\ntrust_code = true\n'
         "[policy.preprocess]\nresize_px = [10, 5]\n"
     )
-    place = [word for word in place if word not in ("--kind", "callable")]
+    place = [word for word in place if word not in CALLABLE]
     place[1] = "mine.toml"
     assert cli.main([*place, "--json", "--horizon", "2"]) == 0
     assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
@@ -374,14 +376,15 @@ def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
 
 
 def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
-    text = '[policy]\nkind = "callable"\nfile = "seen.py:drive"\n[camera]\n'
+    text = '[policy]\nfile = "seen.py:drive"\nkind = "callable"\ntrust_code = true\n'
+    text += "[camera]\n"
     Path("mine.toml").write_text(text + "width = 40\nheight = 20\nfov_x_deg = 60.0\n")
     Path("seen.py").write_text(
         "def drive(image, goal, step):\n"
         "    assert image.shape[1:] == (3, 20, 40), image.shape\n"
         "    return [0.0] * len(image)\n"
     )
-    place = [word for word in place if word not in ("--kind", "callable")]
+    place = [word for word in place if word not in CALLABLE]
     place[1] = "mine.toml"
     assert cli.main([*place, "--horizon", "2"]) == 0
     Path("mine.toml").write_text(text + "width = 0\n")

@@ -38,6 +38,7 @@ def server(tmp_path, monkeypatch) -> Server:
 
 def evaluate(*more: str) -> int:
     start = ["evaluate", "still.py:drive", "--kind", "callable", "--runs", "1"]
+    start += ["--trust-code"]
     return cli.main([*start, "--horizon", "3", "--environments", *more])
 
 

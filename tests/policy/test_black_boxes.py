@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def section(**keys):
-    return PolicySection.model_validate(keys)
+    return PolicySection.model_validate({"trust_code": True, **keys})
 
 
 def camera(n, rng):

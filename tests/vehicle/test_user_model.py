@@ -211,7 +211,7 @@ def call(own):
     ],
 )
 def test_what_a_function_must_not_return(returned, words):
-    message = rf"FunctionDynamics\(test_vehicle_user.py:<lambda>\): .*{words}"
+    message = rf"FunctionDynamics\(test_user_model.py:<lambda>\): .*{words}"
     with pytest.raises(InputError, match=message):
         call(FunctionDynamics(returned))
 
@@ -229,7 +229,7 @@ def test_what_a_function_must_not_return(returned, words):
     ],
 )
 def test_what_a_torch_function_must_not_return(returned, words):
-    message = rf"TorchDynamics\(test_vehicle_user.py:<lambda>\): .*{words}"
+    message = rf"TorchDynamics\(test_user_model.py:<lambda>\): .*{words}"
     with pytest.raises(InputError, match=message):
         call(TorchDynamics(returned))
 
@@ -257,7 +257,7 @@ def folder(tmp_path):
 
 def custom(name, **keys):
     values = {"state_size": 4, "control_limit": 1.5, "rest_state": (5.0,), **keys}
-    return VehicleSection(model="custom", function=name, **values)
+    return VehicleSection(model="custom", function=name, trust_code=True, **values)
 
 
 def test_models_of_the_section():
@@ -288,6 +288,12 @@ def test_function_of_a_file(folder, name, framework):
     slope = dynamics.derivative(state64([[0], [0], [0], [6]]), rows64([[0.5]])[0])
     np.testing.assert_allclose(slope.numpy()[:, 0], [6, 0, 0.5, 2])
     assert float(dynamics.saturate(rows64([[100.0]])[0])[0]) == pytest.approx(1.5)
+
+
+def test_function_without_the_word_of_trust(folder):
+    section = custom("car.py:car").model_copy(update={"trust_code": False})
+    with pytest.raises(InputError, match="vehicle.function: car.py.*trust_code = true"):
+        build_dynamics(section, folder)
 
 
 def test_function_of_a_module(folder, monkeypatch):

@@ -95,6 +95,9 @@ class PolicyOptions:
 
     kind: str | None = None
     """Kind, where the suffix does not tell it: drjit, callable, ..."""
+    trust_code: bool = False
+    """Run the policy's code: FILE.py:NAME, .pt2 and .pt are programs, with all rights
+    of your account."""
     weights_file: str | None = None
     """Weights of a module: .safetensors or a state dict."""
     goal: str | None = None
@@ -118,7 +121,8 @@ class PolicyOptions:
             if self != PolicyOptions():
                 raise InputError(
                     f"{policy}: says itself how the policy is called; leave out "
-                    "--kind, --weights-file, --goal, --goals, --control-scale, --column"
+                    "--kind, --trust-code, --weights-file, --goal, --goals, "
+                    "--control-scale, --column"
                 )
             values = _read_toml(policy).get("policy")
             if not isinstance(values, dict):
@@ -129,6 +133,7 @@ class PolicyOptions:
         values = {
             "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
             "kind": self.kind,
+            "trust_code": self.trust_code,
             "weights_file": self.weights_file,
             "goal": self.goal,
             "goals": self.goals,

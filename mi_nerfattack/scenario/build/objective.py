@@ -26,7 +26,7 @@ from mi_nerfattack.rollout.objective import (
 from mi_nerfattack.rollout.reduction import AbstractReduction, CVaR, Mean, Worst
 from mi_nerfattack.scenario.scenario import Scenario, resolve
 from mi_nerfattack.scenario.sections import AbstractTerm, ObjectiveSection
-from mi_nerfattack.scenario.user_code import load_function, split_reference
+from mi_nerfattack.scenario.user_code import check_trust, load_function, split_reference
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.state import to_state
@@ -96,6 +96,7 @@ def _cost(
         path = Route.from_file(resolve(term.target, base), term.target_route)
         return TargetDistance(path, term.rounding_m)
     assert term.function, "checked with the section"
+    check_trust("objective.function", term.function, term.trust_code)
     return _user_cost(term.function, route, dynamics, base)
 
 

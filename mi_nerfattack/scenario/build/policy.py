@@ -41,7 +41,7 @@ from mi_nerfattack.policy.preprocess import (
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.scenario import resolve
 from mi_nerfattack.scenario.sections import PolicySection, PreprocessSection
-from mi_nerfattack.scenario.user_code import load_function, split_reference
+from mi_nerfattack.scenario.user_code import check_trust, load_function, split_reference
 
 FILTERS = {"antialias": antialias, "bilinear": bilinear, "area": area}
 LAYOUTS = {
@@ -64,6 +64,8 @@ SUFFIXES = {
     ".pt": "torchscript",
     ".onnx": "onnx",
 }
+#: Kinds whose files are code.
+CODE = ("module", "drjit", "callable", "exported", "torchscript")
 MAX_WEIGHT_BYTES = 1 << 33
 
 
@@ -75,11 +77,14 @@ def load_policy(section: PolicySection, base: str | Path) -> AbstractPolicy:
         base: folder that relative paths start from.
 
     Raises:
-        InputError: a file is missing or wrong, a key does not fit the kind, or a
-            package that the kind needs is not installed.
+        InputError: a file is missing or wrong, or is code without the word of trust,
+            a key does not fit the kind, or a package that the kind needs is not
+            installed.
     """
     kind = policy_kind(section)
     _check_keys(section, kind)
+    if kind in CODE:
+        check_trust("policy.file", str(section.file), section.trust_code)
     return _LOADERS[kind](section, base)
 
 

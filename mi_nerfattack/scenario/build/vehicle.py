@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_nerfattack.scenario.scenario import VehicleSection, resolve
-from mi_nerfattack.scenario.user_code import import_function, load_function
+from mi_nerfattack.scenario.user_code import check_trust, import_function, load_function
 from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
@@ -63,6 +63,7 @@ def build_integrator(section: VehicleSection) -> AbstractIntegrator:
 def _custom_dynamics(section: VehicleSection, base: str | Path) -> AbstractDynamics:
     """Load the user's function, and try it near the origin and the initial state."""
     assert section.function is not None and section.control_limit is not None
+    check_trust("vehicle.function", section.function, section.trust_code)
     file, _, name = section.function.rpartition(":")
     if file.endswith(".py"):
         function = load_function(resolve(file, base), name)

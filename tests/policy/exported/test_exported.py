@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def section(**keys):
-    return PolicySection.model_validate(keys)
+    return PolicySection.model_validate({"trust_code": True, **keys})
 
 
 def camera(n, rng):
@@ -124,6 +124,12 @@ def test_other_files_are_no_programs(name, tmp_path):
     (tmp_path / name).write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=f"{name}: is no"):
         load_policy(section(file=name), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["net.pt", "net.pt2", "net.py:Net"])
+def test_code_needs_the_word_of_trust(name, tmp_path):
+    with pytest.raises(InputError, match=f"policy.file: {name}: .*trust_code = true"):
+        load_policy(section(file=name, trust_code=False), tmp_path)
 
 
 @pytest.mark.parametrize("name", ["net.pt", "net.pt2"])

@@ -193,9 +193,8 @@ at = "end"
 
 
 def test_function_of_the_user(write):
-    objective = build(
-        write('[objective]\nfunction = "costs.py:squared"\nkind = "function"')
-    )
+    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
+    objective = build(write(f'{text}"costs.py:squared"'))
     assert isinstance(objective.cost, UserCost)
     rows = dr.llvm.ad.Array3f64([[1, 2, 3, 4], [0, 1, 0, 2], [0] * 4])
     dr.enable_grad(rows)
@@ -203,8 +202,11 @@ def test_function_of_the_user(write):
     assert value.numpy() == pytest.approx([-5.0])
     dr.backward(value)
     np.testing.assert_allclose(dr.grad(rows).numpy()[1], [0, 2, 0, 4])
-    slope = build(write('[objective]\nfunction = "costs.py:slope"\nkind = "function"'))
+    slope = build(write(f'{text}"costs.py:slope"'))
     assert slope.cost(rows).numpy().tolist() == [0] * 4
+    path = write(f'{text}"costs.py:slope"'.replace("true", "false"))
+    with pytest.raises(InputError, match="objective.function: costs.*trust_code = "):
+        build(path)
 
 
 @pytest.mark.parametrize(
@@ -224,7 +226,8 @@ def test_function_of_the_user(write):
     ],
 )
 def test_unusable_functions_are_named(write, function, words):
-    path = write(f'[objective]\nkind = "function"\nfunction = "{function}"\n')
+    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
+    path = write(f'{text}"{function}"')
     with pytest.raises(InputError) as caught:
         build(path)
     for word in words:
@@ -305,6 +308,7 @@ def test_digest_and_text_follow_the_files(write, tmp_path):
 [objective]
 kind = "function"
 function = "costs.py:squared"
+trust_code = true
 [[objective.terms]]
 kind = "target_path"
 target = "targets.json"
@@ -341,8 +345,8 @@ def test_examples_of_the_manual(write, tmp_path):
     assert [weight for weight, _ in objective.terms] == [1.0, 0.1]
     blocks = re.findall(r"```python\n(.*?)```", section, re.S)
     (tmp_path / "manual.py").write_text(blocks[0])
-    function = "manual.py:leave_to_the_right"
-    objective = build(write(f'[objective]\nkind = "function"\nfunction = "{function}"'))
+    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
+    objective = build(write(f'{text}"manual.py:leave_to_the_right"'))
     state = dr.llvm.ad.Array3f64([0, 0], [1, -7], [0, 0])
     assert objective.cost(state).numpy().tolist() == [7, 0]
     names = {"route": ROUTE, "weights": np.ones(4)}
