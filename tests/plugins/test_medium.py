@@ -16,13 +16,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from helpers.variants import RGB
+from helpers.variants import RGB, later
 
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
 
 TEXELS = 80
 CENTRES = np.linspace(-1, 1, TEXELS)
-OTHERS = ("volpathmis", "prbvolpath")
 ALBEDO = {"type": "constvolume", "value": {"type": "rgb", "value": [0.8, 0.5, 0.3]}}
 
 
@@ -99,7 +98,7 @@ def test_values_bound_and_box_are_those_of_gridvolume(path: Path, rng) -> None:
 
 @pytest.mark.parametrize(
     "integrator",
-    ["volpath", *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)],
+    ["volpath", *later("volpathmis", "prbvolpath")],
 )
 def test_fields_render_as_gridvolumes(path: Path, integrator: str) -> None:
     density, radiance = sampled(path)

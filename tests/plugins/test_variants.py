@@ -23,6 +23,8 @@ from mi_nerfattack.render.lighting.spectrum import emission
 pytestmark = pytest.mark.usefixtures("each_variant")
 
 WIDTH, HEIGHT = 12, 8
+#: For what does not meet the conversion of colours.
+IN_RGB = pytest.mark.parametrize("each_variant", RGB, indirect=True)
 BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 NGP_PARAMETERS = ("table", "density_weights", "colour_weights", "sky")
 
@@ -241,6 +243,7 @@ def test_field_emitter(grid: str, rng, seeing: str, eye) -> None:
 DIRECT = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0}  # compiles fast
 
 
+@IN_RGB
 @pytest.mark.parametrize("composite", ["interleaved", "depth"])
 def test_field_emitter_of_two_fields(grid: str, rng, composite: str) -> None:
     beside = mi.ScalarTransform4f().translate([0, 0.3, 0]).scale(0.6)
@@ -259,6 +262,7 @@ def test_field_emitter_of_an_ngp(ngp: str, rng, name: str) -> None:
 # Hard points
 
 
+@IN_RGB
 def test_opacity_one(tmp_path: Path, rng) -> None:
     name = write(tmp_path / "box.safetensors", small.homogeneous(1e4))
     loaded = scene(integrator(object=volume(name)))
@@ -270,6 +274,7 @@ def test_opacity_one(tmp_path: Path, rng) -> None:
     assert np.abs(opaque.gradient()).max() < 1e-3 * np.abs(found.gradient()).max()
 
 
+@IN_RGB
 def test_opacity_zero(tmp_path: Path, rng) -> None:
     field = small.blob(rng, step_m=0.1)
     field.set_parameter("density", np.full(field.n_vertices, -60, np.float32))
@@ -281,6 +286,7 @@ def test_opacity_zero(tmp_path: Path, rng) -> None:
         found.check_zero(rng.normal(0, 1, found.base.shape))
 
 
+@IN_RGB
 @pytest.mark.parametrize(
     ("eye", "target"),
     [((3, 1, 0.5), (3, 1, 9)), ((3, 0, 0), (9, 0, 0.1))],
@@ -293,6 +299,7 @@ def test_objects_out_of_view(grid: str, rng, eye, target) -> None:
         found.check_zero(rng.normal(0, 1, found.base.shape))
 
 
+@IN_RGB
 @pytest.mark.parametrize("density", [-200.0, 9.0], ids=["opacity 0", "opacity 1"])
 def test_emitter_at_the_ends_of_opacity(tmp_path: Path, rng, density: float) -> None:
     field = small.blob(rng, step_m=0.1)
@@ -307,6 +314,7 @@ def test_emitter_at_the_ends_of_opacity(tmp_path: Path, rng, density: float) -> 
         found.check_zero(direction)
 
 
+@IN_RGB
 @pytest.mark.parametrize("method", ["eval", "eval_1", "eval_3"])
 def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
     loaded = mi.load_dict(volume(grid, quantity="radiance"))
@@ -317,6 +325,7 @@ def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
     found.check_zero(rng.normal(0, 1, found.base.shape))
 
 
+@IN_RGB
 @pytest.mark.parametrize("composite", ["interleaved", "depth"])
 def test_touching_objects(grid: str, rng, composite: str) -> None:
     beside = mi.ScalarTransform4f().translate([0, 2, 0])
@@ -330,6 +339,7 @@ def test_touching_objects(grid: str, rng, composite: str) -> None:
         found.check(directions(rng, field_of(loaded), found.base.shape))
 
 
+@IN_RGB
 def test_camera_inside(grid: str, rng) -> None:
     loaded = scene(integrator(object=volume(grid)), (0.2, 0.1, 0))
     found = problem(loaded, "density")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import central_difference
+from helpers.variants import later
 
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
@@ -110,7 +111,7 @@ def test_packed_parameters_of_a_grid(blob: Setting, rng, part: str) -> None:
     check_parameter(blob, lambda: field.packed, write, tangent.ravel(), 2e-2, 5e-3)
 
 
-@pytest.mark.parametrize("name", ["table", "density_weights", "colour_weights"])
+@pytest.mark.parametrize("name", ["table", "colour_weights", *later("density_weights")])
 def test_parameters_of_an_ngp(ngp: Setting, rng, name: str) -> None:
     field = ngp.field
 
@@ -166,6 +167,7 @@ def check_rays(setting: Setting, rng, h: float, tolerance: float) -> None:
         assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_origin_and_direction_through_a_blob(blob: Setting, rng) -> None:
     # Samples that cross the faces of cells, kinks of the field, cost accuracy.
     check_rays(blob, rng, 1e-3, 1.5e-2)

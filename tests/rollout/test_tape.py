@@ -61,6 +61,7 @@ def test_the_sensor_s_product_is_that_of_the_tape(toy, rng):
         np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * np.abs(b).max())
 
 
+@pytest.mark.slow
 def test_adjoints_agree_on_objects_in_front_of_each_other(toy):
     """Two objects that overlap in the image, each with its texture and offset."""
     from mi_nerfattack.fields import GridLayout

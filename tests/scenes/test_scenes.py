@@ -52,6 +52,7 @@ def test_unknown_name_lists_what_exists(name: str) -> None:
         bundled(name)
 
 
+@pytest.mark.slow
 def test_intersection_builds_to_identical_bytes(tmp_path) -> None:
     first = intersection.build(tmp_path / "a", seed=3)
     second = intersection.build(tmp_path / "b", seed=3)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import Derivatives, images
-from helpers.variants import MONO, RGB, SPECTRAL
+from helpers.variants import MONO, RGB, SPECTRAL, later
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, save_field
@@ -346,13 +346,16 @@ def problem(folder: Path, rng, name: str, composite: str) -> Derivatives:
     return Derivatives(params, key, images(loaded, params))
 
 
+@pytest.mark.parametrize(
+    "each_variant", [*RGB, *later(*SPECTRAL, *MONO)], indirect=True
+)
 def test_gradients_in_every_variant(each_variant, tmp_path: Path, rng) -> None:
     found = problem(tmp_path, rng, "object.texture", "interleaved")
     found.check([rng.normal(0, 1, found.base.shape)])
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("name", ["object.texture", "other.texture"])
+@pytest.mark.parametrize("name", ["other.texture", *later("object.texture")])
 def test_gradients_of_the_depth_composite(tmp_path: Path, rng, name: str) -> None:
     found = problem(tmp_path, rng, name, "depth")
     found.check([rng.normal(0, 1, found.base.shape)])
