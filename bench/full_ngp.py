@@ -93,9 +93,10 @@ class NGPData:
         return NGPData(
             NGPLayout(*map(int, layout)),
             *box,
-            tensors,
-            cells.astype(bool),
-            *map(float, steps),
+            tensors=tensors,
+            cells=cells.astype(bool),
+            step_m=float(steps[0]),
+            cone=float(steps[1]),
         )
 
 

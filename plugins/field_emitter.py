@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mi_nerfattack.plugins import field_volume as shared
 from mi_nerfattack.plugins.properties import (
+    Mask,
     background,
     read_composite,
     read_nested,
@@ -84,12 +85,12 @@ class FieldEmitter(mi.Emitter):
         refuse_nested(others, "field_emitter")
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose the fields under their ids."""
         for volume in self.volumes:
-            callback.put(volume.id(), volume, mi.ParamFlags.Differentiable)
+            cb.put(volume.id(), volume, mi.ParamFlags.Differentiable)
 
-    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> Any:
+    def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> Any:
         """Evaluate the radiance that leaves towards ``si.wi``, (channels, n)."""
         direction = -si.to_world(si.wi)
         inside = dr.dot(direction, si.n) > 0
@@ -109,7 +110,7 @@ class FieldEmitter(mi.Emitter):
         )
 
     def sample_direction(
-        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
     ) -> tuple[mi.DirectionSample3f, Any]:
         """Sample a point of the shape seen from ``it``."""
         ds = self.get_shape().sample_direction(it, sample, active)
@@ -119,13 +120,13 @@ class FieldEmitter(mi.Emitter):
         return ds, dr.select(active, value / dr.select(active, ds.pdf, 1), 0)
 
     def pdf_direction(
-        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True
     ) -> mi.Float:
         """Return the density of :meth:`sample_direction`, 1/steradian."""
         return dr.select(active, self.get_shape().pdf_direction(it, ds, active), 0)
 
     def eval_direction(
-        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True
     ) -> Any:
         """Evaluate the radiance that arrives at ``it`` from ``ds``."""
         return self.eval(self._towards(ds, it), active)
@@ -136,7 +137,7 @@ class FieldEmitter(mi.Emitter):
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n, si.t = ds.p, ds.n, ds.dist
         si.wavelengths = it.wavelengths
-        si.sh_frame = mi.Frame3f(ds.n)
+        si.sh_frame = mi.Frame3f(mi.Vector3f(ds.n))
         si.wi = si.to_local(-ds.d)
         return si
 

@@ -12,6 +12,7 @@ import mitsuba as mi
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.properties import (
+    Mask,
     background,
     read_composite,
     read_nested,
@@ -103,9 +104,9 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         self.posed = [volume.posed for volume in self.volumes]
         self.composite.check(self.posed)
         self.behind = others[0] if is_first else None
-        samples = int(props.get("relit_samples", LIGHT_SAMPLES))
+        samples: Any = props.get("relit_samples", LIGHT_SAMPLES)
         relit = tuple(volume.relit for volume in self.volumes)
-        relighting = Relighting(relit, samples, self.stop)
+        relighting = Relighting(relit, int(samples), self.stop)
         if any(relit):
             only_fields(
                 self.posed, "relit objects throw no shadow on it", "set relit to false"
@@ -113,10 +114,10 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         self.relighting = relighting if any(relit) else None
         self._has_aovs = True
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose the fields under their ids."""
         for volume in self.volumes:
-            callback.put(volume.id(), volume, mi.ParamFlags.Differentiable)
+            cb.put(volume.id(), volume, mi.ParamFlags.Differentiable)
 
     def aov_names(self) -> list[str]:
         """Name the arbitrary output variables."""
@@ -129,7 +130,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         self,
         scene: mi.Scene,
         sensor: Any = 0,
-        seed: mi.UInt32 = 0,
+        seed: Any = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
@@ -165,7 +166,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         params: Any,
         grad_in: mi.TensorXf,
         sensor: Any = 0,
-        seed: mi.UInt32 = 0,
+        seed: Any = 0,
         spp: int = 0,
     ) -> None:
         """Accumulate gradients; those of AOVs are ignored."""
@@ -180,7 +181,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         scene: mi.Scene,
         params: Any,
         sensor: Any = 0,
-        seed: mi.UInt32 = 0,
+        seed: Any = 0,
         spp: int = 0,
     ) -> mi.TensorXf:
         """Render the image's tangent; that of AOVs is zero."""
@@ -209,13 +210,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
+        depth: Any = None,
         δL: Any = None,
+        δaovs: Any = None,
         state_in: Any = None,
-        active: mi.Bool = True,
-        **kwargs: Any,
+        active: Mask = True,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``."""
-        del kwargs
+        del depth, δaovs
         ray = mi.Ray3f(dr.detach(ray))
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -9,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import AbstractField, load_field
+from mi_nerfattack.fields import AbstractField, GridField, NGPField, load_field
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.plugins.properties import read_pose
+from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.posed import PosedField
@@ -19,10 +20,10 @@ from mi_nerfattack.render.posed import PosedField
 QUANTITIES = ("density", "radiance")
 
 
-def read_field(props: mi.Properties, kind: str) -> AbstractField:
+def read_field(props: mi.Properties, kind: str) -> GridField | NGPField:
     """Load the file named by the property `filename` and check its kind."""
-    name = mi.file_resolver().resolve(props["filename"])
-    field = load_field(str(name))
+    name = read_filename(props)
+    field = load_field(name)
     if field.kind != kind:
         raise InputError(
             f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'
@@ -48,7 +49,8 @@ def place_unit_cube(
 
 def read_limit(props: mi.Properties) -> float:
     """Read `density_limit`, 1/metre."""
-    limit = float(props.get("density_limit", float("inf")))
+    given: Any = props.get("density_limit", dr.inf)
+    limit = float(given)
     if not limit > 0:
         raise InputError(f"density_limit: {limit}; must be positive, 1/metre")
     return limit
@@ -82,12 +84,12 @@ class AbstractFieldVolume(mi.Volume):
         self.posed = PosedField(field, pose)
         self.values = self.field.parameters()
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose the parameters of the field."""
         for name in self.parameter_names:
-            callback.put(name, self.values[name], mi.ParamFlags.Differentiable)
+            cb.put(name, self.values[name], mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Hand changed parameters to the field.
 
         What was empty may not be so after a change of ``density``: from then on the
@@ -99,7 +101,7 @@ class AbstractFieldVolume(mi.Volume):
         if "density" in keys:
             self.field.occupancy = Occupancy.full()
 
-    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> Any:
+    def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
         """Evaluate the quantity as a spectrum, (channels, n).
 
         Radiance counts as a reflectance: white is 1 in every channel.
@@ -108,18 +110,18 @@ class AbstractFieldVolume(mi.Volume):
             return mi.Spectrum(self.eval_1(it, active))
         return spectrum.reflectance(self._evaluate(it, active)[1], it.wavelengths)
 
-    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+    def eval_1(self, it: mi.Interaction3f, active: Mask = True) -> mi.Float:
         """Evaluate density (n,), 1/metre, or the luminance of the radiance."""
         density, colour = self._evaluate(it, active)
         if self.quantity == "radiance":
             return mi.luminance(colour)
         return dr.minimum(density, self.limit) if self.limit < dr.inf else density
 
-    def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
+    def eval_3(self, it: mi.Interaction3f, active: Mask = True) -> mi.Vector3f:
         """Evaluate radiance (3, n), linear RGB, seen along the field's +z."""
         return mi.Vector3f(self._evaluate(it, active)[1])
 
-    def _evaluate(self, it: mi.Interaction3f, active: mi.Bool) -> Any:
+    def _evaluate(self, it: mi.Interaction3f, active: Mask) -> Any:
         point, _ = self.posed.to_local(it.p, mi.Vector3f(0, 0, 1))
         lower = mi.Point3f(*map(float, self.field.lower))
         upper = mi.Point3f(*map(float, self.field.upper))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -9,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.plugins.properties import Mask
 from mi_nerfattack.render.camera.distortion import distort, jacobian, undistort
 from mi_nerfattack.render.camera.intrinsics import Camera
 
@@ -89,18 +91,18 @@ class OpencvCamera(mi.Sensor):
         self.m_needs_sample_3 = False
         self.parameters_changed([])
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose intrinsics, clip distances and pose."""
-        super().traverse(callback)
+        super().traverse(cb)
         fixed = mi.ParamFlags.NonDifferentiable
         moves = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, value in self.intrinsics.items():
-            callback.put(name, value, moves)
-        callback.put("near_clip", self.near_clip, fixed)
-        callback.put("far_clip", self.far_clip, fixed)
-        callback.put("to_world", self.m_to_world, moves)
+            cb.put(name, value, moves)
+        cb.put("near_clip", self.near_clip, fixed)
+        cb.put("far_clip", self.far_clip, fixed)
+        cb.put("to_world", self.m_to_world, moves)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check what changed and hand it to kernels as opaque values."""
         super().parameters_changed(keys)
         if not keys or "to_world" in keys:
@@ -130,7 +132,7 @@ class OpencvCamera(mi.Sensor):
         sample1: mi.Float,
         sample2: mi.Point2f,
         sample3: mi.Point2f,
-        active: mi.Bool = True,
+        active: Mask = True,
     ) -> tuple[mi.Ray3f, Any]:
         """Make the ray through a position in the crop window."""
         del sample3
@@ -143,7 +145,7 @@ class OpencvCamera(mi.Sensor):
         sample1: mi.Float,
         sample2: mi.Point2f,
         sample3: mi.Point2f,
-        active: mi.Bool = True,
+        active: Mask = True,
     ) -> tuple[mi.RayDifferential3f, Any]:
         """Make the ray and, to first order, those of the next pixels."""
         del sample3
@@ -163,7 +165,7 @@ class OpencvCamera(mi.Sensor):
         return ray, weight
 
     def sample_direction(
-        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
     ) -> tuple[mi.DirectionSample3f, Any]:
         """Connect points to the camera; ``uv`` is in pixels of the crop window."""
         del sample

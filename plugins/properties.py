@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -13,10 +13,19 @@ from mi_nerfattack.render.composite import AbstractComposite
 from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.march import STOP
 
+# Which lanes are active: Mitsuba passes an array, or leaves the default.
+Mask: TypeAlias = "mi.Bool | bool"
+
+
+def read_filename(props: mi.Properties) -> str:
+    """Find the file that `filename` names beside the scene's."""
+    resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  # no stub
+    return str(resolver.resolve(props["filename"]))
+
 
 def read_pose(props: mi.Properties) -> Pose:
     """Read `to_world`: rotation, translation and uniform scale."""
-    transform = props.get("to_world", mi.ScalarTransform4f())
+    transform: Any = props.get("to_world", mi.ScalarTransform4f())
     try:
         return Pose.from_matrix(np.array(transform.matrix, np.float64))
     except ValueError as err:
@@ -27,7 +36,8 @@ def read_pose(props: mi.Properties) -> Pose:
 
 def read_stop(props: mi.Properties) -> float:
     """Read `stop`, a transmittance."""
-    stop = float(props.get("stop", STOP))
+    given: Any = props.get("stop", STOP)
+    stop = float(given)
     if not 0 <= stop < 1:
         raise InputError(f"stop: {stop}; allowed is 0 <= stop < 1")
     return stop
@@ -35,7 +45,7 @@ def read_stop(props: mi.Properties) -> float:
 
 def read_composite(props: mi.Properties) -> AbstractComposite:
     """Read `composite`, the rule by which fields become one colour."""
-    name = props.get("composite", "interleaved")
+    name: Any = props.get("composite", "interleaved")
     if name not in COMPOSITES:
         raise InputError(f"composite: {name!r}; allowed: {', '.join(COMPOSITES)}")
     return COMPOSITES[name]()

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.splats import read_splats
-from mi_nerfattack.plugins.properties import read_pose
+from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.splats import SplatBackground
 
@@ -56,18 +56,18 @@ class SplatBackgroundVolume(mi.Volume):
     def __init__(self, props: mi.Properties) -> None:
         spectrum.prepare()
         pose = read_pose(props)
-        name = mi.file_resolver().resolve(props["filename"])
+        name = read_filename(props)
         super().__init__(props)
-        self.splats = read_splats(str(name))
+        self.splats = read_splats(name)
         self.posed = SplatBackground(self.splats, pose)
         self.relit = False
 
-    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> Any:
+    def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
         """Refuse to be a medium."""
         del it, active
         self._refuse()
 
-    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+    def eval_1(self, it: mi.Interaction3f, active: Mask = True) -> mi.Float:
         """Refuse to be a medium."""
         del it, active
         self._refuse()

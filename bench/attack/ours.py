@@ -35,6 +35,7 @@ from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop, Step, simulate
 from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.rollout.sweep import differentiable
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.integrators import RK4
@@ -119,7 +120,7 @@ class OurAttack(AbstractAttack):
         sizes: list[int] = []
 
         def look(step: Step) -> None:
-            kept = self.loop.sensor.keep(step.observation)
+            kept = differentiable(self.loop).keep(step.observation)
             sizes.append(_bytes(kept))
 
         simulate(self.loop, self.initial, 1, keep=look)

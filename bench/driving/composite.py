@@ -117,12 +117,9 @@ def write_figure(
                 axes.set_ylabel(f"{name}\n({height:+.2f} m)")
     axes = figure.add_subplot(grid[len(SHOWN), :])
     heights = [result.height_m for result in results]
-    for label, key, style in (
-        ("mean", "mean", {"color": "#0072B2", "marker": "o"}),
-        ("largest", "largest", {"color": "#D55E00", "marker": "s", "ls": "--"}),
-    ):
+    for key, line, colour in (("mean", "o-", "#0072B2"), ("largest", "s--", "#D55E00")):
         values = [255 * getattr(result, key) for result in results]
-        axes.plot(heights, values, label=label, **style)
+        axes.plot(heights, values, line, color=colour, label=key)
     axes.set_yscale("symlog", linthresh=0.1)
     axes.axvline(0, color="#9a9a9a", lw=1)
     axes.set(

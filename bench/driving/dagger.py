@@ -116,7 +116,7 @@ def run(
     site = PlaceSite(settings.environment, bundled_place(), weather)
     bench = _Bench(settings, site, folder, workers, show)
     errors: dict[str, list[list[float]]] = {arm: [] for arm in ARMS}
-    departed = dict.fromkeys(ARMS, 0)
+    departed: dict[str, int] = dict.fromkeys(ARMS, 0)
     for seed in settings.seeds:
         policies = bench.cloning(seed), bench.dagger(seed)
         for arm, policy in zip(ARMS, policies, strict=True):

@@ -133,7 +133,7 @@ class OurTrainer(AbstractTrainer):
             seconds = self.steps(_PROFILED)["seconds"]
             profile.disable()
             history = dr.kernel_history()
-        parts = dict.fromkeys(PARTS, 0.0)
+        parts: dict[str, float] = dict.fromkeys(PARTS, 0.0)
         for entry in history:
             parts[self._part(entry)] += entry["execution_time"]
         parts["networks"] = 1e3 * sum(

@@ -79,7 +79,7 @@ class TorchNGP:
 
     def __init__(self, data: NGPData, grid: AbstractHashGrid, stop: float) -> None:
         self.grid, self.limit = grid, -math.log(stop)
-        self.batches = BATCHES
+        self.batches: tuple[tuple[int, int], ...] = BATCHES
         table = data.tensors["table"].reshape(grid.rows, grid.features)
         self.parameters = {"table": _single(table)} | {
             name: _single(value)

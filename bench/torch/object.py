@@ -18,6 +18,7 @@ import torch.nn.functional as F
 
 from bench.full_ngp import level_sizes
 from bench.torch.ngp import BATCHES, decode, sum_before
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.ngp import NGPLayout
 from mi_nerfattack.io import files
 from mi_nerfattack.render.posed import PosedField
@@ -49,6 +50,7 @@ class ObjectData:
     def of(posed: PosedField) -> ObjectData:
         """Copy a posed grid field."""
         field, pose = posed.field, posed.pose
+        assert isinstance(field, GridField)
         layout = field.layout
         edges = (layout.levels, layout.base_resolution, layout.max_resolution)
         columns = (pose.rotation, pose.translation, np.full(3, pose.scale))
@@ -224,7 +226,7 @@ class TorchObject:
         start, slope, near, far = (x[through] for x in (start, slope, near, far))
         first = (near / self.step).floor()
         count = (far / self.step).ceil() - first
-        index = first[:, None] + torch.arange(count.max() if len(count) else 0.0)
+        index = first[:, None] + torch.arange(float(count.max()) if len(count) else 0.0)
         begin = torch.maximum(index * self.step, near[:, None])
         end = torch.minimum((index + 1) * self.step, far[:, None])
         t = 0.5 * (begin + end)

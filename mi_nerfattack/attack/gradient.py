@@ -80,7 +80,8 @@ class GradientAttack:
         self.best_objective = np.inf
         self.best_mean_m = 0.0
         self.best = self._textures()
-        self.optimiser = Adam(lr=self.freedom.texture_rate or self.freedom.pose_rate)
+        rate = self.freedom.texture_rate or self.freedom.pose_rate or 0.0
+        self.optimiser = Adam(lr=rate)
         if self.freedom.texture_rate is not None:
             for i, texture in enumerate(self.sensor.textures()):
                 self.optimiser[str(i)] = texture
@@ -256,13 +257,16 @@ class GradientAttack:
         ends = np.cumsum(tensors["cost_counts"])
         costs = np.split(tensors["costs"], ends[:-1])
         self.history = [
-            IterationRecord(int(row[0]), *map(float, row[1:]), tuple(map(float, part)))
+            IterationRecord(
+                int(row[0]), *map(float, row[1:]), costs=tuple(map(float, part))
+            )
             for row, part in zip(tensors["history"], costs, strict=False)
         ]
 
     def _load_parameter(self, key: str, tensors: dict[str, np.ndarray]) -> None:
         self.optimiser[key] = _tensor(tensors[f"texture.{key}"])
-        value, promoted, rate, extra = self.optimiser.state[key]
+        state: Any = self.optimiser.state[key]
+        value, promoted, rate, extra = state
         if f"first.{key}" in tensors:
             count = type(extra[0])([int(tensors[f"count.{key}"][0])])
             first = _like(extra[1], value, tensors[f"first.{key}"])

@@ -135,7 +135,7 @@ def _inside(
 def _reduced(mask: np.ndarray) -> tuple[np.ndarray, int]:
     """Reduce a mask to about `_PIXELS`; a pixel is set if one of its parts is."""
     factor = max(1, max(mask.shape) // _PIXELS)
-    return block_reduce(mask, (factor, factor), np.max), factor
+    return block_reduce(mask, factor, np.max), factor
 
 
 def _touches(

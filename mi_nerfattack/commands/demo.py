@@ -32,7 +32,7 @@ class Demo:
     def run(self) -> int:
         """Run the bundled scenario."""
         from mi_nerfattack.commands.shared.run_scenario import run_scenario
-        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
+        from mi_nerfattack.scenes import bundled
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
         output = self.output or Path("runs") / f"demo-{stamp}"

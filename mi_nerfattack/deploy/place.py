@@ -81,7 +81,7 @@ def bundled_place(name: str = "intersection") -> Place:
         name: "intersection", with the full-size car; or "room", with the small car on
             its square track, which has no field.
     """
-    from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
+    from mi_nerfattack.scenes import bundled
 
     if name not in _CARS:
         raise InputError(f"place: {name!r}; one of {', '.join(_CARS)}")

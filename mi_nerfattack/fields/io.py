@@ -34,7 +34,7 @@ def save_field(path: str | Path, field: AbstractField) -> None:
     files.write_safetensors(path, tensors, metadata)
 
 
-def load_field(path: str | Path) -> AbstractField:
+def load_field(path: str | Path) -> GridField | NGPField:
     """Read a field file of any kind.
 
     Raises:

@@ -170,7 +170,7 @@ def mean_samples(posed: PosedField, source: BatchSource, seed: int) -> float:
         source: of the rays.
         seed: of those that are counted.
     """
-    random = mi.PCG32(_PROBE, seed)
+    random = mi.PCG32(_PROBE, seed)  # pyright: ignore[reportCallIssue]
     rays = source.draw(random, dr.opaque(mi.UInt32, _PROBE)).rays
     count = sample_count(posed, rays.origin, rays.direction, rays.t_max, rays.jitter)
     return float(dr.mean(count)[0])

@@ -83,9 +83,8 @@ class FitCheckpoint:
             raise InputError(
                 f"{self.path}: entry {err} is missing; the file is damaged"
             ) from err
-        whole = [item.name for item in fields(FitProgress)]
         for row in rows:
-            at = FitProgress(**dict(zip(whole, map(float, row), strict=True)))
+            at = FitProgress(*row.tolist())
             steps = None if at.steps == -1 else int(at.steps or 0)
             self.history.append(replace(at, step=int(at.step), steps=steps))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -150,7 +151,7 @@ def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 
     error = float(np.mean((image.astype(np.float64) - reference) ** 2))
     psnr = float("inf") if error == 0 else -10 * float(np.log10(error))
-    ssim = structural_similarity(
+    ssim: Any = structural_similarity(
         image,
         reference,
         data_range=1.0,

@@ -98,7 +98,7 @@ class Training:
         )
         self.step, self.rays = 0, 0
         self._total = Score()
-        self.random = mi.PCG32(options.batch_rays, options.seed + 1)
+        self.random = mi.PCG32(options.batch_rays, options.seed + 1)  # pyright: ignore[reportCallIssue]
         dr.make_opaque(self.random)
         self.limit = self._size(mean_samples(self._march.posed, source, options.seed))
 
@@ -206,7 +206,7 @@ class Training:
             result[f"value.{name}"] = dr.detach(value).numpy()
             result[f"first.{name}"] = first.numpy()
             result[f"second.{name}"] = second.numpy()
-            result[f"time.{name}"] = time.numpy()
+            result[f"time.{name}"] = np.array(time)
         return {name: np.array(value) for name, value in result.items()}
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:

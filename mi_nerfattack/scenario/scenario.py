@@ -144,7 +144,7 @@ def resolve(name: str, base: str | Path) -> Path:
         base: folder of the scenario file.
     """
     if name.startswith(BUNDLED):
-        from mi_nerfattack.scenes import bundled  # pyright: ignore[reportMissingImports]
+        from mi_nerfattack.scenes import bundled
 
         return bundled(name[len(BUNDLED) :])
     path = Path(name).expanduser()

@@ -128,8 +128,10 @@ def _reconstruct(
         folder,
         names,
         pycolmap.CameraMode.SINGLE,
-        {"camera_model": task["lens"]},
-        {"max_image_size": task["long_edge_px"], "use_gpu": False},
+        pycolmap.ImageReaderOptions(camera_model=task["lens"]),
+        pycolmap.FeatureExtractionOptions(
+            max_image_size=task["long_edge_px"], use_gpu=False
+        ),
     )
     _match(pycolmap, database, task["matching"], len(names))
     models = _map(pycolmap, database, folder, task)

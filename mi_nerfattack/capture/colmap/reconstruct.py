@@ -101,7 +101,8 @@ def _structure(found: dict[str, Any] | None, count: int) -> Structure:
     poses = np.tile(np.eye(4), (placed, 1, 1))
     poses[:, :3] = found["camera_to_world"]
     try:
-        camera = from_colmap(found["model"], *found["size"], found["parameters"])
+        width, height = found["size"]
+        camera = from_colmap(found["model"], width, height, found["parameters"])
     except InputError as error:
         raise InputError(
             f"photographs: the estimated lens is impossible ({error}); take a simpler "

@@ -165,4 +165,4 @@ def _nearest(flat: np.ndarray, points: np.ndarray) -> np.ndarray:
     on_edge = np.zeros_like(weights)
     on_edge[rows, edge] = 1 - share
     on_edge[rows, (edge + 1) % 3] = share
-    return np.where((weights >= 0).all(1)[:, None], weights, on_edge)
+    return np.where((weights >= 0).all(1, keepdims=True), weights, on_edge)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -267,9 +268,8 @@ def _hollows(opaque: np.ndarray) -> np.ndarray:
     hollows = np.zeros_like(opaque)
     for reach in range(1, _PINHOLE + 1):
         # room for the thickened shell, so that the outside stays connected
-        thick = ndimage.binary_dilation(np.pad(opaque, reach), _BLOCK, reach)
-        core = ndimage.binary_fill_holes(thick)
-        assert core is not None
+        thick: Any = ndimage.binary_dilation(np.pad(opaque, reach), _BLOCK, reach)
+        core: Any = ndimage.binary_fill_holes(thick)
         core &= ~thick
         grown = ndimage.binary_dilation(core, _BLOCK, reach + 1)
         hollows |= grown[(slice(reach, -reach),) * 3]

@@ -57,7 +57,7 @@ def laid_out(
         raise InputError("a texture coordinate is NaN or infinite")
     if wrap[0] == wrap[1]:
         return texture, uv, wrap[0]
-    beyond = ((uv < -_BEYOND) | (uv > 1 + _BEYOND)).any(axis=0)
+    beyond = np.any((uv < -_BEYOND) | (uv > 1 + _BEYOND), axis=0)
     for axis in (0, 1):
         if not beyond[axis]:
             return texture, uv, wrap[1 - axis]

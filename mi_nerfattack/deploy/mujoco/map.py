@@ -216,7 +216,8 @@ def _mesh_arrays(shape: Any) -> tuple[Any, ...]:
 
 
 def _rectangle_arrays(shape: Any) -> tuple[Any, ...]:
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    to_world: Any = mi.traverse(shape)["to_world"]
+    matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
     square = np.array([(-1, -1, 0, 1), (1, -1, 0, 1), (1, 1, 0, 1), (-1, 1, 0, 1)])
     uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64)
     vertices = (square @ matrix.T)[:, :3]
@@ -240,7 +241,7 @@ def _bake(bsdf: Any, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         uv (n, 2) in the image's own frame, and the linear albedo (h, w, 3).
     """
-    parameters = mi.traverse(bsdf)
+    parameters: Any = mi.traverse(bsdf)
     images = [parameters[k].shape for k in parameters.keys() if k.endswith(".data")]
     to_uv = np.eye(3)
     if images:

@@ -99,7 +99,7 @@ class _Window:
         self.far = np.float32(model.vis.map.zfar * model.stat.extent)
         self._scene = self._make_scene()
         # before the display goes, which OpenGL ends at exit as well
-        reference = weakref.ref(self)
+        reference: weakref.ReferenceType[_Window] = weakref.ref(self)
         self._at_exit = lambda: _close(reference)
         atexit.register(self._at_exit)
 

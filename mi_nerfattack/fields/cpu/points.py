@@ -64,8 +64,8 @@ class NGPPoints(AbstractPoints):
         features, point = place
         slot = dr.scatter_inc(self._counter, mi.UInt32(0), active)
         active = active & (slot < self.capacity)
-        numbers = mi.ArrayXf([*point, d_density, *d_radiance, mi.Float(0)])
-        dr.scatter(self._features, mi.ArrayXf(features), slot, active)
+        numbers = mi.ArrayXf([*point, d_density, *d_radiance, mi.Float(0)])  # pyright: ignore[reportCallIssue]
+        dr.scatter(self._features, mi.ArrayXf(features), slot, active)  # pyright: ignore[reportCallIssue]
         dr.scatter(self._numbers, numbers, slot, active)
         dr.scatter(self._ray, ray, slot, active)
 

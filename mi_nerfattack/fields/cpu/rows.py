@@ -41,7 +41,7 @@ def rows(values: mi.Float, width: int) -> np.ndarray:
 
 def lay_out(values: Any) -> mi.Float:
     """Lay k arrays (n,) out row by row, (n k,)."""
-    columns = mi.ArrayXf([mi.Float(value) for value in values])
+    columns = mi.ArrayXf([mi.Float(value) for value in values])  # pyright: ignore[reportCallIssue]
     count = dr.width(columns)
     flat = dr.zeros(mi.Float, count * len(columns))
     dr.scatter(flat, columns, dr.arange(mi.UInt32, count))

@@ -101,7 +101,7 @@ def _read_archive(path: Path, writer: str) -> bytes:
 
 def _batch(program: torch.export.ExportedProgram) -> int | None:
     """Return the first size of the first input where it is fixed."""
-    first = program.graph_signature.user_inputs[0]
+    first = list(program.graph_signature.user_inputs)[0]
     for node in program.graph.nodes:
         if node.op == "placeholder" and node.name == first:
             size = node.meta["val"].shape[0]

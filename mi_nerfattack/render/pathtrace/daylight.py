@@ -64,7 +64,7 @@ def set_daylight(scene: Any, name: str) -> None:
     daylight = DAYLIGHT[name]
     if daylight is None:
         return
-    parameters = mi.traverse(scene)
+    parameters: Any = mi.traverse(scene)
     suns = [key for key in parameters.keys() if key.endswith(".sun_direction")]
     if not suns:
         raise InputError(

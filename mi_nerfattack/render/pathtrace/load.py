@@ -86,14 +86,14 @@ def scene_files(path: str | Path) -> list[Path]:
         ]
         for text in texts:  # the parser replaces a spectrum's file by its numbers
             names += _FILENAME.findall(files.read_text(text))
-        resolver = mi.file_resolver()
+        resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]
         found = [Path(str(resolver.resolve(name))) for name in names if name]
     there = [item.resolve() for item in (*texts, *found) if item.is_file()]
     return list(dict.fromkeys(there))
 
 
 def _config() -> Any:
-    config = mi.parser.ParserConfig(mi.variant())
+    config = mi.parser.ParserConfig(str(mi.variant()))
     config.parallel = False  # Python plugins
     return config
 
@@ -134,14 +134,14 @@ def _resolved_from(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: is a folder; give a Mitsuba scene (XML)")
     if not source.is_file():
         raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
-    before = mi.file_resolver()
+    before = mi.file_resolver()  # pyright: ignore[reportCallIssue]
     resolver = mi.FileResolver(before)
     resolver.prepend(str(source.resolve().parent))
-    mi.set_file_resolver(resolver)
+    mi.set_file_resolver(resolver)  # pyright: ignore[reportCallIssue]
     try:
         yield
     finally:
-        mi.set_file_resolver(before)
+        mi.set_file_resolver(before)  # pyright: ignore[reportCallIssue]
 
 
 def _in_one_line(path: str | Path, text: str) -> str:
