@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import astuple, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,22 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.options import FitProgress
 from mi_nerfattack.fit.training import Training
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import read_kept, write_kept
+from mi_nerfattack.io.resumable import Record, Unit
 
-FORMAT = "mi_nerfattack fit checkpoint 2"
+FORMAT = "mi_nerfattack fit checkpoint 3"
 _REMEDY = (
     "resume with the same images, depth, options and versions, or delete the file to "
     "start again"
 )
 _EVERY_S = 30.0
 _MAX_SHARE = 0.02  # of the time that may go into writing
+
+
+class FitRecord(Record):
+    """What is kept beside the state: wall time, and reports so far."""
+
+    elapsed_s: float
+    history: list[FitProgress]
 
 
 class FitCheckpoint:
@@ -47,10 +53,13 @@ class FitCheckpoint:
         self.path, self.training = path, training
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
-        self._header = {"format": FORMAT, **versions(), "fit": _digest(training)}
+        identity = {"format": FORMAT, **versions(), "fit": _digest(training)}
+        self._unit = Unit(path, identity, FitRecord, _REMEDY)
         check_unfinished(path, resume)
-        if path.exists():
-            self._load()
+        kept = self._unit.read()
+        if kept is not None:
+            training.load_tensors(kept.tensors)
+            self.elapsed_s, self.history = kept.record.elapsed_s, kept.record.history
         files.check_writable(path)
         self._written = time.perf_counter()
         self._cost_s = 0.0
@@ -64,29 +73,10 @@ class FitCheckpoint:
     def save(self, elapsed_s: float, history: Sequence[FitProgress]) -> None:
         """Write the complete state."""
         start = time.perf_counter()
-        tensors = self.training.tensors()
-        rows = [astuple(replace(at, steps=at.steps or -1)) for at in history]
-        shape = len(rows), len(fields(FitProgress))
-        tensors["history"] = np.array(rows, np.float64).reshape(shape)
-        tensors["elapsed"] = np.array([elapsed_s])
-        write_kept(self.path, tensors, self._header, {})
+        record = FitRecord(elapsed_s=elapsed_s, history=list(history))
+        self._unit.write(self.training.tensors(), record)
         self._written = time.perf_counter()
         self._cost_s = self._written - start
-
-    def _load(self) -> None:
-        tensors = read_kept(self.path, self._header, _REMEDY).tensors
-        try:
-            self.training.load_tensors(tensors)
-            self.elapsed_s = float(tensors["elapsed"][0])
-            rows = tensors["history"]
-        except KeyError as err:
-            raise InputError(
-                f"{self.path}: entry {err} is missing; the file is damaged"
-            ) from err
-        for row in rows:
-            at = FitProgress(*row.tolist())
-            steps = None if at.steps == -1 else int(at.steps or 0)
-            self.history.append(replace(at, step=int(at.step), steps=steps))
 
 
 def check_unfinished(path: Path, resume: bool) -> None:
