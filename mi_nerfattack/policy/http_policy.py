@@ -14,6 +14,9 @@ Every control period the images are posted, and the answer holds the controls::
 A request that fails for the network's or the server's reasons (no connection, no
 answer in time, status 5xx) is sent again, unchanged; the server must answer it as it
 would have the first time.
+
+Of our own, over the standard library, because a drive needs a limit for the whole
+answer, in time and size; common clients have one between two packets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Numbered pieces of work, done here or by several processes."""
+"""Numbered pieces of work, done here or by several processes.
+
+Of our own because `concurrent.futures` neither hears how far a piece is, nor ends its
+processes with the one that started them (SIGKILL included), nor tells which piece the
+process was at that died.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""ONNX files as torch modules: an interpreter with the derivatives of torch."""
+"""ONNX files as torch modules: an interpreter with the derivatives of torch.
+
+Of our own because an attack needs the derivative by the image: runtimes have none for
+inference graphs, and converters to torch need torchvision, which has no build that fits
+the CPU build of torch.
+"""
 
 from __future__ import annotations
 
