@@ -20,7 +20,7 @@ from mi_nerfattack.capture.mesh.mesh import (
 from mi_nerfattack.capture.mesh.read import load_mesh, up_matrix
 from mi_nerfattack.capture.object_renders import Lighting, render_asset
 from mi_nerfattack.capture.posed_images import PosedImages
-from mi_nerfattack.capture.silhouettes import check_alpha, place, silhouette_bounds
+from mi_nerfattack.capture.silhouettes import check_alpha, move_views, silhouette_bounds
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -131,13 +131,13 @@ def read_views(
             )
         return ObjectViews(images, *find_bounds(images, None, bounds), None)
     matrix = turn_matrix(placement.turn_deg) @ up_matrix(placement.up or "z")
-    images = place(images, matrix, 1.0, np.zeros(3))
+    images = move_views(images, matrix, 1.0, np.zeros(3))
     lower, upper = silhouette_bounds(images)
     scale = extent_scale(
         str(folder), upper - lower, placement.height_m, placement.longest_m
     )
     base = np.array([*(0.5 * (lower + upper)[:2]), lower[2]])
-    images = place(images, np.eye(3), scale, -scale * base)
+    images = move_views(images, np.eye(3), scale, -scale * base)
     if (placement.height_m, placement.longest_m) != (None, None):
         images = replace(images, unit="metre")
     return ObjectViews(images, scale * (lower - base), scale * (upper - base), None)

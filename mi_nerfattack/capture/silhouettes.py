@@ -80,7 +80,7 @@ def silhouette_bounds(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def place(
+def move_views(
     images: PosedImages,
     matrix: np.ndarray,
     scale: float,

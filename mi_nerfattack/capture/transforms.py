@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.capture.colmap.model import MODEL_PLACES, find_model, read_colmap
+from mi_nerfattack.capture.colmap.model import MODEL_FOLDERS, find_model, read_colmap
 from mi_nerfattack.capture.intrinsics import read_cameras
 from mi_nerfattack.capture.posed_images import (
     PosedImages,
@@ -84,7 +84,7 @@ def _nothing_found(folder: Path) -> str:
     )
     return (
         f"{folder}: no posed images; looked for {' or '.join(FILE_NAMES)}, and for a "
-        f"COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_PLACES)}"
+        f"COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}"
         f"; {advice}"
     )
 

@@ -23,7 +23,7 @@ class Place:
         routes: JSON.
         objects: grid fields that may stand beside the road.
         camera: of the vehicle.
-        mount: the camera's place on it.
+        mount: where the camera sits on it.
         period: seconds between two images.
         car: what drives.
         recording: of `replay`: a folder, a video or a log.

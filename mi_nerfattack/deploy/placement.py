@@ -63,7 +63,7 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Roadside:
-    """Sizes and places of objects beside a route.
+    """Sizes and positions of objects beside a route.
 
     Args:
         height_m: range of the object's height, metres.
@@ -94,7 +94,7 @@ class Roadside:
             rng: source of all draws.
 
         Raises:
-            InputError: no free place found.
+            InputError: no free ground found.
         """
         scale = rng.uniform(*self.height_m, _TRIES) / field.upper[2]
         corner = np.maximum(np.abs(field.lower[:2]), np.abs(field.upper[:2]))
@@ -103,9 +103,9 @@ class Roadside:
         farthest = np.maximum(self.lateral_m[1], nearest + 1)
         side = rng.choice([-1.0, 1.0], _TRIES)
         lateral = side * rng.uniform(nearest, farthest)
-        places = route.pose_at(rng.uniform(*arc, _TRIES), lateral)
-        height = ground(places[:, :2])
-        distance = np.abs(route.cross_track_numpy(places))
+        poses = route.pose_at(rng.uniform(*arc, _TRIES), lateral)
+        height = ground(poses[:, :2])
+        distance = np.abs(route.cross_track_numpy(poses))
         free = np.isfinite(height) & (distance > nearest - 1e-3)
         yaw = float(rng.uniform(-np.pi, np.pi))
         if not free.any():
@@ -114,7 +114,7 @@ class Roadside:
                 f"{arc[1]:.1f} m, {self.lateral_m} m aside; move routes or obstacles"
             )
         i = int(np.argmax(free))
-        x, y = places[i, :2].tolist()
+        x, y = poses[i, :2].tolist()
         return Pose.upright((x, y, float(height[i])), yaw, float(scale[i]))
 
 
@@ -128,7 +128,7 @@ def scene_ground(scene: Any, highest_m: float = 0.3) -> Ground:
     box = scene.bbox()
     sides = [np.linspace(box.min[i], box.max[i], 18)[1:-1] for i in range(2)]
     seen = _first_below(scene, np.stack(np.meshgrid(*sides), -1).reshape(-1, 2), 100.0)
-    # a ceiling is above all places
+    # a ceiling is above all of it
     top = float(seen.min()) - 0.1 if seen.min() > highest_m else 100.0
 
     def height(points: np.ndarray) -> np.ndarray:

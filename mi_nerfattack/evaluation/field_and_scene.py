@@ -192,9 +192,9 @@ def compare_with_scene(
     eyes = _Eyes(surrogate, load_scene(scene_path), options)
     arcs = [_stations(route.length, options.spacing_m) for route in routes]
     total, done, result = sum(map(len, arcs)), 0, []
-    for route, places in zip(routes, arcs, strict=True):
+    for route, stops in zip(routes, arcs, strict=True):
         tally = _Tally(route, options)
-        for arc in places:
+        for arc in stops:
             tally.add(eyes.frame(route, float(arc), done))
             done += 1
             progress(done, total)

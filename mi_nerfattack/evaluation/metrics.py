@@ -154,9 +154,9 @@ def validate(document: Any) -> None:
         _Document.model_validate(document)
     except pydantic.ValidationError as err:
         first = err.errors()[0]
-        place = ".".join(["metrics", *map(str, first["loc"])])
+        key = ".".join(["metrics", *map(str, first["loc"])])
         value = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
-        raise InputError(f"{place}: {first['msg']}{value}; see schema 1") from err
+        raise InputError(f"{key}: {first['msg']}{value}; see schema 1") from err
 
 
 class _Model(pydantic.BaseModel):

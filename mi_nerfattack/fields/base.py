@@ -30,7 +30,7 @@ class AbstractPoints(ABC):
     @abstractmethod
     def append(
         self,
-        place: Any,
+        evaluated: Any,
         d_density: mi.Float,
         d_radiance: mi.Color3f,
         ray: mi.UInt32,
@@ -39,7 +39,7 @@ class AbstractPoints(ABC):
         """Collect points; those beyond the capacity are only counted.
 
         Args:
-            place: from :meth:`eval`.
+            evaluated: the third value of :meth:`eval`.
             d_density: (n,) derivative of an objective by the density.
             d_radiance: (3, n) its derivative by the radiance.
             ray: (n,) index of the ray that the point lies on.

@@ -51,7 +51,7 @@ def fit_ngp(
     checkpoint: Path | None = None,
     resume: bool = False,
 ) -> FitResult:
-    """Fit an NGP with a sky to images of a place.
+    """Fit an NGP with a sky to images of a scene.
 
     Args:
         images: RGB, or RGBA: then, as with `FitOptions.sky` off, a random colour lies

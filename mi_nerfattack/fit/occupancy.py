@@ -24,13 +24,13 @@ class RunningOccupancy:
     """Largest densities of the allowed cells, as far as samples tell.
 
     An update visits some of the cells, half of them drawn from all, half from those
-    that are occupied: ``D = max(0.8 D, density at a random place)``. A cell is occupied
+    that are occupied: ``D = max(0.8 D, density at a random point)``. A cell is occupied
     if D reaches the density of a step of opacity 1 %, or the mean of D.
 
     Args:
         field: whose occupancy is kept.
         allowed: boolean grid over its box.
-        seed: of the places.
+        seed: of the points.
 
     Source: Mueller et al. 2022, appendix C.
     """
@@ -69,10 +69,10 @@ class RunningOccupancy:
         shape = np.array(self.allowed.shape)[:, None]
         lower = np.asarray(self.field.lower)[:, None]
         extent = np.asarray(self.field.upper)[:, None] - lower
-        place = self._cells[:, chosen] + rng.random((3, len(chosen)), np.float32)
+        point = self._cells[:, chosen] + rng.random((3, len(chosen)), np.float32)
         # one width, whatever the number of cells, is one kernel
         padded = np.zeros((3, _VISITS), np.float32)
-        padded[:, : len(chosen)] = lower + place / shape * extent
+        padded[:, : len(chosen)] = lower + point / shape * extent
         position = mi.Point3f(padded)
         dr.make_opaque(position)
         with dr.suspend_grad():

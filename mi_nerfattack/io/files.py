@@ -84,9 +84,9 @@ def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -
         out: (k, ...), in C order; filled.
     """
     with _reported(path), open(path, "rb", buffering=0) as file:
-        for row, place in zip(rows.tolist(), out, strict=True):
-            file.seek(start + row * place.nbytes)
-            if file.readinto(place.reshape(-1).view(np.uint8).data) != place.nbytes:
+        for row, into in zip(rows.tolist(), out, strict=True):
+            file.seek(start + row * into.nbytes)
+            if file.readinto(into.reshape(-1).view(np.uint8).data) != into.nbytes:
                 raise InputError(f"{path}: ends before row {row}; copy it again")
 
 

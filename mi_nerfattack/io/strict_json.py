@@ -32,7 +32,7 @@ def parse_json(path: str | Path, text: str) -> Any:
         ) from err
     except _ConstantError as err:
         raise InputError(
-            f"{path}: {_place_of_constant(text)}: {err} is not a JSON number; write a "
+            f"{path}: {_key_of_constant(text)}: {err} is not a JSON number; write a "
             "finite number"
         ) from err
     except (ValueError, RecursionError) as err:
@@ -56,17 +56,17 @@ def _refuse_constant(name: str) -> None:
     raise _ConstantError(name)
 
 
-def _place_of_constant(text: str) -> str:
+def _key_of_constant(text: str) -> str:
     """Return where NaN or infinity is, as `frames[1].transform_matrix[0][3]`."""
 
-    def find(value: Any, place: str) -> str:
+    def find(value: Any, keys: str) -> str:
         if isinstance(value, float) and not math.isfinite(value):
-            return place
+            return keys
         items: Iterable[tuple[str, Any]] = ()
         if isinstance(value, dict):
-            items = ((f"{place}.{key}", item) for key, item in value.items())
+            items = ((f"{keys}.{key}", item) for key, item in value.items())
         elif isinstance(value, list):
-            items = ((f"{place}[{i}]", item) for i, item in enumerate(value))
+            items = ((f"{keys}[{i}]", item) for i, item in enumerate(value))
         return next(filter(None, (find(item, at) for at, item in items)), "")
 
     try:

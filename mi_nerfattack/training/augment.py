@@ -87,8 +87,8 @@ def look_up(tables: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
         (n, 3, height, width) float32, in memory as the frames are.
     """
     n = len(frames)
-    place = 256 * torch.arange(3 * n, dtype=torch.int32, device=frames.device)
-    index = frames.int() + place.view(n, 1, 1, 3)
+    start = 256 * torch.arange(3 * n, dtype=torch.int32, device=frames.device)
+    index = frames.int() + start.view(n, 1, 1, 3)
     values = tables.reshape(-1).index_select(0, index.view(-1))
     return values.view(frames.shape).permute(0, 3, 1, 2)
 

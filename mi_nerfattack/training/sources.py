@@ -30,7 +30,7 @@ class Scenery:
         environment: dressed.
         route: to follow.
         expert: of the route and the environment's vehicle.
-        poses: (n, 3), around one place of the route.
+        poses: (n, 3), around one point of the route.
         rng: source of all draws.
     """
 

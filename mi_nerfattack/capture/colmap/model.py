@@ -23,7 +23,7 @@ from mi_nerfattack.render.camera.conventions import (
 )
 from mi_nerfattack.render.camera.intrinsics import Camera
 
-MODEL_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
+MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 """Where in a folder a model is looked for, in this order."""
 
 MAX_BYTES = 1 << 31
@@ -37,7 +37,7 @@ class _Image(NamedTuple):
 
 
 def find_model(folder: str | Path) -> Path | None:
-    """Return the first of `MODEL_PLACES` in a folder that holds a model, or None."""
+    """Return the first of `MODEL_FOLDERS` in a folder that holds a model, or None."""
     found = _find(Path(folder))
     return None if found is None else found[0]
 
@@ -52,7 +52,7 @@ def read_colmap(
     we do.
 
     Args:
-        path: folder with a model in one of `MODEL_PLACES`. Images are looked for in
+        path: folder with a model in one of `MODEL_FOLDERS`. Images are looked for in
             `images` of the folder, and in the folder and `images` of the model and of
             the two folders above it.
         long_edge_px: reduce images to this longer edge, in pixels; None keeps them.
@@ -67,13 +67,13 @@ def read_colmap(
         SetupError: pycolmap, which reads it, is not installed.
     """
     root = Path(path)
-    place = _find(root)
-    if place is None:
+    at = _find(root)
+    if at is None:
         raise InputError(
             f"{root}: no COLMAP model (cameras and images, .bin or .txt); looked in "
-            f"{', '.join(MODEL_PLACES)}"
+            f"{', '.join(MODEL_FOLDERS)}"
         )
-    model, suffix = place
+    model, suffix = at
     contents, points = _read(model, suffix)
     source, where = model / f"cameras{suffix}", model / f"images{suffix}"
     cameras = _cameras(source, contents["cameras"])
@@ -108,11 +108,11 @@ def read_colmap(
 
 def _find(folder: Path) -> tuple[Path, str] | None:
     """Return the folder of a model and the suffix of its files."""
-    for place in MODEL_PLACES:
+    for name in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
-            needed = (folder / place / f"{name}{suffix}" for name in PARTS[:2])
+            needed = (folder / name / f"{part}{suffix}" for part in PARTS[:2])
             if all(path.is_file() for path in needed):
-                return folder / place, suffix
+                return folder / name, suffix
     return None
 
 
@@ -185,12 +185,12 @@ def _check_images(where: Path, records: Sequence[_Image]) -> None:
 def _find_images(root: Path, model: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the files of the images that exist in the first folder that has any."""
     bases = dict.fromkeys((root, model, model.parent, model.parent.parent))
-    places = [place for base in bases for place in (base / "images", base)]
-    for place in places:
-        found = {name: place / name for name in names if (place / name).is_file()}
+    folders = [path for base in bases for path in (base / "images", base)]
+    for folder in folders:
+        found = {name: folder / name for name in names if (folder / name).is_file()}
         if found:
             return found
     raise InputError(
         f"{model}: none of the {len(names)} images is there, first {names[0]!r}; put "
-        f"them into {root / 'images'} (looked in {', '.join(map(str, places))})"
+        f"them into {root / 'images'} (looked in {', '.join(map(str, folders))})"
     )

@@ -114,5 +114,5 @@ class _Inbox:
 
 def read_pose(transform: Any) -> CarlaPose:
     """Copy a `carla.Transform`."""
-    place, turn = transform.location, transform.rotation
-    return CarlaPose(place.x, place.y, place.z, turn.pitch, turn.yaw, turn.roll)
+    at, turn = transform.location, transform.rotation
+    return CarlaPose(at.x, at.y, at.z, turn.pitch, turn.yaw, turn.roll)

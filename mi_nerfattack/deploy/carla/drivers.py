@@ -58,10 +58,10 @@ def read_axles(actor: Any, actor_to_world: np.ndarray) -> Axles:
             wheels or servers that report none.
     """
     wheels = actor.get_physics_control().wheels
-    places = np.array([[w.position.x, w.position.y, w.position.z] for w in wheels])
+    centres = np.array([[w.position.x, w.position.y, w.position.z] for w in wheels])
     along = np.zeros(0)
     if len(wheels) >= 4:
-        local = point_from_unreal(places) - actor_to_world[:3, 3]
+        local = point_from_unreal(centres) - actor_to_world[:3, 3]
         along = np.sort(local @ actor_to_world[:3, 0])
         rear, front = float(along[:2].mean()), float(along[-2:].mean())
         if -5 < rear < front < 5 and 0.5 < front - rear < 8:

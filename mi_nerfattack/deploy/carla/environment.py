@@ -43,7 +43,7 @@ class CarlaEnvironment(AbstractEnvironment):
     Args:
         server: where it runs, its town and weather.
         camera: intrinsics: no distortion, square pixels, centred.
-        mount: the camera's place, relative to the rear axle on the road.
+        mount: the camera's pose, relative to the rear axle on the road.
         driver: what moves the vehicle.
         period: seconds between two images, at most 0.16.
         vehicle: blueprint.
@@ -148,21 +148,21 @@ class CarlaEnvironment(AbstractEnvironment):
         """
         session = self.session
         body = planar_body(start)
-        place = body if self._axles is None else self._axles.actor_to_world(body)
-        height = road_height(session, place)
-        place[2, 3] = height + _DROP_M
+        pose = body if self._axles is None else self._axles.actor_to_world(body)
+        height = road_height(session, pose)
+        pose[2, 3] = height + _DROP_M
         role = {"role_name": "hero"}
-        self._actor = session.spawn(self._vehicle, body_to_carla(place), role)
+        self._actor = session.spawn(self._vehicle, body_to_carla(pose), role)
         if self._axles is not None:
             return self._axles, height
         session.tick()
         measured = body_from_carla(read_pose(self._actor.get_transform()))
         axles = read_axles(self._actor, measured)
-        place = axles.actor_to_world(planar_body(start))
-        place[2, 3] = height
-        height = road_height(session, place)
-        place[2, 3] = height + _DROP_M
-        self._actor.set_transform(session.transform(body_to_carla(place)))
+        pose = axles.actor_to_world(planar_body(start))
+        pose[2, 3] = height
+        height = road_height(session, pose)
+        pose[2, 3] = height + _DROP_M
+        self._actor.set_transform(session.transform(body_to_carla(pose)))
         return axles, height
 
     def _observe(self, frame: int) -> CameraFrame:

@@ -80,17 +80,17 @@ def route_from_town(
     return Route(name, goal, points, float(first.lane_width), speed_ms)
 
 
-def _nearest(town_map: Any, api: Any, place: Sequence[float]) -> Any:
-    values = np.asarray(place, np.float64)
+def _nearest(town_map: Any, api: Any, point: Sequence[float]) -> Any:
+    values = np.asarray(point, np.float64)
     if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
         raise InputError(
-            f"route_from_town: place {values.tolist()}; two or three finite numbers, "
+            f"route_from_town: point {values.tolist()}; two or three finite numbers, "
             "metres"
         )
     values = point_to_carla(np.append(values, 0.0)[:3]).tolist()
     waypoint = town_map.get_waypoint(api.Location(*values))
     if waypoint is None:
-        raise InputError(f"route_from_town: no lane near {list(place)}")
+        raise InputError(f"route_from_town: no lane near {list(point)}")
     return waypoint
 
 
@@ -181,8 +181,8 @@ def _unroll(trail: Any) -> list[Any]:
 
 def _key(waypoint: Any, spacing_m: float) -> tuple[int, ...]:
     # by half a spacing: rounding takes no two neighbours of a lane for one
-    place = round(2 * waypoint.s / spacing_m)
-    return waypoint.road_id, waypoint.section_id, waypoint.lane_id, place
+    station = round(2 * waypoint.s / spacing_m)
+    return waypoint.road_id, waypoint.section_id, waypoint.lane_id, station
 
 
 def _position(waypoint: Any) -> np.ndarray:

@@ -153,8 +153,8 @@ def _wheel_inertia(car: Car) -> float:
 def _add_wheel(chassis: Any, name: str, car: Car, handling: Handling) -> None:
     front, left = name.startswith("front"), name.endswith("left")
     radius, sign = car.wheel_radius, 1 if left else -1
-    place = [car.wheelbase if front else 0, sign * car.track / 2, radius]
-    holder = chassis.add_body(name=name, pos=place)
+    offset = [car.wheelbase if front else 0, sign * car.track / 2, radius]
+    holder = chassis.add_body(name=name, pos=offset)
     if front:
         holder.add_joint(name=f"{name}_steer", axis=[0, 0, 1])
     holder.add_joint(name=name, axis=[0, 1, 0])

@@ -174,9 +174,9 @@ def _indoor_irradiance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _SAMPLES)
     box = scene.bbox()
-    place = mi.Point3f(sampler.next_2d().x, sampler.next_2d().x, sampler.next_2d().x)
-    place = mi.Point3f(place.x, place.y, 0.05 + 0.45 * place.z)
-    origin = mi.Point3f(box.min) + mi.Vector3f(box.extents()) * mi.Vector3f(place)
+    part = mi.Point3f(sampler.next_2d().x, sampler.next_2d().x, sampler.next_2d().x)
+    part = mi.Point3f(part.x, part.y, 0.05 + 0.45 * part.z)
+    origin = mi.Point3f(box.min) + mi.Vector3f(box.extents()) * mi.Vector3f(part)
     upward = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
     angle = 2 * math.pi * sampler.next_2d().x
     sin, cos = dr.sincos(angle)

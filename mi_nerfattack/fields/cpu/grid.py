@@ -66,9 +66,9 @@ class _Level:
         self, unit: mi.Point3f, scale: float
     ) -> tuple[list[mi.UInt32], list[mi.Float]]:
         """Return vertices and weights times `scale` of the eight corners."""
-        place = [x * self.scale for x in unit]
-        lower = [dr.floor(x) for x in place]
-        upper = [x - y for x, y in zip(place, lower, strict=True)]
+        cell = [x * self.scale for x in unit]
+        lower = [dr.floor(x) for x in cell]
+        upper = [x - y for x, y in zip(cell, lower, strict=True)]
         x, y, z = [(1 - w, w) for w in upper]
         z = z[0] * scale, z[1] * scale
         weights = [x[i] * (y[j] * z[k]) for i, j, k in _CORNERS]

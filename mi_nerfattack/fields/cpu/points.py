@@ -54,14 +54,14 @@ class NGPPoints(AbstractPoints):
 
     def append(
         self,
-        place: Any,
+        evaluated: Any,
         d_density: mi.Float,
         d_radiance: mi.Color3f,
         ray: mi.UInt32,
         active: mi.Bool,
     ) -> None:
         """See :meth:`AbstractPoints.append`."""
-        features, point = place
+        features, point = evaluated
         slot = dr.scatter_inc(self._counter, mi.UInt32(0), active)
         active = active & (slot < self.capacity)
         numbers = mi.ArrayXf([*point, d_density, *d_radiance, mi.Float(0)])  # pyright: ignore[reportCallIssue]

@@ -41,12 +41,12 @@ def resize(call: Call) -> torch.Tensor:
         size = x.shape[axis]
         if call.attribute("coordinate_transformation_mode") == "pytorch_half_pixel":
             _refuse_one(call, target)
-        places = _places(rule, size, target, scale)
+        positions = _positions(rule, size, target, scale)
         if nearest:
-            index = torch.from_numpy(places.astype(np.int64)).to(x.device)
+            index = torch.from_numpy(positions.astype(np.int64)).to(x.device)
             x = x.index_select(axis, index)
         elif target != size or scale != 1:
-            weights = torch.from_numpy(_weights(places, size)).to(x)
+            weights = torch.from_numpy(_weights(positions, size)).to(x)
             x = weights @ x if axis == 2 else x @ weights.T
     return x
 
@@ -83,19 +83,19 @@ def _targets(call: Call) -> list[tuple[int, np.float32]]:
     return list(zip(sizes[2:], scales[2:], strict=True))
 
 
-def _places(rule: str, size: int, target: int, scale: np.float32) -> np.ndarray:
+def _positions(rule: str, size: int, target: int, scale: np.float32) -> np.ndarray:
     """Return where each pixel (target,) reads, float32 in [0, size - 1]."""
     index = np.arange(target, dtype=np.float32)
     if rule == "half_pixel":
-        places = (index + np.float32(0.5)) / scale - np.float32(0.5)
+        positions = (index + np.float32(0.5)) / scale - np.float32(0.5)
     elif rule == "align_corners":
-        places = index * np.float32(size - 1) / np.float32(max(1, target - 1))
+        positions = index * np.float32(size - 1) / np.float32(max(1, target - 1))
     else:
-        places = index / scale
-    return places.clip(0, size - 1)
+        positions = index / scale
+    return positions.clip(0, size - 1)
 
 
-def _weights(places: np.ndarray, size: int) -> np.ndarray:
+def _weights(positions: np.ndarray, size: int) -> np.ndarray:
     """Return weights (target, size) of the two nearest pixels."""
-    distance = np.abs(places[:, None].astype(np.float64) - np.arange(size))
+    distance = np.abs(positions[:, None].astype(np.float64) - np.arange(size))
     return np.maximum(0.0, 1.0 - distance)

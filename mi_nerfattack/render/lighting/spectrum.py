@@ -103,12 +103,12 @@ def _lookup(wavelengths: Any) -> tuple[list[Any], Any]:
     scale = (SAMPLES - 1) / (mi.MI_CIE_MAX - mi.MI_CIE_MIN)
     columns = [mi.Spectrum(0) for _ in range(4)]
     for i, wavelength in enumerate(wavelengths):
-        place = (wavelength - mi.MI_CIE_MIN) * scale
-        visible = (place >= 0) & (place <= SAMPLES - 1)
-        low = mi.UInt32(dr.clip(place, 0, SAMPLES - 2))
+        position = (wavelength - mi.MI_CIE_MIN) * scale
+        visible = (position >= 0) & (position <= SAMPLES - 1)
+        low = mi.UInt32(dr.clip(position, 0, SAMPLES - 2))
         a = dr.gather(mi.Vector4f, table, low, visible)
         b = dr.gather(mi.Vector4f, table, low + 1, visible)
-        values = dr.lerp(a, b, place - mi.Float(low))
+        values = dr.lerp(a, b, position - mi.Float(low))
         for column, value in zip(columns, values, strict=True):
             column[i] = value
     return columns[:3], columns[3]
@@ -139,9 +139,9 @@ def _observer() -> np.ndarray:
     part, weights = (points + 1) / 2, weights / 2
     nodes = _nodes()
     width = nodes[1] - nodes[0]
-    place = mi.Float((nodes[:-1, None] + width * part).ravel())
-    rgb = np.array(mi.xyz_to_srgb(mi.cie1931_xyz(place)), np.float64)
-    density = rgb * mi.cie_d65(place).numpy() * mi.MI_CIE_Y_NORMALIZATION
+    wavelength = mi.Float((nodes[:-1, None] + width * part).ravel())
+    rgb = np.array(mi.xyz_to_srgb(mi.cie1931_xyz(wavelength)), np.float64)
+    density = rgb * mi.cie_d65(wavelength).numpy() * mi.MI_CIE_Y_NORMALIZATION
     density = density.reshape(3, SAMPLES - 1, 3) * weights * width
     result = np.zeros((3, SAMPLES))
     result[:, :-1] += (density * (1 - part)).sum(-1)

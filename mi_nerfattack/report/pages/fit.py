@@ -17,7 +17,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.pages.verdict import (
     OBJECT,
-    PLACE,
+    SCENE,
     Criterion,
     judge,
     pooled_db,
@@ -111,9 +111,9 @@ def view_entry(score: ViewScore) -> dict[str, Any]:
 def judge_fit(result: FitResult) -> list[Criterion]:
     """Judge a fit by its held-out views and the rays it was fitted to.
 
-    A grid holds an object, any other field a place.
+    A grid holds an object, any other field a scene.
     """
-    subject = OBJECT if isinstance(result.field, GridField) else PLACE
+    subject = OBJECT if isinstance(result.field, GridField) else SCENE
     return judge(result.per_view, _fitted_db(result.history), subject)
 
 

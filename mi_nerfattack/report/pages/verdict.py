@@ -39,7 +39,7 @@ class Subject:
     learnt: str
 
 
-PLACE = Subject(
+SCENE = Subject(
     use="to test a policy in",
     reach="near the cameras and from heights and headings like theirs. Where there is "
     "a scene to deploy in, compare with it along the routes too.",
@@ -49,7 +49,7 @@ PLACE = Subject(
     "images with a wrong pose, blur, or things that moved.",
     fog="Fog or thin floaters: add depth or views from other sides, or narrow the "
     "bounds; depths and occlusion by objects are unsure until then.",
-    learnt="The field has learnt images, not the place: add images between the "
+    learnt="The field has learnt images, not the scene: add images between the "
     "present ones, refine the poses, or take a smaller network.",
 )
 OBJECT = Subject(
@@ -105,7 +105,7 @@ def pooled_db(psnr_db: Sequence[float]) -> float:
 def judge(
     scores: Sequence[ViewScore],
     fitted_db: float | None = None,
-    subject: Subject = PLACE,
+    subject: Subject = SCENE,
 ) -> list[Criterion]:
     """Judge a fit by its held-out views.
 
