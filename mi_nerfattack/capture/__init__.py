@@ -16,6 +16,5 @@ if TYPE_CHECKING:
     from .posed_images import load_images as load_images
     from .scene import capture_scene as capture_scene
     from .transforms import read_images as read_images
-    from .transforms import write_transforms as write_transforms
 
 __getattr__, __dir__ = lazy(__name__)

@@ -42,7 +42,6 @@ __all__ = [
     "read_transforms",
     "resize_area",
     "write_poses",
-    "write_transforms",
 ]
 
 
@@ -167,34 +166,6 @@ def _read_points(source: Path, table: Mapping[str, Any]) -> np.ndarray | None:
     return points.astype(np.float64)
 
 
-def write_transforms(
-    folder: str | Path,
-    images: np.ndarray,
-    camera: Camera,
-    camera_to_world: np.ndarray,
-    extra: Mapping[str, Any] | None = None,
-) -> Path:
-    """Write images as PNG and their poses as `transforms.json`.
-
-    Args:
-        folder: made if needed.
-        images: (n, height, width, 3 or 4), uint8 sRGB.
-        camera: shared intrinsics.
-        camera_to_world: (n, 4, 4), OpenCV axes.
-        extra: more keys for the top level.
-
-    Returns:
-        Path of the JSON file, which is written last.
-    """
-    names = tuple(f"images/{i:04d}.png" for i in range(len(images)))
-    posed = PosedImages(images, np.asarray(camera_to_world, float), camera, names)
-    path = begin_posed(folder)
-    for name, image in zip(names, posed.images, strict=True):
-        files.write_image(path.parent / name, image)
-    write_poses(path, names, camera, posed.camera_to_world, extra)
-    return path
-
-
 def begin_posed(folder: str | Path) -> Path:
     """Make a folder and its `images` ready for posed images.
 
@@ -219,7 +190,15 @@ def write_poses(
     camera_to_world: np.ndarray,
     extra: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a `transforms.json` for images that exist; see `write_transforms`."""
+    """Write a `transforms.json` for images that exist.
+
+    Args:
+        path: of the file.
+        names: of the images, relative to its folder.
+        camera: shared intrinsics.
+        camera_to_world: (n, 4, 4), OpenCV axes.
+        extra: more keys for the top level.
+    """
     table: dict[str, Any] = {
         "camera_model": "OPENCV",
         "w": camera.width,

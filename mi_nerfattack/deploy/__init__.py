@@ -34,6 +34,5 @@ if TYPE_CHECKING:
     from .sites import Weather as Weather
     from .vehicle import AbstractVehicle as AbstractVehicle
     from .views.paste import paste_layer as paste_layer
-    from .views.paste import paste_objects as paste_objects
 
 __getattr__, __dir__ = lazy(__name__)

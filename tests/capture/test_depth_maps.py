@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.posed_folders import write_transforms
 from helpers.sphere_views import BOX, RADIUS, sphere_views, write_folder
 from PIL import Image
 
@@ -17,7 +18,6 @@ from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.capture.transforms import (
     find_transforms,
     read_images,
-    write_transforms,
 )
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridLayout

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from helpers.posed_folders import render_views
 from PIL import Image
 
 from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
@@ -17,7 +18,6 @@ from mi_nerfattack.capture.mesh import mesh as meshes
 from mi_nerfattack.capture.mesh.read import load_mesh
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
-from mi_nerfattack.render.pathtrace import views
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -52,7 +52,7 @@ def seen_from_front(mesh) -> np.ndarray:
     )
     path = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
     camera = from_fov(32, 32, 45.0)
-    return views.render_views(scene, camera, pose[None], 900, 0, path)[0][0]
+    return render_views(scene, camera, pose[None], 900, 0, path)[0][0]
 
 
 class TestMesh:
@@ -165,7 +165,7 @@ class TestAsset:
                 {"type": "scene", "l": light.emitter(), **meshes.mitsuba_shapes(cube)}
             )
             pose = look_at([0, 3 * side, 0.5], [0, 0, 0.5])[None]
-            rgb = views.render_views(scene, from_fov(8, 8, 10.0), pose, 256, 0, path)[0]
+            rgb = render_views(scene, from_fov(8, 8, 10.0), pose, 256, 0, path)[0]
             assert rgb.mean() == pytest.approx(0.5 * share, rel=0.02)
 
     def test_cube(self):

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.posed_folders import write_transforms
 from helpers.sphere_views import RADIUS, sphere_views
 
 from mi_nerfattack import cli
 from mi_nerfattack.capture.object_views import Placement, read_views
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.capture.silhouettes import check_alpha, silhouette_bounds
-from mi_nerfattack.capture.transforms import write_transforms
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.shared import progress
 from mi_nerfattack.errors import InputError

@@ -9,9 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.posed_folders import render_views, write_transforms
 
 from mi_nerfattack.capture.posed_images import PosedImages, held_out, resize_area
-from mi_nerfattack.capture.transforms import read_transforms, write_transforms
+from mi_nerfattack.capture.transforms import read_transforms
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
@@ -220,7 +221,7 @@ class TestViews:
         poses = np.stack(
             [look_at([0, 0, 1.0], [1, 0, 1.0]), look_at([0, 0, 1.0], [0, 1.0, 1.0])]
         )
-        rgb, alpha, depth = views.render_views(wall_scene(), camera, poses, 4, 0)
+        rgb, alpha, depth = render_views(wall_scene(), camera, poses, 4, 0)
         assert rgb.shape == (2, 20, 40, 3) and rgb.dtype == np.float32
         # y = 1 at x = 4 is a quarter of the half width to the left of the middle
         np.testing.assert_allclose(rgb[0, 10, 15], [1, 0, 0], atol=1e-6)
@@ -235,11 +236,11 @@ class TestViews:
         straight = Camera(40, 20, 20.0, 23.0, 18.0, 11.0)
         pose = look_at([2.2, 0.2, 1.0], [4, 0.2, 1.1])[None]
         scene = wall_scene()
-        _, alpha, depth = views.render_views(scene, lens, pose, 16, 0)
+        _, alpha, depth = render_views(scene, lens, pose, 16, 0)
         sure = (alpha == 0) | (alpha == 1)
         assert 20 < alpha.sum() < 0.5 * alpha.size and sure.mean() > 0.8
         np.testing.assert_array_equal(np.isfinite(depth)[sure], alpha[sure] == 1)
-        other = views.render_views(scene, straight, pose, 16, 0)[1]
+        other = render_views(scene, straight, pose, 16, 0)[1]
         assert np.abs(other - alpha).sum() > 5
 
     def test_no_kernel_after_the_first_view(self):
@@ -257,14 +258,14 @@ class TestViews:
     def test_seed_decides_the_noise(self):
         camera, pose = from_fov(8, 8, 90.0), look_at([0, 0, 1.0], [1, 0, 1.0])[None]
         first, second, other = (
-            views.render_views(wall_scene(), camera, pose, 2, s)[0] for s in (1, 1, 2)
+            render_views(wall_scene(), camera, pose, 2, s)[0] for s in (1, 1, 2)
         )
         np.testing.assert_array_equal(first, second)
         assert np.any(first != other)
 
     def test_spp_must_be_positive(self):
         with pytest.raises(InputError, match="spp: 0"):
-            views.render_views(wall_scene(), from_fov(2, 2, 9.0), np.eye(4)[None], 0, 0)
+            render_views(wall_scene(), from_fov(2, 2, 9.0), np.eye(4)[None], 0, 0)
 
 
 def straight_route() -> Route:

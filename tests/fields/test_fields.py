@@ -7,11 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
+from helpers.occupancy import build
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
-from mi_nerfattack.fields.occupancy import MAX_DISTANCE, build
+from mi_nerfattack.fields.occupancy import MAX_DISTANCE
 
 pytestmark = pytest.mark.usefixtures("variant")
 

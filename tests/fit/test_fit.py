@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.posed_folders import write_transforms
 from helpers.sphere_views import BOX, RADIUS, directions, sphere_views
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.capture.posed_images import held_out
-from mi_nerfattack.capture.transforms import write_transforms
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, NGPLayout
 from mi_nerfattack.fit.fit import FitOptions, fit_grid, fit_ngp

@@ -9,11 +9,11 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from helpers.posed_folders import render_views
 from PIL import Image
 
 from mi_nerfattack.capture.mesh.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
-from mi_nerfattack.render.pathtrace import views
 
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _COMPONENTS = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
@@ -137,7 +137,7 @@ def seen_from(mesh: TexturedMesh, side: tuple[float, float, float]) -> np.ndarra
     )
     path = mi.load_dict({"type": "path", "max_depth": 8, "hide_emitters": True})
     camera = from_fov(64, 64, 2 * np.degrees(np.arctan(0.25)))
-    rgb, alpha, _ = views.render_views(scene, camera, pose[None], 256, 0, path)
+    rgb, alpha, _ = render_views(scene, camera, pose[None], 256, 0, path)
     return np.concatenate([rgb[0], alpha[0][..., None]], axis=2)
 
 

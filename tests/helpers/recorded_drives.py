@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.posed_folders import write_transforms
 
-from mi_nerfattack.capture.transforms import write_poses, write_transforms
+from mi_nerfattack.capture.transforms import write_poses
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import write_video
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix

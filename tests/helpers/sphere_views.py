@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from helpers.posed_folders import write_transforms
 
 from mi_nerfattack.capture.posed_images import PosedImages
-from mi_nerfattack.capture.transforms import write_transforms
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
 

@@ -7,11 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
+from helpers.occupancy import build
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
-from mi_nerfattack.fields.occupancy import build
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import March, march
 from mi_nerfattack.render.posed import PosedField

@@ -73,19 +73,9 @@ def point_from_unreal(centimetres: ArrayLike) -> np.ndarray:
     return point_from_carla(np.asarray(centimetres, np.float64) / CENTIMETRES)
 
 
-def point_to_unreal(metres: ArrayLike) -> np.ndarray:
-    """Convert points (..., 3) of ours, in metres, to Unreal's axes and centimetres."""
-    return point_to_carla(metres) * CENTIMETRES
-
-
 def heading_from_carla(yaw_deg: float) -> float:
     """Convert a yaw in degrees, clockwise, to a heading in radians in (-pi, pi]."""
     return -math.remainder(math.radians(yaw_deg), 2 * math.pi)
-
-
-def heading_to_carla(heading: float) -> float:
-    """Convert a heading in radians to a yaw in degrees, clockwise, in [-180, 180]."""
-    return -math.degrees(math.remainder(heading, 2 * math.pi))
 
 
 def body_from_carla(pose: CarlaPose) -> np.ndarray:
@@ -207,22 +197,6 @@ def decode_depth(bgra: np.ndarray) -> np.ndarray:
     blue, green, red = (bgra[..., i].astype(np.uint32) for i in range(3))
     code = red + 256 * green + 65536 * blue
     return np.where(code == _FULL_CODE, np.inf, FAR_PLANE * code / _FULL_CODE)
-
-
-def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Encode distances as a depth camera does: the inverse of `decode_depth`.
-
-    Args:
-        depth: (height, width), metres along the optical axis, at least 0; from 1000 m
-            on it is the far plane.
-
-    Returns:
-        (height, width, 4), uint8, BGRA.
-    """
-    share = np.minimum(np.asarray(depth, np.float64) / FAR_PLANE, 1)
-    code = np.round(share * _FULL_CODE).astype(np.uint32)
-    parts = [code >> 16, (code >> 8) & 255, code & 255, np.full_like(code, 255)]
-    return np.stack(parts, axis=-1).astype(np.uint8)
 
 
 def along_rays(planar: np.ndarray, camera: Camera) -> np.ndarray:

@@ -100,48 +100,31 @@ def require_fields(objects: Sequence[Any]) -> None:
             )
 
 
-def paste_objects(
-    frame: CameraFrame, camera: Camera, objects: Sequence[PosedField]
-) -> CameraFrame:
-    """Paste objects into one frame; for a drive keep a `Paster`, which is faster.
-
-    Args:
-        frame: what the camera saw without them.
-        camera: intrinsics of the frame.
-        objects: may be none.
-    """
-    return Paster(camera, objects).paste(frame)
-
-
-def paste_layer(
-    rgb: np.ndarray, depth: np.ndarray, layer: March, threshold: float = OPAQUE
-) -> np.ndarray:
+def paste_layer(rgb: np.ndarray, depth: np.ndarray, layer: March) -> np.ndarray:
     """Paste a march into a linear image as if it were opaque.
 
     Args:
         rgb: (height, width, 3), linear.
         depth: (height, width), metres along the ray; infinite where there is nothing.
         layer: march of height * width rays, row by row from the top left.
-        threshold: of the opacity.
 
     Returns:
         (height, width, 3), linear, float32.
 
     Source: appendix B.3.
     """
-    mask, colour, _ = cut_out(layer, depth, threshold)
+    mask, colour, _ = cut_out(layer, depth)
     return np.where(mask[..., None], colour, rgb).astype(np.float32)
 
 
 def cut_out(
-    layer: March, depth: np.ndarray, threshold: float = OPAQUE
+    layer: March, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find what a march covers of an image.
 
     Args:
         layer: march of height * width rays, row by row from the top left.
         depth: (height, width), metres along the ray, of the image.
-        threshold: of the opacity.
 
     Returns:
         which pixels are covered (height, width), the march's linear colour ``I / a``
@@ -150,7 +133,7 @@ def cut_out(
     shape = depth.shape
     opacity = layer.opacity.numpy().reshape(shape)
     nearness = layer.depth.numpy().reshape(shape).copy()
-    mask = (opacity >= threshold) & (nearness < depth)
+    mask = (opacity >= OPAQUE) & (nearness < depth)
     radiance = layer.radiance.numpy().T.reshape(*shape, 3)
     colour = np.where(mask[..., None], radiance, 0)
     return mask, colour / np.where(mask, opacity, 1)[..., None], nearness

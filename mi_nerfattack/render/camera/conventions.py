@@ -94,33 +94,6 @@ def colmap_to_opencv(quaternion: ArrayLike, translation: ArrayLike) -> np.ndarra
     return matrix
 
 
-def opencv_to_colmap(camera_to_world: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Convert camera-to-world matrices to poses of COLMAP's `images.txt`.
-
-    Args:
-        camera_to_world: (..., 4, 4), OpenCV axes, rotation and translation.
-
-    Returns:
-        unit quaternions (..., 4) in the order w, x, y, z with w >= 0, and translations
-        (..., 3); both world to camera, float64.
-
-    Raises:
-        InputError: a matrix holds more than rotation and translation.
-    """
-    matrix = np.asarray(camera_to_world, np.float64)
-    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
-    product = rotation @ matrix[..., :3, :3]
-    rigid = np.allclose(product, np.eye(3), atol=1e-4)
-    if not (rigid and (np.linalg.det(rotation) > 0).all()):
-        raise InputError(
-            f"camera_to_world: {matrix.tolist()}; must be rotation and translation"
-        )
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3))
-    quaternion = flat.as_quat(canonical=True, scalar_first=True)
-    translation = -(rotation @ matrix[..., :3, 3:])[..., 0]
-    return quaternion.reshape(*matrix.shape[:-2], 4), translation
-
-
 def from_colmap(
     model: str, width: int, height: int, parameters: Sequence[float]
 ) -> Camera:
@@ -145,30 +118,6 @@ def from_colmap(
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
     return Camera(width, height, **values)
-
-
-def to_colmap(camera: Camera, model: str) -> list[float]:
-    """Return the camera's parameters in the order of a model of COLMAP.
-
-    Args:
-        camera: intrinsics.
-        model: one of `COLMAP_MODELS`; OPENCV holds every camera.
-
-    Raises:
-        InputError: another model, or one that cannot hold the camera.
-    """
-    names = _colmap_names(model)
-    lost = [
-        n for n in ("k1", "k2", "p1", "p2") if n not in names and getattr(camera, n)
-    ]
-    if "f" in names and abs(camera.fx / camera.fy - 1) > _SQUARE:
-        lost.append("fy")
-    if lost:
-        raise InputError(
-            f"camera model {model}: cannot hold {', '.join(lost)} of {camera}; take "
-            "OPENCV"
-        )
-    return [getattr(camera, "fx" if name == "f" else name) for name in names]
 
 
 def _colmap_names(model: str) -> tuple[str, ...]:

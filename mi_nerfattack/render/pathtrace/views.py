@@ -111,22 +111,7 @@ def iterate_views(
     seed: int,
     integrator: Any = None,
 ) -> Iterator[View]:
-    """Render views one after the other; see `render_views`."""
-    renderer = ViewRenderer(scene, camera, integrator)
-    seeds = np.random.SeedSequence(seed).generate_state(len(camera_to_world))
-    for matrix, view_seed in zip(camera_to_world, seeds, strict=True):
-        yield renderer.render(matrix, spp, int(view_seed))
-
-
-def render_views(
-    scene: Any,
-    camera: Camera,
-    camera_to_world: np.ndarray,
-    spp: int,
-    seed: int,
-    integrator: Any = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render a scene from n poses.
+    """Render a scene from n poses, one after the other.
 
     Args:
         scene: any scene; its own sensors are ignored.
@@ -135,13 +120,8 @@ def render_views(
         spp: samples per pixel.
         seed: each view has samples of its own derived from it.
         integrator: `mi.Integrator`; None for the scene's own.
-
-    Returns:
-        rgb (n, height, width, 3), alpha and depth (n, height, width) as in `View`.
     """
-    views = list(iterate_views(scene, camera, camera_to_world, spp, seed, integrator))
-    return (
-        np.stack([view.rgb for view in views]),
-        np.stack([view.alpha for view in views]),
-        np.stack([view.depth for view in views]),
-    )
+    renderer = ViewRenderer(scene, camera, integrator)
+    seeds = np.random.SeedSequence(seed).generate_state(len(camera_to_world))
+    for matrix, view_seed in zip(camera_to_world, seeds, strict=True):
+        yield renderer.render(matrix, spp, int(view_seed))

@@ -208,10 +208,6 @@ class Route:
         """Signed cross-track error (n,) in metres of states (n, m)."""
         return self.project_numpy(states).cross_track
 
-    def heading_error_numpy(self, states: Any) -> np.ndarray:
-        """Heading (n,) relative to the route at its nearest point, in [-pi, pi]."""
-        return self.project_numpy(states).heading_error
-
     def project(self, state: Any) -> Measures:
         """Find the nearest point of the route, differentiably.
 

@@ -37,9 +37,6 @@ def test_y_changes_its_sign_and_centimetres_become_metres():
     np.testing.assert_array_equal(
         conventions.point_from_unreal([1000, 2000, 300]), [10, -20, 3]
     )
-    np.testing.assert_array_equal(
-        conventions.point_to_unreal([10, -20, 3]), [1000, 2000, 300]
-    )
 
 
 @pytest.mark.parametrize(
@@ -54,11 +51,6 @@ def test_y_changes_its_sign_and_centimetres_become_metres():
 )
 def test_yaw_is_clockwise(yaw_deg, heading):
     assert conventions.heading_from_carla(yaw_deg) == pytest.approx(heading, abs=1e-5)
-
-
-def test_a_heading_of_a_quarter_left_is_a_yaw_of_minus_90():
-    assert conventions.heading_to_carla(math.pi / 2) == pytest.approx(-90)
-    assert conventions.heading_to_carla(2.5 * math.pi) == pytest.approx(-90)
 
 
 def test_axes_at_rest_and_turned():
@@ -140,24 +132,12 @@ def test_matrices_are_those_of_the_client_mirrored(carla, pose):
         ((0, 0, 128), 1000 * 8388608 / 16777215),  # 500.00003 m
         ((0, 1, 0), 1000 * 256 / 16777215),  # 1.526 cm
         ((1, 0, 0), 1000 / 16777215),  # 0.06 mm
+        ((255, 255, 255), math.inf),  # the far plane
     ],
 )
 def test_depth_codes(rgb, distance):
     pixel = np.array([[[*rgb[::-1], 255]]], np.uint8)
     assert conventions.decode_depth(pixel)[0, 0] == pytest.approx(distance, rel=1e-12)
-
-
-@given(st.floats(0.0, 999.99))
-def test_depth_round_trips_to_half_a_step(distance):
-    decoded = conventions.decode_depth(
-        conventions.encode_depth(np.full((1, 1), distance))
-    )
-    assert decoded[0, 0] == pytest.approx(distance, abs=0.5001 * 1000 / 16777215)
-
-
-def test_depth_beyond_the_far_plane_is_infinite():
-    bgra = conventions.encode_depth(np.array([[1000.0, math.inf]]))
-    assert np.isposinf(conventions.decode_depth(bgra)).all()
 
 
 def test_distances_along_rays():

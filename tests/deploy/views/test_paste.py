@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.small_fields import homogeneous, sigmoid_to_linear
 
-from mi_nerfattack.deploy import CameraFrame, paste_objects
+from mi_nerfattack.deploy import CameraFrame
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
@@ -40,6 +40,10 @@ def box_interval(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def frame_at(pose: np.ndarray, depth: float) -> CameraFrame:
     image = np.full((12, 16, 3), GREY, np.uint8)
     return CameraFrame(image, np.full((12, 16), depth, np.float32), pose)
+
+
+def paste_objects(frame: CameraFrame, camera, objects) -> CameraFrame:
+    return Paster(camera, objects).paste(frame)
 
 
 def rolled(pose: np.ndarray, angle: float) -> np.ndarray:

@@ -89,12 +89,9 @@ def test_colmap_pose_by_hand():
 def test_colmap_pose_of_any_rotation(axis, angle, place):
     axis = np.array(axis) / np.linalg.norm(axis)
     matrix = pose(turn(axis, angle), np.array(place))
-    quaternion, translation = conv.opencv_to_colmap(matrix)
     # world to camera is the opposite turn
-    expected = np.array([np.cos(angle / 2), *(-np.sin(angle / 2) * axis)])
-    np.testing.assert_allclose(quaternion, expected, atol=1e-9)
-    np.testing.assert_allclose(translation, -turn(axis, -angle) @ place, atol=1e-9)
-    back = conv.colmap_to_opencv(3 * quaternion, translation)
+    quaternion = np.array([np.cos(angle / 2), *(-np.sin(angle / 2) * axis)])
+    back = conv.colmap_to_opencv(3 * quaternion, -turn(axis, -angle) @ place)
     np.testing.assert_allclose(back, matrix, atol=1e-9)
 
 
@@ -102,11 +99,8 @@ def test_colmap_poses_keep_their_shape(rng):
     quaternion, translation = rng.normal(size=(2, 3, 4)), rng.normal(size=(2, 3, 3))
     matrix = conv.colmap_to_opencv(quaternion, translation)
     assert matrix.shape == (2, 3, 4, 4)
-    back, there = conv.opencv_to_colmap(matrix)
-    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    sign = np.sign(unit[..., :1])
-    np.testing.assert_allclose(back, sign * unit, atol=1e-12)
-    np.testing.assert_allclose(there, translation, atol=1e-12)
+    one = conv.colmap_to_opencv(quaternion[1, 2], translation[1, 2])
+    np.testing.assert_array_equal(matrix[1, 2], one)
 
 
 @pytest.mark.parametrize(
@@ -115,13 +109,9 @@ def test_colmap_poses_keep_their_shape(rng):
         (lambda: conv.colmap_to_opencv([0, 0, 0, 0], [0, 0, 0]), "quaternion"),
         (lambda: conv.colmap_to_opencv([np.nan, 0, 0, 1], [0, 0, 0]), "quaternion"),
         (lambda: conv.colmap_to_opencv([1, 0, 0, 0], [np.inf, 0, 0]), "translation"),
-        (lambda: conv.opencv_to_colmap(2 * np.eye(4)), "camera_to_world"),
-        (lambda: conv.opencv_to_colmap(np.diag([-1.0, 1, 1, 1])), "camera_to_world"),
         (lambda: conv.from_colmap("FISHEYE", 4, 4, [1.0]), "allowed: SIMPLE_PINHOLE"),
         (lambda: conv.from_colmap("PINHOLE", 4, 4, [4, 2, 2]), r"expected 4 \(fx, fy"),
         (lambda: conv.from_colmap("SIMPLE_PINHOLE", 4, 4, [-4, 2, 2]), "camera.fx"),
-        (lambda: conv.to_colmap(LENS, "RADIAL"), "cannot hold p1, p2, fy"),
-        (lambda: conv.to_colmap(LENS, "PINHOLE"), "cannot hold k1, k2, p1, p2"),
     ],
 )
 def test_what_cannot_be_converted(call, message):
@@ -141,10 +131,6 @@ MODELS = [
 @pytest.mark.parametrize(("model", "parameters", "camera"), MODELS)
 def test_colmap_models(model, parameters, camera):
     assert conv.from_colmap(model, 64, 48, parameters) == camera
-    assert conv.to_colmap(camera, model) == parameters
-    assert conv.from_colmap("OPENCV", 64, 48, conv.to_colmap(camera, "OPENCV")) == (
-        camera
-    )
 
 
 # Mitsuba

@@ -91,7 +91,6 @@ def test_cross_track_of_arc():
     np.testing.assert_allclose(value, offset.ravel(), atol=1e-6)
     inward = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
     np.testing.assert_allclose(gradient, inward, atol=1e-3)
-    np.testing.assert_allclose(route.heading_error_numpy(states), 0, atol=1e-3)
     heading = route.heading_error(array64(states.T)).numpy()
     np.testing.assert_allclose(heading, 0, atol=1e-3)
 
