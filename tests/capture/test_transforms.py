@@ -12,11 +12,12 @@ import pytest
 from helpers.posed_folders import render_views, write_transforms
 
 from mi_nerfattack.capture.posed_images import PosedImages, held_out, resize_area
+from mi_nerfattack.capture.scene import capture_scene, drive_poses
 from mi_nerfattack.capture.transforms import read_transforms
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
-from mi_nerfattack.render.pathtrace import views
+from mi_nerfattack.render.pathtrace.views import ViewRenderer
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -245,7 +246,7 @@ class TestViews:
 
     def test_no_kernel_after_the_first_view(self):
         camera = from_fov(13, 7, 70.0)
-        renderer = views.ViewRenderer(wall_scene(), camera)
+        renderer = ViewRenderer(wall_scene(), camera)
         renderer.render(look_at([0, 0, 1.0], [1, 0, 1.0]), 2, 0)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
@@ -275,7 +276,7 @@ def straight_route() -> Route:
 
 class TestDrivePoses:
     def test_spread(self):
-        poses = views.drive_poses([straight_route()], 400, seed=1)
+        poses = drive_poses([straight_route()], 400, seed=1)
         forward = poses[:, :3, 2]
         eyes = poses[:, :3, 3]
         heading = np.arctan2(forward[:, 1], forward[:, 0])
@@ -289,12 +290,12 @@ class TestDrivePoses:
 
     def test_reproducible(self):
         route = straight_route()
-        first, second = (views.drive_poses([route], 5, seed=3) for _ in range(2))
+        first, second = (drive_poses([route], 5, seed=3) for _ in range(2))
         np.testing.assert_array_equal(first, second)
         with pytest.raises(InputError, match="0 routes"):
-            views.drive_poses([], 5, seed=3)
+            drive_poses([], 5, seed=3)
         with pytest.raises(InputError, match="seed: -1; at least 0"):
-            views.drive_poses([route], 5, seed=-1)
+            drive_poses([route], 5, seed=-1)
 
 
 def test_capture_scene(tmp_path):
@@ -312,7 +313,7 @@ def test_capture_scene(tmp_path):
     }
     (tmp_path / "routes.json").write_text(json.dumps({"straight": route}))
     out, seen = tmp_path / "out", []
-    path = views.capture_scene(
+    path = capture_scene(
         scene,
         tmp_path / "routes.json",
         out,
@@ -334,7 +335,7 @@ def test_capture_scene(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # other views replace the first ones
-        views.capture_scene(
+        capture_scene(
             scene, tmp_path / "routes.json", out, 3, read.camera, 4, 1, interrupt
         )
     assert not path.exists()
