@@ -123,14 +123,6 @@ class TestAtlas:
             miss = np.linalg.norm(found - weights @ triangle, axis=1)
             assert miss.max() < 0.02
 
-    def test_boxes_do_not_overlap(self, rng):
-        atlas = lay_out(self.triangles(rng), 0.05)
-        places = np.stack([atlas.rows, atlas.columns], 1)
-        assert len(np.unique(places, axis=0)) == len(places)
-        assert atlas.rows.max() < atlas.height and atlas.columns.max() < atlas.width
-        assert atlas.weights.min() >= 0
-        np.testing.assert_allclose(atlas.weights.sum(1), 1, atol=1e-9)
-
     @pytest.mark.parametrize("texel", [1e-6, 0.0, np.inf])
     def test_refused(self, texel, rng):
         with pytest.raises(InputError, match="texel_m"):
@@ -263,50 +255,6 @@ class TestLight:
         tolerance = 2 / 255 * 2.28 * IRRADIANCE * cosine / np.pi
         assert np.abs(middle - expected).max() < tolerance
 
-    def test_shadow(self, box_file):
-        item = make_built_in(box_field(), self.POSE, box_file)
-        camera = from_fov(64, 48, 60.0)
-        # from the south, above
-        pose = look_at([3.0, -6.0, 9.0], [3.0, 2.0, 0.0])
-        view = ViewRenderer(lit_scene(item), camera).render(pose, 16, 0)
-        points = ground_points(camera, pose)
-        dark, bright, ground = np.full((3, *view.depth.shape), True)
-        for corner in points:
-            shadowed = meets_box(corner, -SUN)
-            hidden = meets_box(pose[:3, 3] + 0 * corner, corner - pose[:3, 3])
-            dark, bright = dark & shadowed, bright & ~shadowed
-            ground &= ~hidden
-        white = IRRADIANCE * 0.8 / np.pi
-        assert (dark & ground).sum() > 30 and (bright & ground).sum() > 1000
-        assert np.abs(view.rgb[dark & ground]).max() == 0
-        np.testing.assert_allclose(view.rgb[bright & ground], white, rtol=1e-4)
-
-
-def ground_points(camera, pose: np.ndarray) -> list[np.ndarray]:
-    """Return where the corners of all pixels are on z = 0: four of (h, w, 3)."""
-    u, v = np.meshgrid(np.arange(camera.width + 1), np.arange(camera.height + 1))
-    local = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1 + 0 * u], -1
-    )
-    direction = local @ pose[:3, :3].T
-    points = pose[:3, 3] - direction * (pose[2, 3] / direction[..., 2:])
-    return [
-        points[i : i + camera.height, j : j + camera.width]
-        for i in (0, 1)
-        for j in (0, 1)
-    ]
-
-
-def meets_box(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Tell which rays from the ground or to it pass the placed box, (h, w)."""
-    pose = TestLight.POSE
-    start = (origin - pose.translation) @ pose.rotation / pose.scale
-    along = np.broadcast_to(direction, origin.shape) @ pose.rotation / pose.scale
-    with np.errstate(divide="ignore"):
-        a, b = (MIDDLE - HALF - start) / along, (MIDDLE + HALF - start) / along
-    near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-    return (near < far) & (far > 1e-6)
-
 
 class TestPose:
     def test_world_vertices(self, box_file):
@@ -323,6 +271,7 @@ class TestPose:
         np.testing.assert_array_equal(moved.world_vertices, item.vertices)
 
 
+@pytest.mark.slow
 def test_hydrant_covers_the_pixels_that_it_is_pasted_over():
     field = load_grid(bundled("hydrant/field.safetensors"))
     pose = Pose.upright((-8.0, -5.6, 0.12), 0.3, 2.0)

@@ -204,14 +204,6 @@ def test_evaluate_drives_everything_and_counts_steps():
     assert card_table(found).row_count == 8
 
 
-def test_an_environment_has_any_name():
-    settings = EvaluateSettings(runs=1, horizon=2)
-    arguments = ([straight()], [], flat_ground, settings)
-    found = evaluate(Counting(), [surrogate("mine")], *arguments)
-    assert found["mine"]["straight"][CLEAN]["n"] == 1
-    assert card_table(found).row_count == 1
-
-
 @pytest.mark.parametrize(
     ("objects", "change", "message"),
     [

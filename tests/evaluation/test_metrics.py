@@ -308,14 +308,6 @@ def test_overhead_shows_drives_and_object(tmp_path):
     assert 20 < side < 60
 
 
-def test_overhead_of_one_environment_without_object(tmp_path):
-    drives = [d for d in plot_drives() if d.environment == "surrogate"]
-    plots.overhead(tmp_path / "one.png", drives, ROUTE, 3.5, [], 0.85)
-    image = files.read_image(tmp_path / "one.png")
-    assert image.shape[1] == plots.WIDTH_PX
-    assert count(image, YELLOW) == 0
-
-
 def test_overhead_has_a_panel_for_an_environment_of_your_own(tmp_path):
     drives = [make_drive([0.1, 0.2], name, "unperturbed") for name in ("a", "b")]
     plots.overhead(tmp_path / "one.png", drives[:1], ROUTE, 3.5, [], 0.85)

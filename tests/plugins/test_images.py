@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 
-from mi_nerfattack.fields import GridField, load_field, save_field
+from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
 
@@ -219,77 +218,3 @@ def test_monochromatic_variant_shows_luminance(grid: Path) -> None:
     mono = render(scene(fields(volume(grid))))
     expected = colour[..., :3] @ [0.212671, 0.715160, 0.072169]
     np.testing.assert_allclose(mono[..., 0], expected, rtol=1e-3, atol=1e-4)
-
-
-# Derivatives
-
-
-@pytest.fixture
-def attacked(grid: Path) -> tuple[mi.Scene, Callable[..., mi.Float], np.ndarray]:
-    """A scene of two fields, an objective of its image, and a tangent."""
-    rng = np.random.default_rng(1)
-    jitter = '<boolean name="jitter" value="true"/>'
-    loaded = scene(fields(jitter + volume(grid)), rectangle(-0.2, 0.5))
-    weight = mi.TensorXf(rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32))
-
-    def objective(image: mi.TensorXf) -> mi.Float:
-        return dr.sum(image[..., :3] * weight)
-
-    field: GridField = loaded.integrator().volumes[0].field
-    tangent = rng.normal(size=(field.n_vertices, 3)).astype(np.float32)
-    return loaded, objective, tangent
-
-
-def test_render_is_differentiable_in_both_modes(attacked) -> None:
-    loaded, objective, tangent = attacked
-    params = mi.traverse(loaded)
-    (name,) = [key for key in params.keys() if key.endswith("texture")]  # noqa: SIM118
-    base = params[name].numpy().copy()
-    seeds = {"spp": 2, "seed": 7, "seed_grad": 3}
-
-    def shifted(s: float) -> float:
-        params[name] = mi.TensorXf(base + s * tangent)
-        params.update()
-        # The derivative pass draws the samples of `seed_grad`.
-        return float(objective(mi.render(loaded, spp=2, seed=3)).array[0])
-
-    expected = (shifted(1e-2) - shifted(-1e-2)) / 2e-2
-
-    texture = mi.TensorXf(base)
-    dr.enable_grad(texture)
-    params[name] = texture
-    params.update()
-    dr.backward(objective(mi.render(loaded, params, **seeds)))
-    backward = float((dr.grad(params[name]).numpy().astype(float) * tangent).sum())
-
-    texture = mi.TensorXf(base)
-    dr.enable_grad(texture)
-    params[name] = texture
-    params.update()
-    dr.set_grad(params[name], mi.TensorXf(tangent))
-    dr.forward_from(params[name], dr.ADFlag.ClearEdges)
-    found = objective(mi.render(loaded, params, **seeds))
-    dr.forward_to(found)
-    forward = float(dr.grad(found).array[0])
-
-    assert forward == pytest.approx(backward, rel=1e-3)
-    assert backward == pytest.approx(expected, rel=1e-2)
-
-
-def test_gradient_descent_moves_only_the_texture(attacked) -> None:
-    loaded, objective, _ = attacked
-    params = mi.traverse(loaded)
-    (name,) = [key for key in params.keys() if key.endswith("texture")]  # noqa: SIM118
-    field = loaded.integrator().volumes[0].field
-    density = field.parameters()["density"].numpy().copy()
-    optimiser = mi.ad.SGD(lr=1.0)
-    optimiser[name] = params[name]
-    values = []
-    for _ in range(3):
-        params.update(optimiser)
-        value = objective(mi.render(loaded, params, spp=2, seed=0, seed_grad=0))
-        dr.backward(value)
-        optimiser.step()
-        values.append(float(value.array[0]))
-    assert values[2] < values[1] < values[0]
-    np.testing.assert_array_equal(field.parameters()["density"].numpy(), density)

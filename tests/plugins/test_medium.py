@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from helpers.variants import RGB, later
+from helpers.variants import RGB, SPECTRAL, later
 
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
 
@@ -81,6 +81,7 @@ def scene(sigma_t: Any, albedo: Any, integrator: str) -> mi.Scene:
     )
 
 
+@pytest.mark.parametrize("each_variant", [*RGB, *later(*SPECTRAL)], indirect=True)
 def test_values_bound_and_box_are_those_of_gridvolume(path: Path, rng) -> None:
     field, grid = mi.load_dict(own(path)), mi.load_dict(sampled(path)[0])
     it = dr.zeros(mi.Interaction3f, 10_000)
@@ -151,6 +152,7 @@ def gradients(loaded: mi.Scene, suffixes: tuple[str, ...]) -> list[np.ndarray]:
     return [dr.grad(params[key]).numpy().astype(float) for key in keys]
 
 
+@pytest.mark.parametrize("each_variant", [*RGB, *later(*SPECTRAL)], indirect=True)
 def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None:
     density, radiance = sampled(path)
     albedos = [ALBEDO] * 2 if mi.is_spectral else [own(path, "radiance"), radiance]

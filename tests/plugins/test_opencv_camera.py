@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
 from helpers.camera_scenes import (
     CROP,
     EYE,
@@ -23,8 +21,6 @@ from helpers.camera_scenes import (
     sensor,
     world,
 )
-
-from mi_nerfattack.fields import save_field
 
 
 def opencv_pixels(points: np.ndarray) -> np.ndarray:
@@ -168,46 +164,6 @@ def test_nothing_is_compiled_for_another_pose_or_lens(variant: str, lens: Any) -
         later, other = kernels(index)
         assert later and later <= known
         assert abs(other - image).max() > 0.1
-
-
-def test_moved_camera_is_the_camera_that_was_there(variant: str) -> None:
-    there = world(sensor({"type": "opencv_camera", **LENS}), INTEGRATORS["direct"])
-    start = sensor({"type": "opencv_camera", "fx": 10.0, "k1": 1e-3})
-    start["to_world"] = mi.ScalarTransform4f().translate([9, 9, 9])
-    moved = world(start, INTEGRATORS["direct"])
-    params = mi.traverse(moved)
-    for name, value in LENS.items():
-        params[f"eye.{name}"] = value
-    params["eye.to_world"] = mi.Transform4f().look_at(EYE, [0, 0, 0], [0, 1, 0])
-    params.update()
-    a, b = (np.array(mi.render(scene, spp=2)) for scene in (there, moved))
-    np.testing.assert_allclose(a, b, atol=1e-5)
-
-
-# With fields
-
-
-def test_field_integrator_with_a_lens(variant: str, tmp_path: Path) -> None:
-    path = tmp_path / "box.safetensors"
-    save_field(path, small.homogeneous(0.7))
-    volume = {"type": "grid_field", "filename": str(path)}
-    integrator = {"type": "field_integrator", "stop": 0.0, "box": volume}
-    camera = sensor({"type": "opencv_camera", **LENS}, rfilter={"type": "box"})
-    scene = mi.load_dict(
-        {"type": "scene", "integrator": integrator, "eye": camera}, parallel=False
-    )
-    opacity = np.array(mi.render(scene, spp=256))[..., 3]
-    parts = np.arange(8) / 8 + 1 / 16
-    u, v = np.meshgrid(np.add.outer(np.arange(48), parts).ravel(), np.arange(32))
-    pixel = np.stack([u[:, :, None] + 0 * parts, v[:, :, None] + parts], -1)
-    ray, _ = rays(scene.sensors()[0], pixel.reshape(-1, 2))
-    o, d = ray.o.numpy().T.astype(float), ray.d.numpy().T.astype(float)
-    sides = np.sort(np.stack([(-1 - o) / d, (1 - o) / d]), axis=0)
-    inside = np.maximum(sides[1].min(1) - np.maximum(sides[0].max(1), 0), 0)
-    expected = (1 - np.exp(-0.7 * inside)).reshape(32, 48, -1).mean(-1)
-    assert expected.max() > 0.8 and (expected == 0).any()
-    error = np.abs(opacity - expected)
-    assert error.max() < 0.1 and error.mean() < 5e-3  # of 256 random samples
 
 
 # Properties

@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 
-from mi_nerfattack.fields import GridField, NGPField, load_field, save_field
-from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import march
-from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.fields import load_field, save_field
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -152,11 +149,6 @@ def test_unknown_parameters_are_named(grid: Path, wrap) -> None:
         load(wrap(grid))
 
 
-def test_unknown_parameter_of_an_ngp(ngp: Path) -> None:
-    with pytest.raises(RuntimeError, match=r'(?s)1 unreferenced property.*"foo"'):
-        load(volume(ngp, "ngp_field", REFUSED))
-
-
 def refuse(text: str, message: str) -> None:
     """Check that an XML string is refused with a message."""
     with pytest.raises(Exception, match=message):
@@ -285,52 +277,3 @@ def test_box_and_bound_in_the_world(paths, rng: np.random.Generator) -> None:
         peak = loaded.eval_1(it).numpy().max()
         assert 0 < peak <= loaded.max() < 10 * peak
         assert loaded.max_per_channel() == [loaded.max()] * 3
-
-
-def test_updated_parameters_reach_the_field(paths, rng) -> None:
-    _, it = points(rng)
-    for kind, name in zip(KINDS, ("texture", "table"), strict=True):
-        loaded = load(volume(paths[kind], kind))
-        before = loaded.eval_3(it).numpy().copy()
-        params = mi.traverse(loaded)
-        params[name] = type(params[name])(params[name] + 1)
-        params.update()
-        assert np.abs(loaded.eval_3(it).numpy() - before).max() > 0.01
-
-
-def test_heterogeneous_medium_agrees_with_the_march(grid: Path) -> None:
-    # Nothing scatters: what arrives from behind is the transmittance.
-    medium = (
-        '<shape type="cube"><bsdf type="null"/>'
-        '<medium name="interior" type="heterogeneous">'
-        f"{volume(grid, name='sigma_t')}"
-        '<volume type="constvolume" name="albedo"><rgb name="value" value="0"/>'
-        "</volume></medium></shape>"
-    )
-    scene = load(
-        '<scene ><integrator type="volpath"/><sensor type="perspective">'
-        '<float name="fov" value="10"/><transform name="to_world">'
-        '<lookat origin="-3,.1,.2" target="0,.1,.2" up="0,0,1"/></transform>'
-        '<film type="hdrfilm"><integer name="width" value="1"/>'
-        '<integer name="height" value="1"/><rfilter type="box"/></film></sensor>'
-        f'{medium}<emitter type="constant"/></scene>'
-    )
-    count = 4096
-    sensor = scene.sensors()[0]
-    side = 64
-    u = mi.Point2f((np.mgrid[:side, :side].reshape(2, -1) + 0.5) / side)
-    ray, _ = sensor.sample_ray(0, 0, u, u)
-    pose = PosedField(load_field(grid), Pose.identity())
-    seen = march(
-        pose, ray.o, ray.d, mi.Float(dr.inf), mi.Float(0.5), mi.Bool(True), 0.0
-    )
-    expected = 1 - seen.opacity.numpy().astype(float).mean()
-    assert 0.1 < expected < 0.9
-    found = np.array(mi.render(scene, spp=count)).mean()
-    noise = np.sqrt(expected * (1 - expected) / count)
-    assert found == pytest.approx(expected, abs=4 * noise)
-
-
-def test_files_of_both_kinds_load_as_their_class(paths) -> None:
-    found = [type(load(volume(paths[k], k)).field) for k in KINDS]
-    assert found == [GridField, NGPField]

@@ -123,23 +123,6 @@ def test_parameters_of_an_ngp(ngp: Setting, rng, name: str) -> None:
     check_parameter(ngp, lambda: field.parameters()[name], write, tangent, 2e-3, 2e-2)
 
 
-def test_set_parameter_carries_the_texture_gradient(blob: Setting, rng) -> None:
-    field = blob.field
-    packed = mi.Float(field.packed)
-    dr.enable_grad(packed)
-    field.packed = packed
-    blob.derivative(dr.ADMode.Backward)
-    expected = field.texture_gradient(dr.grad(packed)).numpy()
-
-    texture = mi.TensorXf(field.texture)
-    dr.enable_grad(texture)
-    field.set_parameter("texture", texture)
-    blob.derivative(dr.ADMode.Backward)
-    dr.enqueue(dr.ADMode.Backward, field.packed)
-    dr.traverse(dr.ADMode.Backward)
-    np.testing.assert_allclose(dr.grad(texture).numpy(), expected, rtol=1e-3, atol=1e-6)
-
-
 def test_gradient_accumulates_over_passes(blob: Setting) -> None:
     packed = mi.Float(blob.field.packed)
     dr.enable_grad(packed)

@@ -229,8 +229,10 @@ def drive(route, integrator, start, steps):
     return np.abs(errors)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("turn", [np.pi / 2, -np.pi / 2, 1e-9])
+@pytest.mark.parametrize(
+    ("integrator", "turn"),
+    list(zip(INTEGRATORS, [np.pi / 2, -np.pi / 2, 1e-9], strict=True)),
+)
 def test_expert_follows_and_recovers(integrator, turn):
     route = lane(turn=turn)
     assert drive(route, integrator, route.pose_at(0.0), 70).mean() < 0.03
