@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
-from typing import Any
 
-import drjit
+import drjit as dr
 import mitsuba as mi
 
 import mi_nerfattack
@@ -14,7 +13,6 @@ from mi_nerfattack.backend import llvm
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on, with the active variant."""
-    dr: Any = drjit  # its stubs lack the version
     return {
         "mi_nerfattack": mi_nerfattack.__version__,
         "mitsuba": str(mi.__version__),

@@ -50,7 +50,7 @@ class FitCheckpoint:
     """
 
     def __init__(self, path: Path, training: Training, resume: bool) -> None:
-        self.path, self.training = path, training
+        self.training = training
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
         identity = {"format": FORMAT, **versions(), "fit": _digest(training)}

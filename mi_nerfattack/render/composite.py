@@ -295,8 +295,8 @@ def select(
         return []
 
     gains = [rays.gains[k] for k in which] if rays.gains else []
-    rays = replace(rays, gains=gains)
-    return [Task(*(pick_rays(x, index) for x in (rays, primal, cotangent)), which)]
+    parts = replace(rays, gains=gains), primal, cotangent
+    return [Task(*(pick_rays(x, index) for x in parts), fields=which)]
 
 
 def depth_composite(layers: list[March]) -> March:

@@ -155,7 +155,7 @@ class FieldSensor(AbstractDifferentiableSensor):
             self._wrenches = [
                 [a + b for a, b in zip(*pair, strict=True)] for pair in pairs
             ]
-        dr.eval([dr.grad(posed.field.packed) for posed in self.objects], self._wrenches)
+        dr.eval([dr.grad(field.packed) for field in self._grids], self._wrenches)
         return self._by_state(state, d_rays, d_direction) if attached else None
 
     def _cotangent(
@@ -207,30 +207,27 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def start_gradient(self, poses: bool = False) -> None:
         """Make every object's packed grid a fresh leaf with gradient zero."""
-        for posed in self.objects:
-            leaf = mi.Float(dr.detach(posed.field.packed))
+        for field in self._grids:
+            leaf = mi.Float(dr.detach(field.packed))
             dr.enable_grad(leaf)
-            posed.field.packed = leaf
-            dr.set_grad(posed.field.packed, dr.opaque(mi.Float, 0, dr.width(leaf)))
+            field.packed = leaf
+            dr.set_grad(field.packed, dr.opaque(mi.Float, 0, dr.width(leaf)))
         double = dr.float64_array_t(mi.Float)
         zeros = [[dr.opaque(double, 0) for _ in range(6)] for _ in self.objects]
         self._wrenches = zeros if poses else None
 
     def texture_gradients(self) -> list[Any]:
         """Return the accumulated gradient of each texture, (n_vertices, 3)."""
-        return [
-            posed.field.texture_gradient(dr.grad(posed.field.packed))
-            for posed in self.objects
-        ]
+        return [field.texture_gradient(dr.grad(field.packed)) for field in self._grids]
 
     def textures(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.textures`."""
-        return [posed.field.texture for posed in self.objects]
+        return [field.texture for field in self._grids]
 
     def set_textures(self, textures: list[Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.set_textures`."""
-        for posed, texture in zip(self.objects, textures, strict=True):
-            posed.field.set_parameter("texture", texture)
+        for field, texture in zip(self._grids, textures, strict=True):
+            field.set_parameter("texture", texture)
 
     def offsets(self) -> np.ndarray:
         """See :meth:`AbstractDifferentiableSensor.offsets`."""
@@ -257,8 +254,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def start_tangent(self, textures: list[Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.start_tangent`."""
-        for posed, tangent in zip(self.objects, textures, strict=True):
-            field = posed.field
+        for field, tangent in zip(self._grids, textures, strict=True):
             leaf = mi.Float(dr.detach(field.packed))
             dr.enable_grad(leaf)
             none = dr.zeros(mi.Float, field.n_vertices)
@@ -303,7 +299,12 @@ class FieldSensor(AbstractDifferentiableSensor):
             return dr.opaque(mi.Float, 0.5)
         seed = dr.opaque(mi.UInt32, self.jitter_seed)
         key = mi.sample_tea_32(seed, step)[0]
-        return mi.sample_tea_float32(key, dr.arange(mi.UInt32, count))
+        return mi.Float(mi.sample_tea_float32(key, dr.arange(mi.UInt32, count)))
+
+    @property
+    def _grids(self) -> list[GridField]:
+        # checked by __init__
+        return [posed.field for posed in self.objects]  # pyright: ignore[reportReturnType]
 
     @property
     def _fields(self) -> list[Layer]:

@@ -132,8 +132,8 @@ class Sweep:
         """
         loop, index = self.loop, step.index
         controls = self.drive.controls[: index + 1]
-        pair = loop.transition.controls(controls, index, step.state)
-        d_state, *d_pair = loop.transition.vjp(step.state, *pair, d_after)
+        older, newer = loop.transition.controls(controls, index, step.state)
+        d_state, *d_pair = loop.transition.vjp(step.state, older, newer, d_after)
         for source, value in zip(loop.transition.sources(index), d_pair, strict=True):
             self.pending[source] = self.pending.get(source, 0) + value
         image = step.observation.image

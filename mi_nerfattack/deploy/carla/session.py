@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import re
 import weakref
@@ -74,14 +75,13 @@ def load_client() -> Any:
         InputError: it is not installed.
     """
     try:
-        import carla  # pyright: ignore[reportMissingImports]
+        return importlib.import_module("carla")
     except ImportError as error:
         raise InputError(
             f"environment 'carla': its client cannot be imported ({error}); "
             "pip install 'mi-nerfattack[carla]' (0.9.16 has wheels for Python 3.10 to "
             "3.12 on Linux and Windows, x86-64)"
         ) from error
-    return carla
 
 
 class CarlaSession:

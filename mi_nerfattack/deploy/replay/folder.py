@@ -68,9 +68,10 @@ def required_camera(source: Path, own: Camera | None, given: Camera | None) -> C
     Raises:
         InputError: there is none.
     """
-    if own is None and given is None:
+    camera = given if own is None else own
+    if camera is None:
         raise InputError(f"{source}: no intrinsics; add a camera, or give one")
-    return given if own is None else own  # pyright: ignore[reportReturnType]
+    return camera
 
 
 def _pose_file(folder: Path) -> Path:

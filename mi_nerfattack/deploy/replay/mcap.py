@@ -256,10 +256,10 @@ def _compressed(where: str, message: Mapping[str, Any]) -> bytes:
 
 
 def _pose(where: str, message: Mapping[str, Any]) -> np.ndarray:
-    pose = message.get("pose")
+    pose: Any = message.get("pose")
     try:
-        position = [float(pose["position"][key]) for key in "xyz"]  # pyright: ignore
-        turn = [float(pose["orientation"][key]) for key in "wxyz"]  # pyright: ignore
+        position = [float(pose["position"][key]) for key in "xyz"]
+        turn = [float(pose["orientation"][key]) for key in "wxyz"]
     except (TypeError, KeyError, ValueError) as error:
         raise InputError(
             f"{where}: pose {pose!r}; needs position x, y, z and orientation x, y, z, w"
