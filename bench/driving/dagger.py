@@ -253,14 +253,14 @@ class _Bench:
 
         layout: Any = {"memory_format": torch.channels_last}
         module.to(**layout)  # faster on a CPU
-        data = FrameDataset.from_folders(shards)
+        data = FrameDataset.from_shards(shards)
         fit_policy(
             module,
             data,
             TrainSettings(epochs, self.settings.batch, rate, seed=seed),
             self.folder / f"{name}.checkpoint.safetensors",
             progress=step,
-            held_out=FrameDataset.from_folders(shards[:1]),  # has no influence
+            held_out=FrameDataset.from_shards(shards[:1]),  # has no influence
             validation=_LAST,
         )
         module.save(path)

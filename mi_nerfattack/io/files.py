@@ -180,6 +180,18 @@ def read_safetensors(
         raise InputError(f"{path}: {err}; use types that NumPy has") from err
 
 
+def find_tensor(path: str | Path, name: str) -> tuple[int, str, tuple[int, ...]]:
+    """Return where a tensor of a safetensors file begins, its type and its shape."""
+    read_safetensors(path, ())  # checks the header
+    with _reported(path), open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        entry = json.loads(file.read(length)).get(name)
+    if entry is None:
+        raise InputError(f"{path}: has no tensor {name!r}")
+    start = 8 + length + entry["data_offsets"][0]
+    return start, entry["dtype"], tuple(entry["shape"])
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text atomically."""
     write_bytes(path, text.encode("utf-8"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,21 +13,30 @@ import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.placement import Roadside, Scatter
-from mi_nerfattack.deploy.sites import AbstractSite, as_json, expert_of, probe_expert
+from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
-from mi_nerfattack.training.dataset import write_shard
+from mi_nerfattack.training.dataset import shard_columns
 from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Called with frames done and frames wanted.
 OnFrames = Callable[[int, int], None]
 
-_DONE = "shard.json"
-_MANIFEST = "manifest.json"
+FORMAT = "mi_nerfattack frames 1"
+_SHARDS = "shard_*.safetensors"
+_REMEDY = "choose another folder for the frames, or remove this one"
+
+
+class ShardRecord(Record):
+    """Conditions under which the frames of a shard were rendered; frames by goal."""
+
+    conditions: dict[str, Any]
+    goals: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -103,28 +112,33 @@ def collect(
         routes: they take turns by chance, longer ones more often.
         source: of the states.
         settings: see there.
-        folder: gets `<site.name>/shard_0000` and so on, and a manifest.
+        folder: gets `<site.name>/shard_0000.safetensors` and so on.
         workers: who renders.
         progress: called now and then; an exception from it stops the work.
 
     Returns:
-        The folders of the shards, in order.
+        The shards, in order.
 
     Raises:
         InputError: the folder holds frames of other settings, files, routes or states;
             a file cannot be written; a worker ended.
     """
     root = files.make_folder(Path(folder) / site.name)
-    about = {
-        "settings": asdict(settings),
-        "site": site.describe(),
-        "source": source.describe(),
+    experts = {route.name: probe_expert(site, route) for route in routes}
+    identity = {
+        "format": FORMAT,
+        **flatten("settings", asdict(settings)),
+        **flatten("site", site.describe()),
+        **flatten("source", source.describe()),
         "routes": _digest(routes),
-        "expert": {route.name: probe_expert(site, route) for route in routes},
+        **flatten("expert", experts),
     }
-    _claim(root, about)
-    paths = [root / f"shard_{index:04d}" for index in range(settings.shards)]
-    missing = [i for i, path in enumerate(paths) if not _is_done(path)]
+    work = _Shards(site, tuple(routes), source, settings, root, identity)
+    present = sorted(root.glob(_SHARDS))
+    for path in present:
+        work.unit(path).read_record()  # refuses frames of something else
+    paths = [work.path(index) for index in range(settings.shards)]
+    missing = [index for index, path in enumerate(paths) if path not in present]
     done = settings.frames - sum(map(settings.size, missing))
     progress(done, settings.frames)
 
@@ -133,7 +147,6 @@ def collect(
         done += frames
         progress(done, settings.frames)
 
-    work = _Shards(site, tuple(routes), source, settings, root)
     workers.run(work, missing, count)
     return paths
 
@@ -147,6 +160,15 @@ class _Shards(AbstractWork):
     source: AbstractSource
     settings: CollectSettings
     root: Path
+    identity: Mapping[str, str]
+
+    def path(self, index: int) -> Path:
+        """Return the file of a shard."""
+        return self.root / f"shard_{index:04d}.safetensors"
+
+    def unit(self, path: Path) -> Unit[ShardRecord]:
+        """Return what a file must be."""
+        return Unit(path, self.identity, ShardRecord, _REMEDY)
 
     def open(self) -> _Stage:
         """Load objects, ground and what the source needs."""
@@ -168,7 +190,11 @@ class _Shards(AbstractWork):
             if len(rows) == wanted:
                 break
         goals, controls = (np.array(column) for column in zip(*rows, strict=True))
-        self._finish(index, np.stack(images), goals, controls, conditions)
+        counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
+        self.unit(self.path(index)).write(
+            shard_columns(np.stack(images), goals, controls),
+            ShardRecord(conditions=asdict(conditions), goals=counts),
+        )
 
     def close(self, opened: _Stage) -> None:
         """Close the environment."""
@@ -185,25 +211,6 @@ class _Shards(AbstractWork):
             scenery = Scenery(environment, route, experts[route.name], poses, rng)
             for labelled in self.source.frames(stage.prepared, scenery):
                 yield route.goal, labelled
-
-    def _finish(
-        self,
-        index: int,
-        images: np.ndarray,
-        goals: np.ndarray,
-        controls: np.ndarray,
-        conditions: Any,
-    ) -> None:
-        """Write one shard and, last, the file that says that it is complete."""
-        shard = self.root / f"shard_{index:04d}"
-        write_shard(shard, images, goals, controls)
-        counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
-        about = {
-            "frames": len(goals),
-            "goals": counts,
-            "conditions": asdict(conditions),
-        }
-        files.write_json(shard / _DONE, about)
 
 
 class _Stage:
@@ -288,42 +295,17 @@ def _draw_states(
 
 
 def find_shards(folder: str | Path) -> list[Path]:
-    """Return the complete shards anywhere below a folder, in order of their names.
+    """Return the shards anywhere below a folder, in order of their names.
 
     Raises:
         InputError: there are none.
     """
-    found = sorted(path.parent for path in Path(folder).rglob(_DONE))
+    found = sorted(Path(folder).rglob(_SHARDS))
     if not found:
         raise InputError(
             f"{folder}: no frames in it; give a folder of 'mi-nerfattack train'"
         )
     return found
-
-
-def _is_done(shard: Path) -> bool:
-    return (shard / _DONE).is_file()
-
-
-def _claim(root: Path, about: dict[str, Any]) -> None:
-    """Write the manifest, or compare it with that of the frames that are there."""
-    path, about = root / _MANIFEST, as_json(about)
-    if not any(_is_done(shard) for shard in root.glob("shard_*")):
-        files.write_json(path, about)
-        return
-    if not path.is_file():
-        raise InputError(
-            f"{root}: holds frames without {_MANIFEST}; choose another folder or "
-            "remove this one"
-        )
-    found = files.read_json(path)
-    if found != about:
-        keys = sorted(set(found) | set(about))
-        wrong = [key for key in keys if found.get(key) != about.get(key)]
-        raise InputError(
-            f"{path}: the frames there differ in {', '.join(wrong)}; "
-            "choose another folder or remove this one"
-        )
 
 
 def _digest(routes: Sequence[Route]) -> str:

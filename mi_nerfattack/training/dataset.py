@@ -1,14 +1,12 @@
-"""Driving frames with goals and expert controls, memory-mapped from shards.
+"""Driving frames with goals and expert controls, read row by row from shards.
 
-A shard is a folder of three NumPy files: `frames.npy`, uint8 (n, height, width, 3),
-sRGB; `goals.npy`, int64 (n,); `controls.npy`, float32 (n,), rad/s. Frames stay on
-the disk and are read row by row.
+A shard is one safetensors file: `frames`, uint8 (n, height, width, 3), sRGB; `goals`,
+int64 (n,); `controls`, float32 (n,), rad/s or rad. Frames stay on the disk.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,8 +18,6 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
-COLUMNS = {"frames": np.uint8, "goals": np.int64, "controls": np.float32}
-
 
 class FramesFile:
     """Frames of one shard on the disk, read row by row.
@@ -30,13 +26,19 @@ class FramesFile:
     1,024 on many systems, and large collections have more shards.
 
     Args:
-        path: `frames.npy`.
+        path: the shard.
     """
 
+    dtype = np.dtype(np.uint8)
+
     def __init__(self, path: Path) -> None:
-        column = _map_column(path, np.uint8)
-        self.path, self._start = path, column.offset
-        self.shape, self.dtype = column.shape, column.dtype
+        self.path = path
+        self._start, dtype, self.shape = files.find_tensor(path, "frames")
+        if dtype != "U8" or len(self.shape) != 4 or self.shape[3] != 3:
+            raise InputError(
+                f"{path}: frames {dtype} {self.shape}; U8 of shape "
+                "(n, height, width, 3) is needed"
+            )
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -81,30 +83,27 @@ class FrameDataset:
             )
 
     @classmethod
-    def from_folders(cls, folders: Sequence[str | Path]) -> FrameDataset:
-        """Map shards written by `write_shard`, in the order given.
+    def from_shards(cls, paths: Sequence[str | Path]) -> FrameDataset:
+        """Open shards, in the order given; their frames are read when they are needed.
 
         Raises:
-            InputError: no folder; a missing or damaged file; lengths that differ.
+            InputError: no file; one that is missing or damaged, or whose columns are no
+                frames or differ in length.
         """
-        if not folders:
-            raise InputError("dataset: no folders; give at least one shard")
-        shards = [
-            (
-                FramesFile(Path(folder) / "frames.npy"),
-                _read_column(Path(folder), "goals"),
-                _read_column(Path(folder), "controls"),
-            )
-            for folder in folders
-        ]
-        for folder, shard in zip(folders, shards, strict=True):
-            if len({len(column) for column in shard}) != 1:
+        if not paths:
+            raise InputError("dataset: no shards; give at least one")
+        frames, goals, controls = [], [], []
+        for path in map(Path, paths):
+            images, columns = FramesFile(path), _read_columns(path)
+            if {len(column) for column in columns} != {len(images)}:
                 raise InputError(
-                    f"{folder}: {[len(column) for column in shard]} rows of "
-                    f"{list(COLUMNS)}; remove the folder, and the command that "
+                    f"{path}: {len(images)} frames, but {len(columns[0])} goals and "
+                    f"{len(columns[1])} controls; remove it, and the command that "
                     "collected it renders it again"
                 )
-        frames, goals, controls = zip(*shards, strict=True)
+            frames.append(images)
+            goals.append(columns[0])
+            controls.append(columns[1])
         return cls(tuple(frames), np.concatenate(goals), np.concatenate(controls))
 
     def __len__(self) -> int:
@@ -159,25 +158,25 @@ class FrameDataset:
         return np.flatnonzero(~mask), np.flatnonzero(mask)
 
 
-def write_shard(
-    folder: str | Path, frames: np.ndarray, goals: np.ndarray, controls: np.ndarray
-) -> None:
-    """Write one shard; each of its files appears whole or not at all.
+def shard_columns(
+    frames: np.ndarray, goals: np.ndarray, controls: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Check and name what a shard holds.
 
     Args:
-        folder: made if missing.
         frames: (n, height, width, 3) uint8, sRGB.
         goals: (n,) integers.
-        controls: (n,) rad/s.
+        controls: (n,) rad/s or rad.
+
+    Raises:
+        InputError: shapes or types that do not fit, controls that are not finite.
     """
-    goals = np.asarray(goals, np.int64)
-    controls = np.asarray(controls, np.float32)
-    FrameDataset((np.asarray(frames),), goals, controls)  # checks all three
-    folder = files.make_folder(folder)
-    for name, array in zip(COLUMNS, (frames, goals, controls), strict=True):
-        buffer = io.BytesIO()
-        np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
-        files.write_bytes(folder / f"{name}.npy", buffer.getvalue())
+    data = FrameDataset(
+        (np.asarray(frames),),
+        np.asarray(goals, np.int64),
+        np.asarray(controls, np.float32),
+    )
+    return {"frames": frames, "goals": data.goals, "controls": data.controls}
 
 
 def divide_shards(
@@ -189,7 +188,7 @@ def divide_shards(
     when more shards come. Shards share neither drives nor textures.
 
     Args:
-        shards: folders written by `write_shard`.
+        shards: files of `collect`.
         fraction: held out, of many; in [0, 1).
         least: held out at least, where one is left to train on; those nearest to being
             held out anyway.
@@ -211,29 +210,16 @@ def divide_shards(
 
 def _draw_of(shard: Path) -> float:
     """Return a number in [0, 1) that looks random and is the shard's own."""
-    return zlib.crc32(_read_column(shard, "controls").tobytes()) / 2**32
+    return zlib.crc32(_read_columns(shard)[1].tobytes()) / 2**32
 
 
-def _read_column(shard: Path, name: str) -> np.ndarray:
-    """Copy one of the small .npy files of a shard into memory, checked."""
-    return np.array(_map_column(shard / f"{name}.npy", COLUMNS[name]))
-
-
-def _map_column(path: Path, dtype: type) -> np.memmap:
-    """Memory-map one .npy file and check its type and shape."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+def _read_columns(shard: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read goals and controls."""
+    columns, _ = files.read_safetensors(shard, ("goals", "controls"))
+    goals, controls = columns["goals"], columns["controls"]
+    if goals.dtype != np.int64 or controls.dtype != np.float32:
         raise InputError(
-            f"{path}: cannot be read ({error}); remove its folder, and the command "
-            "that collected it renders it again"
-        ) from error
-    image = len(array.shape) == 4 and array.shape[3] == 3
-    fits = array.dtype == dtype and array.flags.c_contiguous
-    if not fits or not (image if dtype is np.uint8 else array.ndim == 1):
-        raise InputError(
-            f"{path}: {array.dtype} {array.shape}; {np.dtype(dtype)} of shape "
-            f"{'(n, height, width, 3)' if dtype is np.uint8 else '(n,)'}, in C order, "
-            "is needed"
+            f"{shard}: goals {goals.dtype}, controls {controls.dtype}; int64 and "
+            "float32 are needed"
         )
-    return array
+    return goals, controls

@@ -23,7 +23,7 @@ from mi_nerfattack.training.dataset import FrameDataset, divide_shards
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
 from mi_nerfattack.training.train import Progress, check_labels, fit_policy
-from mi_nerfattack.training.validation import ClosedLoop, rank
+from mi_nerfattack.training.validation import ClosedLoop, Epoch, rank
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Called with the name of the stage, units done and wanted, and what to show.
@@ -42,7 +42,7 @@ class Imitated:
     """
 
     module: PilotNet
-    history: list[list[dict[str, Any]]]
+    history: list[list[Epoch]]
     best_round: int
     card: dict[str, Any]
     shards: list[Path]
@@ -199,7 +199,7 @@ class _Imitation:
             self.held_out += held_out
         self.training += training
 
-    def train(self, module: PilotNet, number: int) -> list[dict[str, Any]]:
+    def train(self, module: PilotNet, number: int) -> list[Epoch]:
         """Train once, with a checkpoint after each epoch."""
         settings = replace(self.settings.training, seed=self._seed(number))
         if number:
@@ -220,11 +220,11 @@ class _Imitation:
         module.to(**layout)
         return fit_policy(
             module,
-            FrameDataset.from_folders(self.training),
+            FrameDataset.from_shards(self.training),
             settings,
             self.folder / f"checkpoint_{number}.safetensors",
             progress=step,
-            held_out=FrameDataset.from_folders(self.held_out),
+            held_out=FrameDataset.from_shards(self.held_out),
             validation=self.loop,
         )
 
@@ -308,7 +308,7 @@ def check_camera(site: AbstractSite) -> None:
 def _check_frames(module: PilotNet, shards: Sequence[Path]) -> None:
     """Raise `InputError` unless a policy can be trained on shards."""
     for shard in shards:
-        data = FrameDataset.from_folders([shard])
+        data = FrameDataset.from_shards([shard])
         height, width = data.frames[0].shape[1:3]
         if (height, width) != IMAGE_SHAPE:
             raise InputError(

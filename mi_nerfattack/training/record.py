@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.deploy.sites import AbstractSite
-from mi_nerfattack.io import files
+from mi_nerfattack.training.dataset import FramesFile
 from mi_nerfattack.training.settings import ImitationSettings
-
-_DONE = "shard.json"  # in the folder of every complete shard
 
 
 def training_record(
@@ -80,9 +78,5 @@ def count_frames(data: Path, shards: Sequence[Path]) -> dict[str, int]:
     for shard in sorted(shards):
         own = shard.is_relative_to(data)
         place = shard.parent.relative_to(data).as_posix() if own else ""
-        counts[place or f"earlier/{shard.parent.name}"] += _frames(shard)
+        counts[place or f"earlier/{shard.parent.name}"] += len(FramesFile(shard))
     return dict(counts)
-
-
-def _frames(shard: Path) -> int:
-    return int(files.read_json(shard / _DONE)["frames"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,11 +13,26 @@ import numpy as np
 import torch
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io import files
-from mi_nerfattack.policy.pilotnet import PilotNet, load_checked
+from mi_nerfattack.io.resumable import Record, Unit, flatten
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.training.augment import Augmentation
 from mi_nerfattack.training.dataset import FrameDataset
-from mi_nerfattack.training.validation import AbstractValidation, LossAlone, rank
+from mi_nerfattack.training.validation import (
+    AbstractValidation,
+    Epoch,
+    LossAlone,
+    Measured,
+    rank,
+)
+
+FORMAT = "mi_nerfattack training checkpoint 1"
+_REMEDY = "restore what differs, or remove the file to train again"
+
+
+class TrainRecord(Record):
+    """The epochs that are done."""
+
+    history: list[Epoch]
 
 
 @dataclass(frozen=True)
@@ -76,7 +90,7 @@ def fit_policy(
     progress: Callable[[Progress], None] | None = None,
     held_out: FrameDataset | None = None,
     validation: AbstractValidation | None = None,
-) -> list[dict[str, Any]]:
+) -> list[Epoch]:
     """Train a policy and leave the weights of its best epoch in it.
 
     Best is the epoch with the fewest drives departed in the closed loop, among these
@@ -115,15 +129,13 @@ def fit_policy(
         train_rows, held = np.arange(len(data)), Part.of_all(held_out)
     module.to(device).requires_grad_(True)
     parts = Part(data, train_rows), held
-    run = _Run(module, parts, settings, device, validation or LossAlone())
-    if checkpoint is not None and Path(checkpoint).exists():
-        run.restore(checkpoint)
+    run = _Run(module, parts, settings, device, validation or LossAlone(), checkpoint)
+    run.restore()
     for epoch in range(len(run.history), settings.epochs):
         train_loss = run.epoch(epoch, progress)
         held_loss, held_error = run.validate()
         run.record(train_loss, held_loss, held_error)
-        if checkpoint is not None:
-            run.save(checkpoint)
+        run.save()
     module.load_state_dict(run.best)
     module.to("cpu").eval()
     return run.history
@@ -156,6 +168,7 @@ class _Run:
         settings: TrainSettings,
         device: str,
         validation: AbstractValidation,
+        checkpoint: str | Path | None,
     ) -> None:
         self.module, self.settings, self.validation = module, settings, validation
         self.part, self.held = parts
@@ -167,8 +180,11 @@ class _Run:
             weight_decay=settings.weight_decay,
         )
         self.best = copy.deepcopy(module.state_dict())
-        self.start = _digest_weights(module)
-        self.history: list[dict[str, Any]] = []
+        self.history: list[Epoch] = []
+        self.checkpoint: Unit[TrainRecord] | None = None
+        if checkpoint is not None:
+            path = Path(checkpoint)
+            self.checkpoint = Unit(path, self._identity(), TrainRecord, _REMEDY)
 
     def epoch(self, epoch: int, progress: Callable[[Progress], None] | None) -> float:
         """Pass over the rows once, in an order that depends on seed and epoch."""
@@ -216,80 +232,63 @@ class _Run:
 
         Only epochs that are measured can be best.
         """
-        row: dict[str, Any] = {
+        number, every = len(self.history) + 1, self.validation.every
+        due = number % every == 0 or number == self.settings.epochs
+        measured: Measured = self.validation.measure(self.module) if due else {}
+        row: Epoch = {
             "train_loss": train_loss,
             "held_out_loss": held_loss,
             "held_out_error": held_error,
+            "measured": due,
+            **measured,
         }
-        number, every = len(self.history) + 1, self.validation.every
-        if number % every == 0 or number == self.settings.epochs:
-            row |= self.validation.measure(self.module)
-            previous = [rank(older) for older in self.history if older["measured"]]
-            if not previous or rank(row) < min(previous):
-                self.best = copy.deepcopy(self.module.state_dict())
-            row["measured"] = True
-        else:
-            row["measured"] = False
+        previous = [rank(older) for older in self.history if older["measured"]]
+        if due and (not previous or rank(row) < min(previous)):
+            self.best = copy.deepcopy(self.module.state_dict())
         self.history.append(row)
 
-    def save(self, path: str | Path) -> None:
+    def save(self) -> None:
         """Write the state after a whole epoch."""
+        if self.checkpoint is None:
+            return
         tensors = {f"last.{k}": v for k, v in self.module.state_dict().items()}
         tensors |= {f"best.{k}": v for k, v in self.best.items()}
-        names = [name for name, _ in self.module.named_parameters()]
         for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{names[index]}.{k}": v for k, v in state.items()}
+            tensors |= {f"adam.{index}.{k}": v for k, v in state.items()}
         arrays = {name: value.cpu().numpy() for name, value in tensors.items()}
-        metadata = {"run": self._fingerprint(), "history": json.dumps(self.history)}
-        files.write_safetensors(path, arrays, metadata)
+        self.checkpoint.write(arrays, TrainRecord(history=self.history))
 
-    def restore(self, path: str | Path) -> None:
-        """Read what `save` wrote for the same settings, data and first weights."""
-        arrays, metadata = files.read_safetensors(path)
-        if metadata.get("run") != self._fingerprint():
-            raise InputError(
-                f"{path}: written with other settings or data "
-                f"({self._differences(metadata.get('run', '{}'))}); remove it or "
-                "restore them"
-            )
-        groups: dict[str, dict[str, np.ndarray]] = {"last": {}, "best": {}, "adam": {}}
-        for name, value in arrays.items():
+    def restore(self) -> None:
+        """Read what `save` wrote, where there is something."""
+        kept = None if self.checkpoint is None else self.checkpoint.read()
+        if kept is None:
+            return
+        groups: dict[str, dict[str, torch.Tensor]] = {}
+        for name, value in kept.tensors.items():
             group, _, rest = name.partition(".")
-            groups.setdefault(group, {})[rest] = value
-        load_checked(self.module, groups["best"], f"{path} (best)")
-        self.best = copy.deepcopy(self.module.state_dict())
-        load_checked(self.module, groups["last"], f"{path} (last)")
+            groups.setdefault(group, {})[rest] = torch.from_numpy(value)
+        self.module.load_state_dict(groups["last"])
+        self.best = groups["best"]
         state = self.optimiser.state_dict()
-        for index, (name, value) in enumerate(self.module.named_parameters()):
-            shapes = {"step": (), "exp_avg": value.shape, "exp_avg_sq": value.shape}
-            slots = {key: groups["adam"].get(f"{name}.{key}") for key in shapes}
-            for key, array in slots.items():
-                if array is None or array.shape != tuple(shapes[key]):
-                    raise InputError(f"{path}: adam.{name}.{key} is missing or damaged")
-            state["state"][index] = {
-                key: torch.from_numpy(np.array(array)) for key, array in slots.items()
-            }
+        for name, value in groups["adam"].items():
+            index, _, key = name.partition(".")
+            state["state"].setdefault(int(index), {})[key] = value
         self.optimiser.load_state_dict(state)
-        self.history = json.loads(metadata["history"])
+        self.history = kept.record.history
 
-    def _fingerprint(self) -> str:
+    def _identity(self) -> dict[str, str]:
         """Describe all on which a continued run must agree."""
-        return json.dumps(
-            {
-                "settings": asdict(self.settings),
-                "validation": self.validation.describe(),
-                "rows": self.part.describe(),
-                "held_out": self.held.describe(),
-                "start": self.start,
-                "goals": self.module.goals,
-                "max_control": self.module.max_control,
-            }
-        )
-
-    def _differences(self, found: str) -> str:
-        """Name the parts of a checkpoint's fingerprint that differ from this run's."""
-        theirs, mine = json.loads(found), json.loads(self._fingerprint())
-        return ", ".join(key for key in mine if theirs.get(key) != mine[key])
+        about = {
+            "settings": asdict(self.settings),
+            "validation": self.validation.describe(),
+            "rows": self.part.describe(),
+            "held_out": self.held.describe(),
+            "start": _digest_weights(self.module),
+            "goals": self.module.goals,
+            "max_control": self.module.max_control,
+        }
+        parts = [flatten(name, value) for name, value in about.items()]
+        return {"format": FORMAT, **{k: v for part in parts for k, v in part.items()}}
 
     def _batch(self, data: FrameDataset, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
         """Read frames (uint8), goals and controls in [-1, 1] onto the device."""

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import pydantic
+from typing_extensions import TypedDict
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.placement import Ground
@@ -22,6 +24,25 @@ from mi_nerfattack.vehicle.route.route import Route
 ERROR, DEPARTED = "closed_loop_error_m", "closed_loop_drives_departed"
 
 
+class Measured(TypedDict, total=False):
+    """What a validation in the closed loop measures; nothing without one."""
+
+    closed_loop_error_m: float
+    closed_loop_drives_departed: int
+    routes: dict[str, float]
+
+
+class Epoch(Measured):
+    """A row of a training's history."""
+
+    __pydantic_config__ = pydantic.ConfigDict(extra="forbid", strict=True)  # pyright: ignore
+
+    train_loss: float
+    held_out_loss: float
+    held_out_error: float
+    measured: bool
+
+
 class AbstractValidation(ABC):
     """Measurement of a policy beside its loss.
 
@@ -32,8 +53,8 @@ class AbstractValidation(ABC):
     every: int
 
     @abstractmethod
-    def measure(self, module: PilotNet) -> dict[str, Any]:
-        """Return what is known, for the history: JSON, with `ERROR` and `DEPARTED`.
+    def measure(self, module: PilotNet) -> Measured:
+        """Return what is known, for the history.
 
         Args:
             module: in evaluation mode; left unchanged.
@@ -50,7 +71,7 @@ class LossAlone(AbstractValidation):
 
     every: int = 1
 
-    def measure(self, module: PilotNet) -> dict[str, Any]:
+    def measure(self, module: PilotNet) -> Measured:
         """Measure nothing."""
         del module
         return {}
@@ -84,13 +105,13 @@ class ClosedLoop(AbstractValidation):
     every: int = 4
     progress: Callable[[int, int], None] = lambda done, total: None
 
-    def measure(self, module: PilotNet) -> dict[str, Any]:
+    def measure(self, module: PilotNet) -> Measured:
         """Drive; return mean error, drives departed, and the error of each route."""
         card = self.card(module)
         errors = route_errors(card)
         return {
-            ERROR: float(np.mean(list(errors.values()))),
-            DEPARTED: count_departed(card),
+            "closed_loop_error_m": float(np.mean(list(errors.values()))),
+            "closed_loop_drives_departed": count_departed(card),
             "routes": errors,
         }
 

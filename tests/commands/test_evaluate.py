@@ -7,8 +7,10 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.roadside import Grey, PaintedEnvironment, PaintedSite, small_grid
+from helpers.shards import write_shard
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.evaluate import Evaluate
@@ -198,9 +200,9 @@ def test_a_training_s_record_is_shown_as_far_as_it_goes():
 
 
 def test_a_training_writes_down_its_data_and_settings(tmp_path):
-    shard = tmp_path / "round_0" / "painted" / "shard_0000"
-    shard.mkdir(parents=True)
-    files.write_json(shard / "shard.json", {"frames": 12})
+    folder = files.make_folder(tmp_path / "round_0" / "painted")
+    frames = np.zeros((12, 2, 2, 3), np.uint8)
+    shard = write_shard(folder / "shard_0000", frames, [0] * 12, [0.0] * 12)
     settings = ImitationSettings({"painted": 12}, seed=5)
     record = training_record(settings, [PaintedSite()], tmp_path, [shard], "train it")
     assert record["data"] == {"round_0/painted": 12}

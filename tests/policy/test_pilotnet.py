@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from helpers.shards import write_shard
 
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
@@ -18,7 +19,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.training.augment import Augmentation
-from mi_nerfattack.training.dataset import FrameDataset, divide_shards, write_shard
+from mi_nerfattack.training.dataset import FrameDataset, divide_shards
 from mi_nerfattack.training.train import TrainSettings, fit_policy
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -191,16 +192,17 @@ SETTINGS = TrainSettings(epochs=4, batch=16, held_out=0.2, seed=3)
 
 @pytest.fixture
 def data(tmp_path, rng):
-    for name, n in (("a", 70), ("b", 58)):
-        write_shard(tmp_path / name, *coloured(n, rng))
-    return FrameDataset.from_folders([tmp_path / "a", tmp_path / "b"])
+    sizes = {"a": 70, "b": 58}
+    return FrameDataset.from_shards(
+        [write_shard(tmp_path / name, *coloured(n, rng)) for name, n in sizes.items()]
+    )
 
 
 def test_dataset_reads_across_shards(tmp_path, rng):
     parts = [coloured(n, rng) for n in (5, 1, 7)]
-    for number, part in enumerate(parts):
-        write_shard(tmp_path / str(number), *part)
-    data = FrameDataset.from_folders([tmp_path / str(i) for i in range(3)])
+    data = FrameDataset.from_shards(
+        [write_shard(tmp_path / str(i), *part) for i, part in enumerate(parts)]
+    )
     rows = np.array([12, 0, 5, 4, 6])
     whole = np.concatenate([part[0] for part in parts])
     np.testing.assert_array_equal(data.read_frames(rows), whole[rows])
@@ -212,10 +214,9 @@ def test_dataset_reads_across_shards(tmp_path, rng):
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
 def test_many_shards_need_no_more_descriptors(tmp_path, rng):
     """Else 192,000 frames in shards of 64 exceed the usual 1,024 of a process."""
-    for number in range(20):
-        write_shard(tmp_path / str(number), *coloured(1, rng))
+    shards = [write_shard(tmp_path / str(i), *coloured(1, rng)) for i in range(20)]
     before = len(os.listdir("/proc/self/fd"))
-    data = FrameDataset.from_folders([tmp_path / str(i) for i in range(20)])
+    data = FrameDataset.from_shards(shards)
     assert data.read_frames(np.arange(20)).any() and data.digest
     assert len(os.listdir("/proc/self/fd")) == before
 
@@ -232,7 +233,7 @@ def test_split_keeps_blocks_together():
 
 
 def test_shards_are_held_out_by_themselves(tmp_path, rng):
-    shards = [tmp_path / f"{number}" for number in range(60)]
+    shards = [tmp_path / f"{number}.safetensors" for number in range(60)]
     for shard in shards:
         frames, goals, controls = coloured(3, rng)
         write_shard(shard, frames[:, :2, :2], goals, controls)
@@ -247,7 +248,7 @@ def test_shards_are_held_out_by_themselves(tmp_path, rng):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.999])
 def test_the_first_shards_are_never_all_on_one_side(tmp_path, rng, fraction):
-    shards = [tmp_path / name for name in "abc"]
+    shards = [tmp_path / f"{name}.safetensors" for name in "abc"]
     for shard in shards:
         frames, goals, controls = coloured(3, rng)
         write_shard(shard, frames[:, :2, :2], goals, controls)
@@ -261,18 +262,26 @@ def test_dataset_errors(tmp_path, rng):
         write_shard(tmp_path / "x", frames, goals[:2], controls)
     with pytest.raises(InputError, match="row 1 is nan"):
         write_shard(tmp_path / "x", frames, goals, [0, np.nan, 0, 0])
-    with pytest.raises(InputError, match="no folders"):
-        FrameDataset.from_folders([])
-    with pytest.raises(InputError, match=r"absent.*frames.npy"):
-        FrameDataset.from_folders([tmp_path / "absent"])
-    write_shard(tmp_path / "x", frames, goals, controls)
-    path = tmp_path / "x" / "frames.npy"
+    with pytest.raises(InputError, match="no shards"):
+        FrameDataset.from_shards([])
+    with pytest.raises(InputError, match=r"absent.*does not exist"):
+        FrameDataset.from_shards([tmp_path / "absent"])
+    path = write_shard(tmp_path / "x", frames, goals, controls)
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(InputError, match=r"frames.npy: cannot be read"):
-        FrameDataset.from_folders([tmp_path / "x"])
-    np.save(path, frames.astype(np.float32))
-    with pytest.raises(InputError, match=r"float32.*uint8"):
-        FrameDataset.from_folders([tmp_path / "x"])
+    with pytest.raises(InputError, match=r"x.safetensors: damaged or truncated"):
+        FrameDataset.from_shards([path])
+    whole = {"frames": frames, "goals": goals, "controls": controls}
+    for change, message in (
+        ({"frames": frames.astype(np.float32)}, r"frames F32.*U8 of shape"),
+        ({"goals": goals.astype(np.int32)}, "goals int32"),
+        ({"goals": goals[:2]}, "4 frames, but 2 goals and 4 controls"),
+    ):
+        files.write_safetensors(path, whole | change)
+        with pytest.raises(InputError, match=message):
+            FrameDataset.from_shards([path])
+    files.write_safetensors(path, {"goals": goals})
+    with pytest.raises(InputError, match="no tensor 'frames'"):
+        FrameDataset.from_shards([path])
 
 
 def test_augmentation_limits_and_identity():
@@ -344,13 +353,13 @@ def test_training_continues_after_an_interruption(data, tmp_path):
     assert continued == history
     for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(InputError, match=r"other settings or data \(settings\)"):
+    with pytest.raises(InputError, match=r"settings.seed: 3 -> 4"):
         train(data, dataclasses.replace(SETTINGS, seed=4), checkpoint=path)
     frames = 255 - data.read_frames(np.arange(len(data)))
     other = dataclasses.replace(data, frames=(frames,))
-    with pytest.raises(InputError, match=r"data \(rows, held_out\)"):
+    with pytest.raises(InputError, match=r"\n  rows: .*\n  held_out: .*\n"):
         train(other, checkpoint=path)
-    with pytest.raises(InputError, match=r"data \(start\)"):
+    with pytest.raises(InputError, match=r"\n  start: .*\n"):
         fit_policy(PilotNet(), data, SETTINGS, checkpoint=path)
 
 

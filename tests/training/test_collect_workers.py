@@ -63,7 +63,7 @@ def test_killed_collection_continues_without_gaps_or_duplicates(tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, str(script)], env=environment)
     deadline = time.monotonic() + 120
-    while len(list(part.rglob("shard.json"))) < 3 and process.poll() is None:
+    while len(list(part.rglob("shard_*.safetensors"))) < 3 and process.poll() is None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     children = subprocess.run(
@@ -75,7 +75,7 @@ def test_killed_collection_continues_without_gaps_or_duplicates(tmp_path):
     while any(is_alive(pid) for pid in pids):  # they notice that it has gone
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    done = len(list(part.rglob("shard.json")))
+    done = len(list(part.rglob("shard_*.safetensors")))
     assert 3 <= done < settings().shards
     collect(PaintedSite(), routes, Scattered(), settings(), part, InThisProcess())
     for path in part.rglob(".*.tmp"):  # of the killed writers

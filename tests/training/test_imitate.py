@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.roadside import PaintedSite, bent, flat_ground, small, straight
+from helpers.shards import write_shard
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.train import Train
@@ -23,7 +24,8 @@ from mi_nerfattack.policy.exported.program import export_program
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
 from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.system.workers import InThisProcess
-from mi_nerfattack.training.dataset import FrameDataset, write_shard
+from mi_nerfattack.training.collect import find_shards
+from mi_nerfattack.training.dataset import FrameDataset
 from mi_nerfattack.training.imitate import _check, imitate
 from mi_nerfattack.training.presets import PRESETS, find_preset
 from mi_nerfattack.training.settings import ImitationSettings
@@ -98,10 +100,10 @@ def test_a_collection_of_its_own_is_held_out(tmp_path):
     stages = []
     imitate([SITE], ROUTES, settings, tmp_path, HERE, lambda *at: stages.append(at[0]))
     assert "held_out, mitsuba" in stages
-    shards = [
-        tmp_path / name / "mitsuba" / "shard_0000" for name in ("round_0", "held_out")
-    ]
-    one, other = (FrameDataset.from_folders([shard]) for shard in shards)
+    one, other = (
+        FrameDataset.from_shards(find_shards(tmp_path / name))
+        for name in ("round_0", "held_out")
+    )
     assert not np.array_equal(one.controls, other.controls)
 
 
@@ -269,14 +271,18 @@ def test_goals_cameras_and_weights_must_fit(tmp_path):
 @pytest.mark.parametrize(
     ("size", "goal", "message"),
     [
-        ((100, 50), 0, "other: frames of 100 x 50 px; PilotNet takes 200 x 66"),
-        ((200, 66), 2, "other: goals: 2 to 2; at least 0 and below 2"),
+        (
+            (100, 50),
+            0,
+            "frames of 100 x 50 px; PilotNet takes 200 x 66",
+        ),
+        ((200, 66), 2, "goals: 2 to 2; at least 0 and below 2"),
     ],
 )
 def test_earlier_frames_must_fit(tmp_path, size, goal, message):
-    other = tmp_path / "other"
-    write_shard(other, np.zeros((1, size[1], size[0], 3), np.uint8), [goal], [0.0])
-    with pytest.raises(InputError, match=message):
+    frames = np.zeros((1, size[1], size[0], 3), np.uint8)
+    other = write_shard(tmp_path / "other", frames, [goal], [0.0])
+    with pytest.raises(InputError, match=f"other.safetensors: {message}"):
         imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE, more=[other])
     assert not (tmp_path / "data").exists()  # told before the first frame
 
@@ -298,7 +304,7 @@ def test_an_environment_that_is_not_there_is_told_before_the_first_frame(tmp_pat
 
 
 def test_one_process_works_in_a_folder(tmp_path):
-    partial = tmp_path / "round_0" / ".frames.npy.0123456789ab.tmp"
+    partial = tmp_path / "round_0" / ".shard_0000.safetensors.0123456789ab.tmp"
     files.make_folder(partial.parent)
     partial.touch()  # of a killed writer
     with exclusive(tmp_path), pytest.raises(InputError, match="another process works"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -77,18 +76,20 @@ def test_rounds_of_other_seeds_have_other_frames(tmp_path):
         settings = dataclasses.replace(SETTINGS, seed=seed, dagger_rounds=1)
         imitate([SITE], ROUTES, settings, tmp_path / f"{seed}", HERE)
         for number in (0, 1):
-            name = tmp_path / f"{seed}" / f"round_{number}" / "mitsuba/manifest.json"
-            frames[seed, number] = files.read_json(name)["settings"]["seed"]
-            path = tmp_path / f"{seed}" / f"checkpoint_{number}.safetensors"
-            about = json.loads(files.read_safetensors(path)[1]["run"])
-            order[seed, number] = about["settings"]["seed"]
+            shard = f"round_{number}/mitsuba/shard_0000.safetensors"
+            for name, seeds in (
+                (shard, frames),
+                (f"checkpoint_{number}.safetensors", order),
+            ):
+                _, about = files.read_safetensors(tmp_path / f"{seed}" / name)
+                seeds[seed, number] = about["settings.seed"]
     assert len(set(frames.values())) == len(set(order.values())) == 4
 
 
 def test_weights_to_start_with_are_not_those_of_the_run_before(tmp_path):
     settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
     imitate([SITE], ROUTES, settings, tmp_path, HERE)
-    with pytest.raises(InputError, match=r"checkpoint_0.*data \(start\); remove it"):
+    with pytest.raises(InputError, match=r"checkpoint_0.*\n  start: .* -> .*\nrestore"):
         imitate([SITE], ROUTES, settings, tmp_path, HERE, start=PilotNet(2))
 
 
