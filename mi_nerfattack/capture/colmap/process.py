@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import sys
 import threading
 from pathlib import Path
@@ -66,8 +65,8 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
     suffix = Path(names[0]).suffix
     binary = suffix == ".bin"
     size = sum((work / name).stat().st_size for name in names)
-    _limit(resource.RLIMIT_CPU, 20 + size // 1_000_000)
-    _limit(resource.RLIMIT_AS, (4 << 30) + 10 * size)
+    _limit("RLIMIT_CPU", 20 + size // 1_000_000)
+    _limit("RLIMIT_AS", (4 << 30) + 10 * size)
     for part in PARTS:
         (folder / f"{part}{suffix}").write_bytes(bytes(8) if binary else b"")
     model, images = pycolmap.Reconstruction(), []
@@ -94,7 +93,12 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
     return {"cameras": cameras, "images": images}
 
 
-def _limit(kind: int, most: int) -> None:
+def _limit(name: str, most: int) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows has no limits of this kind
+        return
+    kind = getattr(resource, name)
     _, hard = resource.getrlimit(kind)
     if hard == resource.RLIM_INFINITY or most < hard:
         resource.setrlimit(kind, (most, hard))
