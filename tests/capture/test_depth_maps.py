@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers.posed_folders import write_transforms
-from helpers.sphere_views import BOX, RADIUS, sphere_views, write_folder
+from helpers.sphere_views import RADIUS, sphere_views, write_folder
 from PIL import Image
 
 from mi_nerfattack.capture.inputs import depth_points, find_bounds, read_depth
@@ -20,8 +20,6 @@ from mi_nerfattack.capture.transforms import (
     read_images,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridLayout
-from mi_nerfattack.fit.fit import FitOptions, fit_grid
 from mi_nerfattack.fit.loss import LossWeights, _geometry_loss
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.distortion import distort
@@ -162,20 +160,6 @@ def test_unknown_depth_has_no_loss():
         unknown = values.numpy()[:2]
         assert not unknown.any() and not np.isnan(unknown).any()
         assert values[2] != 0
-
-
-def test_fit_to_depth_that_is_partly_unknown():
-    images, depth = sphere_views(16)
-    depth[1::2] = np.nan
-    depth[:, :3] = np.nan
-    options = FitOptions(
-        steps=40, batch_rays=512, learning_rate=0.05, occupancy_resolution=16
-    )
-    result = fit_grid(images, *BOX, GridLayout(4, 4, 16), options, depth)
-    assert all(np.isfinite(report.loss) for report in result.history)
-    inside = result.field.density(mi.Point3f(0, 0, RADIUS - 0.05), mi.Bool(True))
-    outside = result.field.density(mi.Point3f(0.45, 0.45, 0.45), mi.Bool(True))
-    assert inside[0] > 5 * outside[0]
 
 
 class TestBoundsFromPoints:

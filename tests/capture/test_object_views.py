@@ -17,6 +17,7 @@ from mi_nerfattack.capture.silhouettes import check_alpha, silhouette_bounds
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.shared import progress
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import GridLayout
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -187,7 +188,6 @@ class TestCommand:
         code, error = self.call(capsys, source, "-o", out, "--resume")
         assert code == 2 and "none.glb: does not exist" in error
 
-    @pytest.mark.slow
     def test_interrupted_fit_to_a_mesh_is_resumed(self, tmp_path, monkeypatch, capsys):
         """It is accepted only if the mesh is rendered to the same bytes again."""
 
@@ -199,6 +199,8 @@ class TestCommand:
         (tmp_path / "box.obj").write_text(box)
         out = tmp_path / "box.safetensors"
         settings = {"views": 9, "size": 24, "steps": 30, "batch_rays": 64}
+        small = GridLayout(2, 4, 8)
+        monkeypatch.setattr("mi_nerfattack.fields.grid.GridLayout", lambda *_: small)
         with monkeypatch.context() as patch:
             patch.setattr(progress.StageBars, "show", interrupt)
             with pytest.raises(KeyboardInterrupt):

@@ -18,7 +18,6 @@ from mi_nerfattack.scenes import bundled
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-@pytest.mark.slow
 def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     from mi_nerfattack.evaluation.metrics import validate
     from mi_nerfattack.fields import load_grid

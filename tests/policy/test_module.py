@@ -11,7 +11,6 @@ from torch import nn
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.goals import NoGoal
 from mi_nerfattack.policy.one_image import OneImage
-from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -55,18 +54,6 @@ def test_networks_may_view_what_they_convolve(rng):
     control, gradient = made.vjp(image, 0, mi.Float(1, 1))
     np.testing.assert_allclose(control, expected, atol=1e-4)
     assert np.any(gradient.numpy())
-
-
-def test_pilotnet_convolves_the_camera_s_memory(rng, monkeypatch):
-    """It is spared the copy, and its numbers are those of the view, to the bit."""
-    network = PilotNet()
-    image = mi.TensorXf(rng.random((2, 66, 200, 3), dtype=np.float32))
-    view = torch.from_numpy(image.numpy()).permute(0, 3, 1, 2).requires_grad_(True)
-    expected = network(view, torch.tensor([1, 1]))
-    (gradient,) = torch.autograd.grad(expected.sum(), view)
-    control, d_image = TorchPolicy(network).vjp(image, 1, mi.Float(1, 1))
-    np.testing.assert_array_equal(control, expected.detach())
-    np.testing.assert_array_equal(d_image, gradient.permute(0, 2, 3, 1))
 
 
 def test_networks_that_write_in_place_change_nothing_of_the_loop(rng):

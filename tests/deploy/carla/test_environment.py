@@ -26,7 +26,6 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.dynamics import Dubins
-from mi_nerfattack.vehicle.expert import LaneFollower
 from mi_nerfattack.vehicle.integrators import RK4
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -104,30 +103,6 @@ def test_a_heading_rate_is_driven(rate):
     speed = np.linalg.norm(np.diff(np.array(states)[:, :2], axis=0), axis=1) / PERIOD
     np.testing.assert_allclose(speed, 5.0, atol=0.2)
     environment.close()
-
-
-def test_the_expert_keeps_the_lane():
-    environment = make(Server())
-    environment.reset(STRAIGHT, np.array([2.0, 0.6, 0.1]))
-    expert, errors = LaneFollower(STRAIGHT), []
-    for _ in range(60):
-        environment.step(float(expert.control(environment.state)[0]))
-        errors.append(STRAIGHT.cross_track_numpy(environment.state)[0])
-    assert abs(errors[-1]) < 0.02
-    environment.close()
-
-
-def test_two_environments_with_one_seed_are_equal():
-    runs = []
-    for _ in range(2):
-        environment = make(Server())
-        frames = [environment.reset(STRAIGHT, seed=3)]
-        frames += [environment.step(math.sin(i)) for i in range(10)]
-        runs.append([(f.image, f.depth, f.camera_to_world) for f in frames])
-        environment.close()
-    for one, two in zip(*runs, strict=True):
-        for a, b in zip(one, two, strict=True):
-            np.testing.assert_array_equal(a, b)
 
 
 def test_a_second_reset_leaves_no_actor_of_the_first():

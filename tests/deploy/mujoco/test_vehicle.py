@@ -127,16 +127,6 @@ def test_another_reset_forgets_the_drive_before():
     np.testing.assert_array_equal(vehicle.state, other.state)
 
 
-def test_two_copies_give_equal_bits():
-    first, second = moving(), moving()
-    for step in range(100):
-        control = 0.3 * math.sin(0.2 * step)
-        first.advance(control)
-        second.advance(control)
-        np.testing.assert_array_equal(first.state, second.state)
-        np.testing.assert_array_equal(first.body_to_world, second.body_to_world)
-
-
 @pytest.mark.parametrize("lag", [0.1, 0.3])
 def test_steering_follows_with_the_stated_lag(lag):
     step = 0.006

@@ -125,19 +125,6 @@ def test_objects_are_behind_recorded_depth_alone(tmp_path, with_depth, is_seen):
     np.testing.assert_array_equal(environment.reset(ROUTE).image, plain.image)
 
 
-def test_two_replays_are_equal(tmp_path):
-    folder = write_folder(tmp_path / "frames", depth=True)
-    runs = []
-    for _ in range(2):
-        environment = replay(folder)
-        frames = [environment.reset(ROUTE, seed=1)]
-        frames += [environment.step(1.0) for _ in range(COUNT - 1)]
-        runs.append(frames)
-    for one, two in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one.image, two.image)
-        np.testing.assert_array_equal(one.depth, two.depth)
-
-
 def test_toml_poses_of_the_camera_and_its_intrinsics(tmp_path):
     write_csv_folder(tmp_path / "frames").joinpath("poses.csv").unlink()
     lines = ["[camera]", "width = 16", "height = 8", "fx = 8.0", "fy = 8.0"]
