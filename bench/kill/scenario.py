@@ -122,5 +122,5 @@ def run_job(folder: Path, output: Path, writer: int) -> None:
     scenario, text = load_scenario(folder / "scenario.toml")
     policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
     with one_thread():
-        Job(scenario, text, folder, policy, output, tell).run(resume=True)
+        Job(scenario, text, policy, output, tell).run(resume=True)
     json.loads(files.read_text(output / "metrics.json"))

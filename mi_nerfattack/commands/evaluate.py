@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
-    from mi_nerfattack.scenario.sections import PolicySection
+    from mi_nerfattack.scenario.policy import AbstractPolicySection
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.vehicle.route.route import Route
 
@@ -138,18 +138,17 @@ class Evaluate:
         """Check everything that can be checked before the first drive."""
         from mi_nerfattack.evaluation.identity import identify
         from mi_nerfattack.evaluation.work import EvaluateWork, check_policy
-        from mi_nerfattack.scenario.build.policy import load_policy
 
-        section, base = self.options.section(self.policy)
+        section = self.options.section(self.policy)
         under = self._environments()
         place, seen = self.where.build(), policy_camera(self.policy)
         if seen is not None:
             place = replace(place, camera=seen[0], mount=seen[1])
         routes, settings = self._routes(place.routes), self._settings()
-        check_policy(load_policy(section, base), place, routes)
-        identities = identify(section, base, place, under, routes, settings)
+        check_policy(section.build(), place, routes)
+        identities = identify(section, place, under, routes, settings)
         return EvaluateWork(
-            section, base, place, under, routes, settings, self.drives, identities
+            section, place, under, routes, settings, self.drives, identities
         )
 
     def _settings(self) -> EvaluateSettings:
@@ -185,7 +184,8 @@ class Evaluate:
         self.where.check(self.environments)
         return parse_conditions(self.environments, self.conditions, self.spp)
 
-    def _workers(self, policy: PolicySection) -> AbstractWorkers:
+    def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
+        from mi_nerfattack.scenario.policy import HttpSection
         from mi_nerfattack.system.workers import (
             InThisProcess,
             Processes,
@@ -193,7 +193,7 @@ class Evaluate:
         )
 
         # a server that keeps a state would mix the drives of several processes
-        alone = "carla" in self.environments or policy.url is not None
+        alone = "carla" in self.environments or isinstance(policy, HttpSection)
         default = 1 if alone else available_cores()
         count = default if self.workers is None else self.workers
         return InThisProcess() if count == 1 else Processes(count)
@@ -207,9 +207,9 @@ def _check_different(option: str, names: tuple[str, ...]) -> None:
 def _training_record(work: EvaluateWork) -> dict[str, Any] | None:
     """Read what training wrote beside the policy; None where it wrote nothing."""
     from mi_nerfattack.commands.shared.training_record import read_record
-    from mi_nerfattack.scenario.scenario import resolve
+    from mi_nerfattack.scenario.policy import PilotNetSection, ProgramSection
 
-    if work.policy.file is None or ".py:" in work.policy.file:
+    if not isinstance(work.policy, PilotNetSection | ProgramSection):
         return None
-    path = resolve(work.policy.file, work.base).with_suffix(".json")
+    path = work.policy.file.file.with_suffix(".json")
     return read_record(path) if path.is_file() else None

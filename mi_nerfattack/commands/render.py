@@ -61,7 +61,7 @@ class Render:
         from mi_nerfattack import variant
         from mi_nerfattack.render.pathtrace.frames import FrameRenderer
         from mi_nerfattack.render.pathtrace.sequence import Shot
-        from mi_nerfattack.scenario.scenario import resolve
+        from mi_nerfattack.scenario.named_file import resolve
 
         is_path = self.path is not None or self.route is not None
         self._check_output(is_path)
@@ -123,7 +123,7 @@ class Render:
     def _poses(self) -> np.ndarray:
         from mi_nerfattack.capture.camera_path import read_path, route_path
         from mi_nerfattack.render.camera.intrinsics import CameraMount
-        from mi_nerfattack.scenario.scenario import resolve
+        from mi_nerfattack.scenario.named_file import resolve
         from mi_nerfattack.vehicle.route.route import Route
 
         if self.path is not None:

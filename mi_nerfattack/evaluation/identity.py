@@ -6,17 +6,14 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
-from mi_nerfattack.io import files
-from mi_nerfattack.scenario.scenario import resolve
-from mi_nerfattack.scenario.sections import PolicySection
-from mi_nerfattack.scenario.user_code import split_reference
+from mi_nerfattack.scenario.named_file import NamedFile
+from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.vehicle.route.route import Route
 
 FORMAT = "mi_nerfattack evaluated drive 2"
@@ -44,8 +41,7 @@ class EnvironmentUnder:
 
 
 def identify(
-    policy: PolicySection,
-    base: Path,
+    policy: AbstractPolicySection,
     place: Place,
     environments: Sequence[EnvironmentUnder],
     routes: Sequence[Route],
@@ -55,7 +51,6 @@ def identify(
 
     Args:
         policy: as of `EvaluateWork`, and so are the others.
-        base: likewise.
         place: likewise.
         environments: likewise.
         routes: likewise.
@@ -69,7 +64,7 @@ def identify(
     """
     shared = {
         "format": FORMAT,
-        "policy": _digest("policy", policy_content(policy, base)),
+        "policy": _digest("policy", policy_content(policy)),
         **{f"version.{name}": value for name, value in versions().items()},
     }
     worlds = {
@@ -98,12 +93,13 @@ def _route_content(route: Route) -> list[Any]:
     return [*values, route.points.tolist()]
 
 
-def policy_content(policy: PolicySection, base: Path) -> dict[str, Any]:
+def policy_content(policy: AbstractPolicySection) -> dict[str, Any]:
     """Return what a policy's section says as JSON, files by their checksums."""
     values = policy.model_dump(mode="json", exclude_defaults=True)
-    for key in ("file", "weights_file"):
-        if key in values:
-            values[f"{key}_sha256"] = reference_digest(values.pop(key), base)
+    for (key, *_), value in policy.leaves():
+        if isinstance(value, NamedFile):
+            values.pop(str(key))
+            values[f"{key}_sha256"] = value.content()["sha256"]
     return values
 
 
@@ -115,14 +111,6 @@ def _digest(name: str, value: Any) -> str:
 
 def _sha256(raw: bytes) -> str:
     return hashlib.sha256(raw).hexdigest()
-
-
-def reference_digest(reference: str, base: Path) -> str:
-    """Return the SHA-256 of a policy's file: ``FILE`` or ``FILE.py:NAME``."""
-    named = ".py:" in reference
-    file, name = split_reference(reference) if named else (reference, "")
-    raw = files.read_bytes(resolve(file, base), files.MAX_TENSOR_BYTES)
-    return _sha256(raw + name.encode())
 
 
 def short_digest(identity: Mapping[str, str]) -> str:

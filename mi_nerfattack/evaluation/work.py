@@ -40,8 +40,7 @@ from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.rollout.drive import Drive, departure_limits
-from mi_nerfattack.scenario.build.policy import load_policy
-from mi_nerfattack.scenario.sections import PolicySection
+from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.system.workers import (
     AbstractWork,
     AbstractWorkers,
@@ -79,7 +78,6 @@ class EvaluateWork(AbstractWork):
 
     Args:
         policy: that drives, as a scenario describes it.
-        base: folder that its relative paths start from.
         place: where.
         environments: with different labels.
         routes: with different names.
@@ -88,8 +86,7 @@ class EvaluateWork(AbstractWork):
         identities: of the drives of each environment and route, see `identify`.
     """
 
-    policy: PolicySection
-    base: Path
+    policy: AbstractPolicySection
     place: Place
     environments: tuple[EnvironmentUnder, ...]
     routes: tuple[Route, ...]
@@ -170,8 +167,8 @@ class EvaluateWork(AbstractWork):
         if CARLA in names:  # not the machine that it runs on
             where.append(f"CARLA's {place.server.partition('/')[2] or 'loaded town'}")
         return {
-            "policy": _relative(self.policy.file or self.policy.url or ""),
-            "policy_section": policy_content(self.policy, self.base),
+            "policy": _relative(self.policy.source),
+            "policy_section": policy_content(self.policy),
             "place": where,
             "routes": [route.name for route in self.routes],
             "environments_under": {
@@ -201,7 +198,7 @@ class Opened:
 
     def __init__(self, work: EvaluateWork) -> None:
         self._work = work
-        self._policy = load_policy(work.policy, work.base)
+        self._policy = work.policy.build()
         site = PlaceSite(work.environments[0].name, work.place)
         self._objects = site.load_objects(work.settings.objects)
         self._ground = site.load_ground()

@@ -16,9 +16,8 @@ from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.run_folder import RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages
 from mi_nerfattack.rollout.drive import departure_limit
-from mi_nerfattack.scenario.build.attack import build_attack
-from mi_nerfattack.scenario.build.world import World, build_world
 from mi_nerfattack.scenario.scenario import Scenario, portable_text
+from mi_nerfattack.scenario.world import World, build_attack, build_world
 from mi_nerfattack.system.interrupts import held_interrupts
 
 #: Called with a sentence.
@@ -36,7 +35,6 @@ class Job:
     Attributes:
         scenario: what to do.
         text: the scenario file, kept in the run folder.
-        base: folder that the scenario's relative paths start from.
         policy: the policy under test.
         output: the run folder.
         on_progress: told about every time step.
@@ -45,7 +43,6 @@ class Job:
 
     scenario: Scenario
     text: str
-    base: Path
     policy: Any
     output: Path
     on_progress: OnProgress = _quiet
@@ -69,8 +66,8 @@ class Job:
             SetupError: the scenario is deterministic and the variant cannot be.
         """
         started = time.perf_counter()
-        identity = {**versions(), **self.scenario.identity(self.base)}
-        text = portable_text(self.text, self.base)
+        identity = {**versions(), **self.scenario.identity()}
+        text = portable_text(self.scenario, self.text)
         route, seed = self.scenario.scene.route, self.scenario.seed
         strict = self.scenario.attack.deterministic
         with (
@@ -85,7 +82,7 @@ class Job:
 
     def _work(self, folder: RunFolder, account: Account) -> dict[str, Any]:
         """Do what is not done yet."""
-        world = build_world(self.scenario, self.base, self.policy)
+        world = build_world(self.scenario, self.policy)
         departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
         folder.begin()
 

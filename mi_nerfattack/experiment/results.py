@@ -22,7 +22,7 @@ from mi_nerfattack.report.plots.strip import first_person_strip
 from mi_nerfattack.report.table import write_steps
 from mi_nerfattack.rollout.drive import Drive, departure_limit
 from mi_nerfattack.rollout.loop import OnStep
-from mi_nerfattack.scenario.build.world import Appearance, World, object_footprints
+from mi_nerfattack.scenario.world import Appearance, World, object_footprints
 from mi_nerfattack.vehicle.state import to_state
 
 STRIP_FRAMES = 6

@@ -14,7 +14,7 @@ from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.rollout.loop import Trajectory, simulate
 from mi_nerfattack.rollout.sensor import AbstractSensor
-from mi_nerfattack.scenario.build.world import World
+from mi_nerfattack.scenario.world import World
 
 #: Called with stage, steps done, steps in all, and a remark.
 OnProgress = Callable[[str, int, int, str], None]

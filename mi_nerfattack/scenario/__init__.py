@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from mi_nerfattack._lazy import lazy
 
 if TYPE_CHECKING:
-    from .build.policy import load_policy as load_policy
-    from .build.world import World as World
-    from .build.world import build_world as build_world
+    from .policy import PolicySection as PolicySection
+    from .policy import load_policy as load_policy
     from .scenario import Scenario as Scenario
     from .scenario import load_scenario as load_scenario
-    from .sections import PolicySection as PolicySection
+    from .world import World as World
+    from .world import build_world as build_world
 
 __getattr__, __dir__ = lazy(__name__)

@@ -16,18 +16,6 @@ from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
 
 
-def split_reference(reference: str) -> tuple[str, str]:
-    """Split ``FILE.py:NAME`` into file and name.
-
-    Raises:
-        InputError: it has another form.
-    """
-    file, _, name = reference.rpartition(":")
-    if not file.endswith(".py") or not name.isidentifier():
-        raise InputError(f"{reference!r}: must have the form FILE.py:NAME")
-    return file, name
-
-
 def check_trust(key: str, name: str, trusted: bool) -> None:
     """Refuse code that the user has not said to trust.
 

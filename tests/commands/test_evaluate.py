@@ -24,7 +24,7 @@ from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.report.pages.policy import policy_name, summary, training_facts
-from mi_nerfattack.scenario.sections import PolicySection
+from mi_nerfattack.scenario.policy import HttpSection, ProgramSection
 from mi_nerfattack.system.workers import InThisProcess, Processes
 from mi_nerfattack.training.imitate import ImitationSettings
 from mi_nerfattack.training.record import training_record
@@ -252,7 +252,8 @@ def test_a_summary_counts_all_drives():
 
 def test_one_process_asks_a_server_that_may_keep_a_state():
     """It starts anew where step is 0, and cannot tell the drives of two apart."""
-    here, there = PolicySection(file="mine.onnx"), PolicySection(url="http://a:1")
+    here = ProgramSection(kind="onnx", file="mine.onnx")
+    there = HttpSection(kind="http", url="http://a:1")
     assert Evaluate()._workers(there) == InThisProcess()
     assert Evaluate(workers=2)._workers(there) == Processes(2)
     assert Evaluate(workers=3)._workers(here) == Processes(3)
@@ -270,7 +271,7 @@ def test_one_process_asks_a_server_that_may_keep_a_state():
         (["--conditions", "night"], "--conditions: 'night'"),
         (["--conditions", "day:bright"], "--conditions: 'day:bright'"),
         (["--spp", "0"], "spp: 0"),
-        (["--goal", "integer"], "still.py:drive: policy.goals"),
+        (["--goal", "integer"], "still.py:drive: policy.goal: "),
         (["--routes-file", "nothing.json"], "nothing.json: does not exist"),
         (["--scene", "nothing.xml"], "nothing.xml: does not exist"),
         (["--object", "nothing.safetensors"], "nothing.safetensors: does not exist"),

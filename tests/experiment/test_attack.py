@@ -116,13 +116,12 @@ def test_attack_raises_its_objective(scenario_folder):
 def make_attack(scenario_folder):
     from mi_nerfattack.policy.pilotnet import PilotNet
     from mi_nerfattack.policy.torch_policy import TorchPolicy
-    from mi_nerfattack.scenario.build.attack import build_attack
-    from mi_nerfattack.scenario.build.world import build_world
     from mi_nerfattack.scenario.scenario import load_scenario
+    from mi_nerfattack.scenario.world import build_attack, build_world
 
     scenario, _ = load_scenario(scenario_folder / "scenario.toml")
     policy = TorchPolicy(PilotNet.load(scenario_folder / "policy.safetensors"))
-    return build_attack(build_world(scenario, scenario_folder, policy))
+    return build_attack(build_world(scenario, policy))
 
 
 def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_thread):

@@ -98,9 +98,9 @@ def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
     shape = '<shape type="ply"><string name="filename" value="road.ply"/></shape>'
     (mine / "deployment.xml").write_text(xml.replace("<emitter", f"{shape}<emitter"))
     scenario, _ = load_scenario(mine / "scenario.toml")
-    before = scenario.identity(mine)
+    before = scenario.identity()
     mesh.write_text("other")
-    assert resumable.differences(before, scenario.identity(mine)) == [
+    assert resumable.differences(before, scenario.identity()) == [
         "scenario.scene.deployment: the content of deployment.xml has changed"
     ]
 

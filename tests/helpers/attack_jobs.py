@@ -65,7 +65,7 @@ def job(folder, output, change=("", ""), on_progress=None, notices=None):
         text = re.sub(r"(?m)^learning_rate = .*\n", "", text)
     path.write_text(text)
     scenario, text = load_scenario(path)
-    result = Job(scenario, text, folder, TorchPolicy(toy.SmoothPolicy()), output)
+    result = Job(scenario, text, TorchPolicy(toy.SmoothPolicy()), output)
     result.on_progress = on_progress or result.on_progress
     result.on_notice = (notices if notices is not None else []).append
     return result

@@ -15,14 +15,18 @@ from torch import nn
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.http_policy import HttpPolicy
-from mi_nerfattack.scenario.build.policy import load_differentiable, load_policy
-from mi_nerfattack.scenario.sections import PolicySection
+from mi_nerfattack.scenario.policy import (
+    PolicySection,
+    build_differentiable,
+    load_policy,
+)
+from mi_nerfattack.scenario.section import read_section
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def section(**keys):
-    return PolicySection.model_validate({"trust_code": True, **keys})
+    return {"trust_code": True, **keys}
 
 
 def camera(n, rng):
@@ -54,7 +58,9 @@ def test_black_boxes_refuse_gradients_by_name(tmp_path, rng):
         lambda: policy.vjp(image, 0, mi.Float(1)),
         lambda: policy.step_vjp(image, 0, memory, mi.Float(1), ()),
         lambda: policy.step_jvp(image, 0, memory, image, ()),
-        lambda: load_differentiable(found, tmp_path),
+        lambda: build_differentiable(
+            read_section("policy", PolicySection, found, tmp_path)
+        ),
     ]
     for call in calls:
         with pytest.raises(InputError, match="mine.py:drive: is a black box.*module, "):

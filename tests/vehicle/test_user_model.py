@@ -14,9 +14,9 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import StageSum
-from mi_nerfattack.scenario.build.vehicle import build_dynamics, build_integrator
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
-from mi_nerfattack.scenario.sections import VehicleSection
+from mi_nerfattack.scenario.section import read_section
+from mi_nerfattack.scenario.vehicle import VehicleSection
 from mi_nerfattack.vehicle import (
     RK4,
     Ackermann,
@@ -253,20 +253,25 @@ def folder(tmp_path):
     return tmp_path
 
 
-def custom(name, **keys):
-    values = {"state_size": 4, "control_limit": 1.5, "rest_state": (5.0,), **keys}
-    return VehicleSection(model="custom", function=name, trust_code=True, **values)
+def vehicle(folder=".", **keys):
+    return read_section("vehicle", VehicleSection, keys, folder)
+
+
+def custom(folder, name, framework="drjit", trust=True):
+    values = {"state_size": 4, "control_limit": 1.5, "rest_state": (5.0,)}
+    values |= {"framework": framework, "trust_code": trust}
+    return vehicle(folder, model="custom", function=name, **values).build()
 
 
 def test_models_of_the_section():
-    default = VehicleSection()
-    assert build_dynamics(default) == Dubins(5.0, 1.5)
+    default = vehicle()
+    assert default.build() == Dubins(5.0, 1.5)
     assert default.substeps == 1 and default.delay_steps == 0
-    assert build_integrator(default) == RK4()
+    assert default.build_integrator() == RK4()
     degree = np.pi / 180
 
     def build(model, **keys):
-        return build_dynamics(VehicleSection(model=model, speed_ms=4.0, **keys))
+        return vehicle(model=model, speed_ms=4.0, **keys).build()
 
     assert build("ackermann", wheelbase_m=2.0) == Ackermann(4.0, 2.0, 34 * degree)
     assert build(
@@ -281,7 +286,7 @@ def test_models_of_the_section():
     ("name", "framework"), [("car", "drjit"), ("torch_car", "torch")]
 )
 def test_function_of_a_file(folder, name, framework):
-    dynamics = build_dynamics(custom(f"car.py:{name}", framework=framework), folder)
+    dynamics = custom(folder, f"car.py:{name}", framework)
     np.testing.assert_array_equal(dynamics.extend(np.zeros(3)), [[0, 0, 0, 5]])
     slope = dynamics.derivative(state64([[0], [0], [0], [6]]), rows64([[0.5]])[0])
     np.testing.assert_allclose(slope.numpy()[:, 0], [6, 0, 0.5, 2])
@@ -289,15 +294,14 @@ def test_function_of_a_file(folder, name, framework):
 
 
 def test_function_without_the_word_of_trust(folder):
-    section = custom("car.py:car").model_copy(update={"trust_code": False})
     with pytest.raises(InputError, match="vehicle.function: car.py.*trust_code = true"):
-        build_dynamics(section, folder)
+        custom(folder, "car.py:car", trust=False)
 
 
 def test_function_of_a_module(folder, monkeypatch):
     (folder / "own_cars.py").write_text(FILE)
     monkeypatch.syspath_prepend(str(folder))
-    assert build_dynamics(custom("own_cars:car")).state_size == 4
+    assert custom(folder, "own_cars:car").state_size == 4
 
 
 @pytest.mark.parametrize(
@@ -324,7 +328,7 @@ def test_functions_that_are_refused(folder, monkeypatch, name, framework, words)
     (folder / "broken.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(str(folder))
     with pytest.raises(InputError, match=words):
-        build_dynamics(custom(name, framework=framework), folder)
+        custom(folder, name, framework)
 
 
 SCENARIO = """\
@@ -335,7 +339,7 @@ deployment = "a"
 routes = "a"
 route = "right"
 [policy]
-file = "a"
+file = "a.onnx"
 [[objects]]
 id = "one"
 field = "a"
@@ -361,7 +365,11 @@ def load(folder, text):
         ('"custom"', '"dubins"', r":15: vehicle.function: has no meaning with model"),
         ('function = "car.py:car"\n', "", r"vehicle.function: is missing; model"),
         ("control_limit = 1.5\n", "", r"vehicle.control_limit: is missing"),
-        ("car.py:car", "car.py", r":15: vehicle.function: .*pattern"),
+        (
+            "car.py:car",
+            "car.py",
+            r":15: vehicle.function: must have the form FILE.py:NAME",
+        ),
         ("= 1.5", "= -1.5", r":16: vehicle.control_limit: "),
         ("= 4", "= 2", r":17: vehicle.state_size: .*greater than or equal to 3"),
         ("= 4", "= 5", r":18: vehicle.rest_state: has 1 numbers; .* needs 2 or none"),
@@ -387,13 +395,14 @@ def test_stiff_steering_is_taken_with_enough_substeps(folder):
 
 
 def test_digest_and_text_follow_the_function(folder):
-    (folder / "a").write_text("a")
-    first = load(folder, SCENARIO).digest(folder)
-    text = portable_text(SCENARIO, folder)
+    for name in ("a", "a.onnx"):
+        (folder / name).write_text("a")
+    first = load(folder, SCENARIO).digest()
+    text = portable_text(load(folder, SCENARIO), SCENARIO)
     assert str(folder / "car.py:car") in text
-    assert load(folder, text).digest(folder) == first
+    assert load(folder, text).digest() == first
     (folder / "car.py").write_text(FILE + "# changed\n")
-    assert load(folder, SCENARIO).digest(folder) != first
+    assert load(folder, SCENARIO).digest() != first
     module = SCENARIO.replace("car.py:car", "own.cars:car")
-    assert portable_text(module, folder).count('"own.cars:car"') == 1
-    assert load(folder, module).digest(folder) != first
+    assert portable_text(load(folder, module), module).count('"own.cars:car"') == 1
+    assert load(folder, module).digest() != first

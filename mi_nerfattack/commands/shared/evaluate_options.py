@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from mi_nerfattack.errors import InputError
 
@@ -13,9 +12,8 @@ if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
-    from mi_nerfattack.scenario.sections import PolicySection, Section
+    from mi_nerfattack.scenario.policy import AbstractPolicySection
 
-_Section = TypeVar("_Section", bound="Section")
 #: The policy that is evaluated where none is given.
 BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 
@@ -109,13 +107,14 @@ class PolicyOptions:
     column: int | None = None
     """Column of the control, where the network gives several numbers."""
 
-    def section(self, policy: str | None) -> tuple[PolicySection, Path]:
-        """Return what a scenario's section [policy] would say, and its folder.
+    def section(self, policy: str | None) -> AbstractPolicySection:
+        """Return what a scenario's section [policy] would say.
 
         Raises:
             InputError: an option does not fit, or the TOML file is not usable.
         """
-        from mi_nerfattack.scenario.sections import PolicySection
+        from mi_nerfattack.scenario.policy import PolicySection
+        from mi_nerfattack.scenario.section import read_section
 
         if _is_toml(policy):
             if self != PolicyOptions():
@@ -127,8 +126,8 @@ class PolicyOptions:
             values = _read_toml(policy).get("policy")
             if not isinstance(values, dict):
                 raise InputError(f"{policy}: has no section [policy]")
-            section = _checked(f"{policy}: policy", PolicySection, values)
-            return section, Path(policy).parent
+            name, folder = f"{policy}: policy", Path(policy).parent
+            return read_section(name, PolicySection, values, folder)
         chosen = policy or BUNDLED_POLICY
         values = {
             "url" if chosen.startswith(("http://", "https://")) else "file": chosen,
@@ -140,7 +139,8 @@ class PolicyOptions:
             "control_scale": self.control_scale,
             "output": self.column,
         }
-        return _checked(f"{chosen}: policy", PolicySection, values), Path()
+        values = {key: value for key, value in values.items() if value is not None}
+        return read_section(f"{chosen}: policy", PolicySection, values, Path())
 
 
 def parse_conditions(
@@ -181,13 +181,13 @@ def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
     Raises:
         InputError: the section [camera] is not usable.
     """
-    from mi_nerfattack.scenario.build.camera import build_camera
-    from mi_nerfattack.scenario.sections import CameraSection
+    from mi_nerfattack.scenario.scenario import CameraSection
+    from mi_nerfattack.scenario.section import read_section
 
-    values = _read_toml(policy).get("camera") if _is_toml(policy) else None
-    if values is None:
+    if not _is_toml(policy) or (values := _read_toml(policy).get("camera")) is None:
         return None
-    return build_camera(_checked(f"{policy}: camera", CameraSection, values))
+    name, folder = f"{policy}: camera", Path(policy).parent
+    return read_section(name, CameraSection, values, folder).build()
 
 
 def _is_toml(policy: str | None) -> TypeGuard[str]:
@@ -198,20 +198,3 @@ def _read_toml(policy: str) -> dict[str, Any]:
     from mi_nerfattack.io import files
 
     return files.read_toml(Path(policy))
-
-
-def _checked(name: str, model: type[_Section], values: object) -> _Section:
-    """Return a section of a scenario; `name` is its file's and its own."""
-    from pydantic import ValidationError
-
-    from mi_nerfattack.scenario.sections import explain
-
-    try:
-        return model.model_validate_json(json.dumps(values, default=str))
-    except ValidationError as err:
-        first = err.errors()[0]
-        location, problem = explain(first)
-        where = ".".join([name, *map(str, location)])
-        if first["type"] == "extra_forbidden":
-            problem = "unknown key; remove or correct it"
-        raise InputError(f"{where}: {problem}") from err

@@ -30,31 +30,20 @@ def run_scenario(
     from mi_nerfattack import variant
     from mi_nerfattack.backend.threads import one_thread
     from mi_nerfattack.commands.shared.progress import StageBars
-    from mi_nerfattack.errors import InputError
     from mi_nerfattack.experiment.job import Job
     from mi_nerfattack.report.table import metrics_table
-    from mi_nerfattack.scenario.build.policy import load_differentiable, policy_kind
-    from mi_nerfattack.scenario.scenario import load_scenario, replace_objects
+    from mi_nerfattack.scenario.policy import build_differentiable
+    from mi_nerfattack.scenario.scenario import load_scenario
 
-    scenario, text = load_scenario(path)
-    if object_field is not None:
-        scenario, text = replace_objects(scenario, text, object_field)
-    model = scenario.vehicle.model
-    steered = model not in ("dubins", "custom")
-    if steered and policy_kind(scenario.policy) == "pilotnet":
-        raise InputError(
-            f"{path}: vehicle.model: {model} takes a steering angle in radians, "
-            "PilotNet gives a heading rate in rad/s; use dubins, or a policy of "
-            "another kind"
-        )
+    scenario, text = load_scenario(path, object_field)
     variant.ensure()
-    policy = load_differentiable(scenario.policy, path.parent)
+    policy = build_differentiable(scenario.policy)
     with StageBars() as bars, one_thread():
 
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        job = Job(scenario, text, path.parent, policy, output, show, bars.say)
+        job = Job(scenario, text, policy, output, show, bars.say)
         document = job.run(resume, force)
     if as_json:
         print(json.dumps(document, allow_nan=False))

@@ -13,14 +13,13 @@ from torch import nn
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.exported import load
-from mi_nerfattack.scenario.build.policy import load_policy
-from mi_nerfattack.scenario.sections import PolicySection
+from mi_nerfattack.scenario.policy import load_policy
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def section(**keys):
-    return PolicySection.model_validate({"trust_code": True, **keys})
+    return {"trust_code": True, **keys}
 
 
 def camera(n, rng):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.deploy.path_traced_sensor import PathTracedSensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.fields.splats import read_splats
+from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.interleaved import COMPOSITES
@@ -19,13 +19,11 @@ from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.splats import SplatBackground
 from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
-from mi_nerfattack.scenario.build.camera import build_camera
-from mi_nerfattack.scenario.build.objective import build_objective
-from mi_nerfattack.scenario.build.vehicle import build_dynamics, build_integrator
-from mi_nerfattack.scenario.scenario import Scenario, resolve
+from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -54,7 +52,7 @@ class World:
         fields: grid fields of the objects, in the scenario's order.
         surrogate: sensor in the scene's field.
         deployment: sensor in the path-traced scene.
-        policy: a policy.AbstractPolicy.
+        policy: the policy under test.
         dynamics: the vehicle.
         objective: what an attack makes smaller.
         initial: (runs, 3) initial states, the first one nominal.
@@ -65,7 +63,7 @@ class World:
     fields: list[GridField]
     surrogate: FieldSensor
     deployment: PathTracedSensor
-    policy: Any
+    policy: AbstractPolicy
     dynamics: AbstractDynamics
     objective: AbstractObjective
     initial: np.ndarray
@@ -78,7 +76,7 @@ class World:
             self.policy,
             self.route.goal,
             self.dynamics,
-            build_integrator(vehicle),
+            vehicle.build_integrator(),
             vehicle.dt_s,
             vehicle.substeps,
             vehicle.delay_steps,
@@ -100,46 +98,37 @@ class World:
             field.set_parameter("texture", texture)
 
 
-def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
+def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     """Load all files of a scenario.
 
     Args:
         scenario: from :func:`scenario.load_scenario`.
-        base: folder that relative paths start from.
         policy: the policy under test.
 
     Raises:
         InputError: a file is missing or wrong.
     """
-    scene = _load_surrogate(scenario, base)
-    fields = [load_grid(resolve(item.field, base)) for item in scenario.objects]
+    place = scenario.scene
+    surrogate = _load_surrogate(scenario)
+    fields = [load_grid(item.field.file) for item in scenario.objects]
     posed = [
-        PosedField(
-            field, Pose.upright(item.position_m, np.radians(item.yaw_deg), item.scale)
-        )
+        PosedField(field, item.pose)
         for field, item in zip(fields, scenario.objects, strict=True)
     ]
-    camera, mount = build_camera(scenario.camera)
-    route = Route.from_file(resolve(scenario.scene.routes, base), scenario.scene.route)
-    dynamics = build_dynamics(scenario.vehicle, base)
-    objective = build_objective(scenario, route, dynamics, base)
-    xml = load_scene(resolve(scenario.scene.deployment, base))
+    camera, mount = scenario.camera.build()
+    route = Route.from_file(place.routes.file, place.route)
+    dynamics = scenario.vehicle.build()
+    objective = scenario.objective.build(scenario, route, dynamics)
+    xml = load_scene(place.deployment.file)
     jitter = scenario.seed if scenario.attack.jitter else None
+    composite = COMPOSITES[place.composite]()
+    spp, seed = scenario.deployment.spp, scenario.seed
     return World(
         scenario,
         route,
         fields,
-        FieldSensor(
-            scene,
-            posed,
-            camera,
-            mount,
-            jitter,
-            composite=COMPOSITES[scenario.scene.composite](),
-        ),
-        PathTracedSensor(
-            xml, posed, camera, mount, scenario.deployment.spp, scenario.seed
-        ),
+        FieldSensor(surrogate, posed, camera, mount, jitter, composite=composite),
+        PathTracedSensor(xml, posed, camera, mount, spp, seed),
         policy,
         dynamics,
         objective,
@@ -147,9 +136,33 @@ def build_world(scenario: Scenario, base: str | Path, policy: Any) -> World:
     )
 
 
-def _load_surrogate(scenario: Scenario, base: str | Path) -> Layer:
+def build_attack(world: World) -> GradientAttack:
+    """Make the attack of a scenario, before its first iteration.
+
+    Args:
+        world: what the scenario describes.
+
+    Raises:
+        TypeError: the policy has no derivatives.
+    """
+    scenario, section = world.scenario, world.scenario.attack
+    loop = world.loop(world.surrogate)
+    rollout = Rollout(
+        loop,
+        world.objective,
+        scenario.drive.horizon,
+        scenario.objective.reduction.build(),
+        section.adjoint.build(),
+        section.attached,
+    )
+    poses = initial_states(scenario, world.route, section.poses, 2)
+    freedom = section.freedom.build()
+    return GradientAttack(rollout, world.route, loop.initial(poses), freedom)
+
+
+def _load_surrogate(scenario: Scenario) -> Layer:
     """Load the scene: a field, or splats, which are told by the suffix .ply."""
-    path, matrix = resolve(scenario.scene.field, base), scenario.scene.to_world
+    path, matrix = scenario.scene.field.file, scenario.scene.to_world
     try:
         pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
     except ValueError as err:

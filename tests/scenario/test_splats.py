@@ -163,8 +163,8 @@ height = 6
 @pytest.fixture
 def build(paths):
     """Return a function that builds the world of a scenario text."""
-    from mi_nerfattack.scenario.build.world import build_world
     from mi_nerfattack.scenario.scenario import load_scenario
+    from mi_nerfattack.scenario.world import build_world
 
     folder = Path(paths["wall.ply"]).parent
     points = [[-20.0, 0.0], [60.0, 0.0]]
@@ -176,7 +176,7 @@ def build(paths):
     def inner(text: str) -> Any:
         path = folder / "scenario.toml"
         path.write_text(text)
-        return build_world(load_scenario(path)[0], folder, None)
+        return build_world(load_scenario(path)[0], None)
 
     return inner
 

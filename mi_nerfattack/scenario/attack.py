@@ -1,0 +1,103 @@
+"""The section ``[attack]``: what may change, and the way back through a drive."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.rollout.adjoint import (
+    AbstractAdjoint,
+    Checkpointed,
+    KeptBackgrounds,
+    Replay,
+)
+from mi_nerfattack.scenario.section import Count, Kinds, Positive, Section
+
+Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+class PlainAdjoint(Section):
+    """Costates solved for period by period; each frame is rendered again."""
+
+    adjoint: Literal["replay", "kept_backgrounds"] = "replay"
+
+    def build(self) -> AbstractAdjoint:
+        """Make the way back through a drive."""
+        return KeptBackgrounds() if self.adjoint == "kept_backgrounds" else Replay()
+
+
+class CheckpointedAdjoint(Section):
+    """Segments differentiated one by one."""
+
+    adjoint: Literal["checkpointed"]
+    segment: Count = 16  # control periods between the checkpoints
+
+    def build(self) -> AbstractAdjoint:
+        """Make the way back through a drive."""
+        return Checkpointed(self.segment)
+
+
+class TextureFreedom(Section):
+    """Textures may change."""
+
+    parameters: Literal["texture"] = "texture"
+    learning_rate: Positive = 0.3
+
+    def build(self) -> Freedom:
+        """Say what the attack may change."""
+        return Freedom(self.learning_rate)
+
+
+class AbstractPoseFreedom(Section):
+    """Objects may move."""
+
+    pose_learning_rate: Positive = 0.02  # metres and radians
+    pose_axes: Annotated[tuple[Axis, ...], Field(min_length=1)] = ("x", "y", "yaw")
+    pose_limit_m: Positive = 1.0  # along each axis of the world
+    pose_limit_deg: Positive = 30.0  # about each axis
+
+    def _with(self, texture_rate: float | None) -> Freedom:
+        limit = float(np.radians(self.pose_limit_deg))
+        rate, axes = self.pose_learning_rate, self.pose_axes
+        return Freedom(texture_rate, rate, axes, self.pose_limit_m, limit)
+
+
+class PoseFreedom(AbstractPoseFreedom):
+    """Objects alone may change."""
+
+    parameters: Literal["pose"]
+
+    def build(self) -> Freedom:
+        """Say what the attack may change."""
+        return self._with(None)
+
+
+class BothFreedom(AbstractPoseFreedom):
+    """Textures may change, too."""
+
+    parameters: Literal["both"]
+    learning_rate: Positive = 0.3
+
+    def build(self) -> Freedom:
+        """Say what the attack may change."""
+        return self._with(self.learning_rate)
+
+
+class AttackSection(Section):
+    """How textures and poses are optimised."""
+
+    iterations: Count = 20
+    poses: Count = 1  # initial poses of an iteration; the first is nominal
+    freedom: Annotated[
+        TextureFreedom | PoseFreedom | BothFreedom, Kinds("parameters")
+    ] = Field(default=TextureFreedom(), validation_alias="(freedom)")
+    adjoint: Annotated[PlainAdjoint | CheckpointedAdjoint, Kinds("adjoint")] = Field(
+        default=PlainAdjoint(), validation_alias="(adjoint)"
+    )
+    attached: bool = False
+    jitter: bool = False
+    checkpoint_every: Count = 10
+    deterministic: bool = False  # equal bits from run to run, on one thread

@@ -1,1 +1,0 @@
-"""From the sections of a scenario to world, vehicle, policy and objective."""

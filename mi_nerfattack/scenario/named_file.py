@@ -1,0 +1,151 @@
+"""Files and functions that a scenario names, found once, when it is read."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import PlainSerializer, PlainValidator, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.scenario.user_code import (
+    check_trust,
+    import_function,
+    load_function,
+    module_file,
+)
+
+BUNDLED = "bundled:"
+
+
+@dataclass(frozen=True)
+class NamedFile:
+    """A file, or a function in one.
+
+    Attributes:
+        name: as the scenario says it.
+        path: the file; None of a function of an installed module.
+        function: its name; empty of a file.
+    """
+
+    name: str
+    path: Path | None
+    function: str = ""
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def file(self) -> Path:
+        """The path of what is no function of a module."""
+        assert self.path is not None
+        return self.path
+
+    @property
+    def portable(self) -> str:
+        """The name that means the same in every folder."""
+        if self.path is None or self.name.startswith(BUNDLED):
+            return self.name
+        return ":".join(filter(None, (str(self.path.resolve()), self.function)))
+
+    def load(self, key: str, trusted: bool) -> Callable[..., Any]:
+        """Run the file or import the module, and return the function.
+
+        Args:
+            key: of the file, ``section.key``.
+            trusted: the section's `trust_code`.
+
+        Raises:
+            InputError: see `check_trust`, `load_function` and `import_function`.
+        """
+        check_trust(key, self.name, trusted)
+        if self.path is None:
+            return import_function(self.name)
+        return load_function(self.path, self.function)
+
+    def content(self) -> dict[str, str]:
+        """Return the name without its folder, and the SHA-256 of the content.
+
+        An XML file counts with the files that it names itself, meshes and pictures. Of
+        an installed module, its own source counts; the name where it has none.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
+        if self.path is None:
+            source = module_file(self.name.partition(":")[0])
+            raw = b"" if source is None else _read(source)
+            digest = hashlib.sha256(raw + self.name.encode())
+            return {"file": self.name, "sha256": digest.hexdigest()}
+        raw = _read(self.path)
+        digest = hashlib.sha256(raw + self.function.encode())
+        if self.path.suffix.lower() == ".xml":
+            text = raw.decode("utf-8", "replace")
+            for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
+                if (inner := self.path.parent / name).is_file():
+                    digest.update(hashlib.sha256(_read(inner)).digest())
+        shown = ":".join(filter(None, (self.path.name, self.function)))
+        return {"file": shown, "sha256": digest.hexdigest()}
+
+
+def resolve(name: str, folder: str | Path) -> Path:
+    """Find a file.
+
+    Args:
+        name: ``bundled:FILE``, or a path relative to `folder`.
+        folder: that relative paths start from.
+    """
+    if name.startswith(BUNDLED):
+        from mi_nerfattack.scenes import bundled
+
+        return bundled(name[len(BUNDLED) :])
+    return Path(folder) / Path(name).expanduser()
+
+
+def _file(value: Any, info: ValidationInfo) -> NamedFile:
+    """Find a file; the folder of relative paths is in the validation's context."""
+    if isinstance(value, NamedFile):
+        return value
+    if not isinstance(value, str):
+        raise PydanticCustomError("file", "must be a path, as text")
+    try:
+        return NamedFile(value, resolve(value, (info.context or {}).get("folder", "")))
+    except InputError as err:
+        raise PydanticCustomError("file", "{why}", {"why": str(err)}) from err
+
+
+def _code(value: Any, info: ValidationInfo) -> NamedFile:
+    """Find ``FILE.py:NAME``."""
+    file, _, function = str(value).rpartition(":")
+    if not file.endswith(".py") or not function.isidentifier():
+        raise PydanticCustomError("file", "must have the form FILE.py:NAME")
+    return NamedFile(str(value), _file(file, info).path, function)
+
+
+def _any_code(value: Any, info: ValidationInfo) -> NamedFile:
+    """Find ``FILE.py:NAME`` or ``package.module:NAME``."""
+    module, _, function = str(value).rpartition(":")
+    if module.endswith(".py"):
+        return _code(value, info)
+    if not module or not function.isidentifier():
+        raise PydanticCustomError(
+            "file", "must have the form FILE.py:NAME or package.module:NAME"
+        )
+    return NamedFile(str(value), None)
+
+
+def _read(path: Path) -> bytes:
+    return files.read_bytes(path, files.MAX_TENSOR_BYTES)
+
+
+_NAME = PlainSerializer(str, return_type=str)
+#: Types of keys: a file; ``FILE.py:NAME``; that or ``package.module:NAME``.
+File = Annotated[NamedFile, PlainValidator(_file), _NAME]
+Code = Annotated[NamedFile, PlainValidator(_code), _NAME]
+AnyCode = Annotated[NamedFile, PlainValidator(_any_code), _NAME]

@@ -1,0 +1,391 @@
+"""The section ``[policy]``: the policy under test, one section a kind of file."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, MutableMapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.policy.base import AbstractPolicy
+from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
+from mi_nerfattack.policy.drjit_network import DrJitNetwork
+from mi_nerfattack.policy.exported.load import load_exported, load_torchscript
+from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal, NoGoal, OneHotGoal
+from mi_nerfattack.policy.http_policy import HttpPolicy
+from mi_nerfattack.policy.one_image import OneImage
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.preprocess import (
+    AbstractStage,
+    Crop,
+    FractionalCrop,
+    Normalise,
+    Preprocess,
+    Resize,
+    ToLinear,
+    antialias,
+    area,
+    bilinear,
+    channels_first,
+    channels_last,
+    time_channels_last,
+    time_first,
+    to_bgr,
+    to_grey,
+    to_yuv,
+)
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.policy.weights import load_drjit_state, load_state
+from mi_nerfattack.scenario.named_file import Code, File
+from mi_nerfattack.scenario.section import (
+    Count,
+    Finite,
+    Kinds,
+    Positive,
+    Section,
+    Trust,
+    Whole,
+    read_section,
+    refuse,
+)
+from mi_nerfattack.scenario.user_code import check_trust
+
+FILTERS = {"antialias": antialias, "bilinear": bilinear, "area": area}
+LAYOUTS = {
+    "NCHW": channels_first,
+    "NHWC": channels_last,
+    "NTCHW": time_first,
+    "NTHWC": time_channels_last,
+}
+COLOURS: dict[str, Callable[[], AbstractStage]] = {
+    "linear": ToLinear,
+    "yuv": to_yuv,
+    "grey": to_grey,
+    "bgr": to_bgr,
+}
+#: Kinds by the suffix of the file.
+SUFFIXES = {
+    ".safetensors": "pilotnet",
+    ".py": "module",
+    ".pt2": "exported",
+    ".pt": "torchscript",
+    ".onnx": "onnx",
+}
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise ValueError("must not be 0")
+    return value
+
+
+Part = Annotated[float, Field(ge=0, lt=1)]
+NonZero = Annotated[Finite, AfterValidator(_not_zero)]
+Shapes = tuple[tuple[int, ...], ...]
+
+
+class PreprocessSection(Section):
+    """From the camera's image to the policy's input, in the order of the keys."""
+
+    crop_px: tuple[Whole, Whole, Whole, Whole] | None = None  # see crop_fraction
+    crop_fraction: tuple[Part, Part, Part, Part] | None = None  # top bottom left right
+    resize_px: tuple[Count, Count] | None = None  # width, height
+    filter: Literal["antialias", "bilinear", "area"] = "antialias"
+    colour: Literal["srgb", "linear", "yuv", "grey", "bgr"] = "srgb"
+    scale: Positive = 1.0  # of values in [0, 1]
+    mean: Annotated[tuple[Finite, ...], Field(min_length=1)] = (0.0,)
+    std: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
+    frames: Count = 1  # in the stack
+    stride: Count = 1  # control periods between them
+    layout: Literal["NCHW", "NHWC", "NTCHW", "NTHWC"] = "NCHW"
+
+    @model_validator(mode="after")
+    def _check_crops(self) -> Any:
+        """Refuse two crops."""
+        if self.crop_px is not None and self.crop_fraction is not None:
+            refuse("crop_fraction", "stands beside crop_px; give one of them")
+        return self
+
+    def build(self) -> Preprocess:
+        """Make the stages, in the order of the keys."""
+        stages: list[AbstractStage] = []
+        if self.crop_px is not None:
+            stages.append(Crop(*self.crop_px))
+        if self.crop_fraction is not None:
+            stages.append(FractionalCrop(*self.crop_fraction))
+        if self.resize_px is not None:
+            stages.append(Resize(*self.resize_px, FILTERS[self.filter]))
+        if self.colour != "srgb":
+            stages.append(COLOURS[self.colour]())
+        if (self.scale, self.mean, self.std) != (1.0, (0.0,), (1.0,)):
+            stages.append(Normalise(self.scale, self.mean, self.std))
+        return Preprocess(stages, self.frames, self.stride, LAYOUTS[self.layout])
+
+
+class PlainGoal(Section):
+    """The goal as the kind takes it, or none."""
+
+    goal: Literal["none"] | None = None
+
+    def build(self, default: AbstractGoal) -> AbstractGoal:
+        """Make what passes the goal to a network."""
+        return default if self.goal is None else NoGoal()
+
+
+class NumberedGoal(Section):
+    """One of a number of goals."""
+
+    goal: Literal["integer", "one_hot"]
+    goals: Count
+
+    def build(self, default: AbstractGoal) -> AbstractGoal:
+        """Make what passes the goal to a network."""
+        return (IntegerGoal if self.goal == "integer" else OneHotGoal)(self.goals)
+
+
+class AbstractPolicySection(Section):
+    """What describes every policy."""
+
+    control_scale: NonZero = 1.0  # to rad/s (dubins) or rad, positive to the left
+    output: Whole | None = None  # column of the control, where there are several
+    preprocess: PreprocessSection = PreprocessSection()
+    trust_code: Trust = False  # of files that are code: they run with all rights
+
+    @property
+    def source(self) -> str:
+        """The file or URL, as it is given."""
+        return next(str(v) for (key, *_), v in self.leaves() if key in ("file", "url"))
+
+    @abstractmethod
+    def build(self) -> AbstractPolicy:
+        """Make the policy.
+
+        Raises:
+            InputError: a file is missing or wrong, or is code without the word of
+                trust, or a package that the kind needs is not installed.
+        """
+
+
+class AbstractNetworkSection(AbstractPolicySection):
+    """A network with derivatives."""
+
+    file: File
+    goal: Annotated[PlainGoal | NumberedGoal, Kinds("goal")] = Field(
+        default=PlainGoal(), validation_alias="(goal)"
+    )
+    batch: Literal[1] | None = None  # where it takes one image at a time
+
+    def _policy(
+        self,
+        module: torch.nn.Module,
+        batch: int | None = None,
+        recurrent: Shapes = (),
+        goal: AbstractGoal | None = None,
+    ) -> TorchPolicy:
+        """Join network, goal and preprocessing."""
+        batch = self.batch or batch
+        if batch not in (None, 1):
+            raise InputError(
+                f"{self.source}: takes exactly {batch} images at a time; export it "
+                "with a free batch size, or for one image"
+            )
+        return TorchPolicy(
+            module if batch is None else OneImage(module, recurrent),
+            self.goal.build(goal or NoGoal()),
+            self.preprocess.build(),
+            recurrent,
+            self.control_scale,
+            self.output,
+            self.source,
+        )
+
+    def _made(self, kind: Any, wanted: str) -> Any:
+        """Return the object of ``FILE.py:NAME``, or what calling it gives."""
+        found: Any = self.file.load("policy.file", self.trust_code)
+        if isinstance(found, MutableMapping | torch.nn.Module):
+            result = found  # a finished network of drjit.nn or torch.nn
+        else:
+            try:
+                result = found()
+            except Exception as err:
+                if is_interrupt(err):
+                    raise
+                raise InputError(
+                    f"{self.source}: calling it without arguments raises "
+                    f"{type(err).__name__}: {err}"
+                ) from err
+        if not isinstance(result, kind):
+            raise InputError(
+                f"{self.source}: gives a {type(result).__name__}; a {wanted} is needed"
+            )
+        return result
+
+
+class PilotNetSection(AbstractNetworkSection):
+    """PilotNet with a goal, of ``mi-nerfattack train``."""
+
+    kind: Literal["pilotnet"] = "pilotnet"
+
+    def build(self) -> AbstractPolicy:
+        """Load the network."""
+        module = PilotNet.load(self.file.file)
+        return self._policy(module, goal=IntegerGoal(module.goals))
+
+
+class ModuleSection(AbstractNetworkSection):
+    """A module of torch, made by Python code."""
+
+    kind: Literal["module"]
+    file: Code
+    weights_file: File | None = None  # .safetensors, or a state dict .pt
+    recurrent: Shapes = ()  # -1 for the vehicles
+
+    def build(self) -> AbstractPolicy:
+        """Run the file and load the weights."""
+        module = self._made(torch.nn.Module, "torch.nn.Module")
+        if self.weights_file is not None:
+            load_state(module, self.weights_file.file)
+        return self._policy(module, recurrent=self.recurrent)
+
+
+class ProgramSection(AbstractNetworkSection):
+    """A network in a file of its own: of torch.export, of torch.jit, in ONNX."""
+
+    kind: Literal["exported", "torchscript", "onnx"]
+    recurrent: Shapes = ()
+
+    def build(self) -> AbstractPolicy:
+        """Load the program."""
+        path, batch = self.file.file, None
+        if self.kind != "onnx":
+            check_trust("policy.file", self.source, self.trust_code)
+        if self.kind == "torchscript":
+            network = load_torchscript(path)
+        else:
+            network = (load_exported if self.kind == "exported" else _load_onnx)(path)
+            batch = network.batch
+        return self._policy(network, batch, self.recurrent)
+
+
+class DrJitSection(AbstractNetworkSection):
+    """A network of ``drjit.nn``, or a function in Dr.Jit operations."""
+
+    kind: Literal["drjit"]
+    file: Code
+    weights_file: File | None = None  # .safetensors
+
+    def build(self) -> AbstractPolicy:
+        """Run the file and load the weights."""
+        network = self._made(Callable, "drjit.nn module or a function")
+        if self.weights_file is not None:
+            load_drjit_state(network, self.weights_file.file)
+        return self._policy(DrJitNetwork(network))
+
+
+class CallableSection(AbstractPolicySection):
+    """A function of images without derivatives."""
+
+    kind: Literal["callable"]
+    file: Code
+
+    def build(self) -> AbstractPolicy:
+        """Load the function."""
+        stages = self.preprocess.build()
+        function, scale = (
+            self.file.load("policy.file", self.trust_code),
+            self.control_scale,
+        )
+        return CallablePolicy(function, self.source, stages, scale, self.output)
+
+
+class HttpSection(AbstractPolicySection):
+    """A server that answers images with controls."""
+
+    kind: Literal["http"]
+    url: str
+    timeout_s: Positive = 10.0  # of an answer
+    retries: Whole = 2
+
+    def build(self) -> AbstractPolicy:
+        """Make the client."""
+        stages, scale = self.preprocess.build(), self.control_scale
+        return HttpPolicy(
+            self.url, self.timeout_s, self.retries, stages, scale, self.output
+        )
+
+
+def _tell_kind(data: Any) -> Any:
+    """Tell the kind by the suffix of the file, where it is left out."""
+    if not isinstance(data, dict):
+        return data
+    file, url = data.get("file"), data.get("url")
+    if (file is None) == (url is None):
+        refuse("file", "give either file or url")
+    if data.get("kind") is not None:
+        return data
+    if file is None:
+        return {**data, "kind": "http"}
+    suffix = ".py" if ".py:" in str(file) else Path(str(file)).suffix.lower()
+    if suffix in SUFFIXES:
+        return {**data, "kind": SUFFIXES[suffix]}
+    if ":" in str(file):
+        refuse(
+            "file",
+            f"{file}: code is given as FILE.py:NAME, with the path of a Python "
+            "file; import modules of a package in such a file",
+        )
+    refuse(
+        "file",
+        f"{file}: its suffix tells no kind; give policy.kind, or one of "
+        f"{', '.join(SUFFIXES)}",
+    )
+
+
+PolicySection = Annotated[
+    PilotNetSection
+    | ModuleSection
+    | ProgramSection
+    | DrJitSection
+    | CallableSection
+    | HttpSection,
+    Kinds("kind"),
+    BeforeValidator(_tell_kind),
+]
+
+
+def load_policy(keys: Mapping[str, Any], folder: str | Path = ".") -> AbstractPolicy:
+    """Make a policy.
+
+    Args:
+        keys: of a section ``[policy]``.
+        folder: that its paths start from.
+
+    Raises:
+        InputError: a key or a file cannot be used, see `AbstractPolicySection.build`.
+    """
+    return read_section("policy", PolicySection, dict(keys), folder).build()
+
+
+def build_differentiable(section: AbstractPolicySection) -> AbstractPolicy:
+    """Make a policy for a gradient method.
+
+    Raises:
+        InputError: see `AbstractPolicySection.build`, or the policy is a black box.
+    """
+    policy = section.build()
+    if not policy.differentiable:
+        raise InputError(
+            f"policy: {section.source}: is a black box, which has no derivatives; a "
+            f"gradient attack takes the kinds {DIFFERENTIABLE_KINDS}"
+        )
+    return policy
+
+
+def _load_onnx(path: Path) -> Any:
+    from mi_nerfattack.policy.onnx.network import load_onnx  # an extra
+
+    return load_onnx(path)

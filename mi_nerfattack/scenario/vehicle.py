@@ -1,0 +1,191 @@
+"""The section ``[vehicle]``: its model, one section each, and its time step."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from mi_nerfattack.scenario.named_file import AnyCode
+from mi_nerfattack.scenario.section import (
+    Count,
+    Finite,
+    Kinds,
+    Positive,
+    Section,
+    Trust,
+    Whole,
+    refuse,
+)
+from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
+from mi_nerfattack.vehicle.bicycle import KinematicBicycle
+from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins
+from mi_nerfattack.vehicle.integrators import (
+    RK4,
+    AbstractIntegrator,
+    ExplicitEuler,
+    ImplicitMidpoint,
+)
+from mi_nerfattack.vehicle.state import to_state
+from mi_nerfattack.vehicle.trial import require_model
+from mi_nerfattack.vehicle.user_model import FunctionDynamics
+
+INTEGRATORS: dict[str, type[AbstractIntegrator]] = {
+    "euler": ExplicitEuler,
+    "rk4": RK4,
+    "implicit_midpoint": ImplicitMidpoint,
+}
+#: Ratio of step and time constant at which the integration of a lag diverges.
+_STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
+#: Vehicles with which a user's model is tried.
+TRIALS = 3
+
+SteerAngle = Annotated[float, Field(gt=0, lt=90)]
+
+
+class AbstractVehicleSection(Section):
+    """What all vehicles have: a control period, divided into integration steps."""
+
+    integrator: Literal["euler", "rk4", "implicit_midpoint"] = "rk4"
+    dt_s: Positive = 0.1  # control period
+    substeps: Count = 1  # integration steps a control period
+    delay_steps: Whole = 0  # integration steps
+    width_m: Positive = 1.8
+
+    @abstractmethod
+    def build(self) -> AbstractDynamics:
+        """Make the model; a variant must be set for a custom one.
+
+        Raises:
+            InputError: a function cannot be loaded, or is no model of a vehicle.
+        """
+
+    def build_integrator(self) -> AbstractIntegrator:
+        """Make the time step."""
+        return INTEGRATORS[self.integrator]()
+
+
+class DubinsSection(AbstractVehicleSection):
+    """Controlled by its heading rate."""
+
+    model: Literal["dubins"] = "dubins"
+    speed_ms: Positive = 5.0
+    max_heading_rate: Positive = 1.5
+
+    def build(self) -> AbstractDynamics:
+        """Make the model."""
+        return Dubins(self.speed_ms, self.max_heading_rate)
+
+
+class AckermannSection(AbstractVehicleSection):
+    """Controlled by its steering angle."""
+
+    model: Literal["ackermann"]
+    speed_ms: Positive = 5.0
+    wheelbase_m: Positive = 2.7
+    max_steer_deg: SteerAngle = 34.0
+
+    def build(self) -> AbstractDynamics:
+        """Make the model."""
+        steer = float(np.radians(self.max_steer_deg))
+        return Ackermann(self.speed_ms, self.wheelbase_m, steer)
+
+
+class AckermannRateSection(AbstractVehicleSection):
+    """Controlled by a steering angle that it follows with a lag."""
+
+    model: Literal["ackermann_rate"]
+    speed_ms: Positive = 5.0
+    wheelbase_m: Positive = 2.7
+    max_steer_deg: SteerAngle = 34.0
+    max_steer_rate_deg_s: Positive = 40.0
+    steer_time_s: Positive = 0.1  # time constant of the steering's lag
+
+    @model_validator(mode="after")
+    def _check_steps(self) -> Any:
+        """Refuse steps that oscillate."""
+        step, limit = self.dt_s / self.substeps, _STABLE_RATIO[self.integrator]
+        if step / self.steer_time_s >= limit:
+            refuse(
+                "steer_time_s",
+                f"integration steps of dt_s / substeps = {step:g} s diverge "
+                f"with {self.integrator}: they must be below {limit:g} x "
+                f"{self.steer_time_s:g} s; raise substeps",
+            )
+        return self
+
+    def build(self) -> AbstractDynamics:
+        """Make the model."""
+        steer, rate = np.radians([self.max_steer_deg, self.max_steer_rate_deg_s])
+        return RateLimitedAckermann(
+            self.speed_ms, self.wheelbase_m, steer, rate, self.steer_time_s
+        )
+
+
+class BicycleSection(AbstractVehicleSection):
+    """Controlled by its steering angle, about its centre of gravity."""
+
+    model: Literal["bicycle"]
+    speed_ms: Positive = 5.0
+    front_axle_m: Positive = 1.35  # from the centre of gravity
+    rear_axle_m: Positive = 1.35
+    max_steer_deg: SteerAngle = 34.0
+
+    def build(self) -> AbstractDynamics:
+        """Make the model."""
+        steer = float(np.radians(self.max_steer_deg))
+        return KinematicBicycle(
+            self.speed_ms, self.front_axle_m, self.rear_axle_m, steer
+        )
+
+
+class CustomSection(AbstractVehicleSection):
+    """A function of the user's."""
+
+    model: Literal["custom"]
+    function: AnyCode
+    trust_code: Trust = False  # it runs with all rights of the account
+    framework: Literal["drjit", "torch"] = "drjit"  # of the function
+    state_size: Annotated[int, Field(ge=3, le=16)] = 3
+    control_limit: Positive  # in the unit of the function's control
+    rest_state: tuple[Finite, ...] = ()  # initial values of the rows after theta
+
+    @model_validator(mode="after")
+    def _check_rest(self) -> Any:
+        """Refuse initial values of too many or too few rows."""
+        if len(self.rest_state) not in (0, self.state_size - 3):
+            refuse(
+                "rest_state",
+                f"has {len(self.rest_state)} numbers; state_size = "
+                f"{self.state_size} needs {self.state_size - 3} or none",
+            )
+        return self
+
+    def build(self) -> AbstractDynamics:
+        """Load the function, and try it near the origin and the initial state."""
+        kind = FunctionDynamics
+        if self.framework == "torch":
+            from mi_nerfattack.vehicle.torch_model import TorchDynamics as kind
+        function = self.function.load("vehicle.function", self.trust_code)
+        limit = self.control_limit
+        dynamics = kind(function, self.state_size, limit, self.rest_state)
+        rng = np.random.default_rng(0)
+        states = dynamics.extend(rng.normal(size=(TRIALS, 3)))
+        # Off the initial values of the other rows: there a model may have a kink.
+        states[:, 3:] += 1e-3 * rng.uniform(0.5, 1, (TRIALS, self.state_size - 3))
+        state = to_state(states)
+        control = type(state[0])(limit * rng.uniform(0.1, 0.5, TRIALS))
+        require_model(dynamics.name, dynamics, state, control)
+        return dynamics
+
+
+VehicleSection = Annotated[
+    DubinsSection
+    | AckermannSection
+    | AckermannRateSection
+    | BicycleSection
+    | CustomSection,
+    Kinds("model"),
+]
