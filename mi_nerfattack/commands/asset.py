@@ -12,8 +12,6 @@ import tyro
 from mi_nerfattack.commands.shared.progress import StageBars
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mi_nerfattack.capture.object_views import ObjectViews
     from mi_nerfattack.fit.options import FitOptions
 
@@ -83,9 +81,8 @@ class Asset:
             finish,
             show_fit,
         )
-        from mi_nerfattack.fields.grid import GridLayout
         from mi_nerfattack.fit.checkpoint import check_unfinished
-        from mi_nerfattack.fit.fit import fit_grid
+        from mi_nerfattack.fit.fit import fit_object
 
         check_output(self.output)
         checkpoint = self.output.with_suffix(".checkpoint.safetensors")
@@ -94,25 +91,14 @@ class Asset:
         variant.ensure()
         with StageBars() as bars:
             found = self._views(bars)
-            # room for the outermost vertices' own cells
-            room = 2.0 / self.resolution * float((found.upper - found.lower).max())
-            result = fit_grid(
-                found.images,
-                found.lower - room,
-                found.upper + room,
-                GridLayout(16, 16, self.resolution),
+            result = fit_object(
+                found,
+                self.resolution,
                 self._options(found.depth is not None),
-                found.depth,
-                progress=partial(show_fit, bars),
-                checkpoint=checkpoint,
-                resume=self.resume,
+                partial(show_fit, bars),
+                checkpoint,
+                self.resume,
             )
-        result.field.info.update(
-            {
-                "provenance.object_lower": _text(found.lower),
-                "provenance.object_upper": _text(found.upper),
-            }
-        )
         provenance = {
             "source": Path(self.source).name,
             "source_unit": found.images.unit,
@@ -192,7 +178,3 @@ class Asset:
         ):
             if value is not None and not allowed:
                 raise InputError(f"--{name}: is for {kind}, not for {self.source}")
-
-
-def _text(vector: np.ndarray) -> str:
-    return " ".join(repr(float(value)) for value in vector)

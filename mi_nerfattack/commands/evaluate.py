@@ -206,8 +206,8 @@ def _check_different(option: str, names: tuple[str, ...]) -> None:
 
 def _training_record(work: EvaluateWork) -> dict[str, Any] | None:
     """Read what training wrote beside the policy; None where it wrote nothing."""
-    from mi_nerfattack.commands.shared.training_record import read_record
     from mi_nerfattack.scenario.policy import PilotNetSection, ProgramSection
+    from mi_nerfattack.training.record import read_record
 
     if not isinstance(work.policy, PilotNetSection | ProgramSection):
         return None

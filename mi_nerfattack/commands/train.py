@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,7 +14,6 @@ from mi_nerfattack.errors import InputError
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.deploy.sites import AbstractSite
-    from mi_nerfattack.training.imitate import Imitated
     from mi_nerfattack.training.presets import Preset
     from mi_nerfattack.training.settings import ImitationSettings
 
@@ -105,15 +104,14 @@ class Train:
         from mi_nerfattack.report.table import card_table
         from mi_nerfattack.system.workers import Processes, available_cores
         from mi_nerfattack.training.imitate import imitate
-        from mi_nerfattack.training.presets import find_preset
-        from mi_nerfattack.training.record import training_record
+        from mi_nerfattack.training.record import training_record, write_trained
         from mi_nerfattack.vehicle.route.route import load_routes
 
         check_output(self.output)
         for suffix in (SUFFIX, ".json"):
             files.check_writable(self.output.with_suffix(suffix))
         variant.ensure()
-        preset = find_preset(self.preset)
+        preset = self._preset()
         place, settings = self._place(preset), self._settings(preset)
         routes = load_routes(place.routes)
         start = None if self.start is None else PilotNet.load(self.start)
@@ -131,7 +129,7 @@ class Train:
             )
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result.shards, command)
-        self._write(result, record)
+        write_trained(self.output, result, record)
         Console().print(card_table(result.card))
         print(f"{self.output}: written; program and validation are beside it")
         return 0
@@ -177,51 +175,40 @@ class Train:
         from mi_nerfattack.training.settings import ImitationSettings
         from mi_nerfattack.training.train import TrainSettings
 
-        def given(mine: object, its: object) -> object:
-            return its if mine is None else mine
-
-        there = EVALUATIONS[preset.place]
-        base = replace(there, runs=self.runs, objects=self.objects)
-        chosen: dict = {
-            name: given(getattr(self, name), getattr(preset, name))
-            for name in (
-                "frames",
-                "validation_frames",
-                "dagger_rounds",
-                "dagger_frames",
-                "dagger_epochs",
-            )
-        }
-        epochs = preset.epochs if self.epochs is None else self.epochs
+        drives = replace(
+            EVALUATIONS[preset.place], runs=self.runs, objects=self.objects
+        )
         return ImitationSettings(
-            **chosen,
+            frames=preset.frames,
+            validation_frames=preset.validation_frames,
+            dagger_rounds=preset.dagger_rounds,
+            dagger_frames=preset.dagger_frames,
+            dagger_epochs=preset.dagger_epochs,
             seed=self.seed,
             validate_every=self.validate_every,
             validate_in=self.validate_in,
             collecting=preset.collecting,
             training=TrainSettings(
-                epochs, self.batch, learning_rate=self.learning_rate
+                preset.epochs, self.batch, learning_rate=self.learning_rate
             ),
-            validation=replace(base, runs=1, objects=0),
-            final=replace(base, seed=1),  # not the drives that chose the best epoch
+            validation=replace(drives, runs=1, objects=0),
+            final=replace(drives, seed=1),  # not the drives that chose the best epoch
         )
+
+    def _preset(self) -> Preset:
+        """Return the preset with what is given in place of its own."""
+        from dataclasses import replace
+
+        from mi_nerfattack.training.presets import find_preset
+
+        names = (
+            "frames validation_frames dagger_rounds dagger_frames dagger_epochs epochs"
+        )
+        given = {name: getattr(self, name) for name in names.split()}
+        given = {name: value for name, value in given.items() if value is not None}
+        return replace(find_preset(self.preset), **given)
 
     def _more(self) -> list[Path]:
         from mi_nerfattack.training.collect import find_shards
 
         return [shard for folder in self.more for shard in find_shards(folder)]
-
-    def _write(self, result: Imitated, record: dict[str, Any]) -> None:
-        from mi_nerfattack.io import files
-        from mi_nerfattack.policy.exported.program import SUFFIX, export_program
-
-        result.module.save(self.output)
-        export_program(result.module, self.output.with_suffix(SUFFIX))
-        document = {
-            "schema": 2,
-            "environments": result.card,
-            "training": result.history,
-            "best_round": result.best_round,
-            **record,
-        }
-        files.write_json(self.output.with_suffix(".json"), document)

@@ -7,6 +7,7 @@ from mi_nerfattack._lazy import lazy
 if TYPE_CHECKING:
     from .fit import fit_grid as fit_grid
     from .fit import fit_ngp as fit_ngp
+    from .fit import fit_object as fit_object
     from .loss import LossWeights as LossWeights
     from .options import FitOptions as FitOptions
     from .options import FitProgress as FitProgress

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.capture.object_views import ObjectViews
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.fields.grid import GridField, GridLayout
@@ -29,8 +30,6 @@ from mi_nerfattack.fit.options import (
 )
 from mi_nerfattack.fit.scores import evaluate
 from mi_nerfattack.fit.training import Training
-
-__all__ = ["FitOptions", "FitProgress", "FitResult", "fit_grid", "fit_ngp"]
 
 _REPORT_EVERY = 25
 _BLACK = -30.0  # raw value of a colour
@@ -140,6 +139,43 @@ def fit_grid(
     )
     training = Training(grid, images, options, depth, box_only=True)
     return _run(training, progress, checkpoint, resume)
+
+
+def fit_object(
+    views: ObjectViews,
+    resolution: int,
+    options: FitOptions,
+    progress: ProgressCallback = no_progress,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> FitResult:
+    """Fit a grid to views of an object, in a box with room around it.
+
+    Args:
+        views: with the object's box, which the field's header keeps.
+        resolution: of the finest level.
+        options: of the fit.
+        progress: called every 25 steps and at the end.
+        checkpoint: see `fit_grid`.
+        resume: continue from `checkpoint`.
+    """
+    # room for the outermost vertices' own cells
+    room = 2.0 / resolution * float((views.upper - views.lower).max())
+    result = fit_grid(
+        views.images,
+        views.lower - room,
+        views.upper + room,
+        GridLayout(16, 16, resolution),
+        options,
+        views.depth,
+        progress,
+        checkpoint,
+        resume,
+    )
+    for name in ("lower", "upper"):
+        corner = " ".join(map(repr, getattr(views, name).tolist()))
+        result.field.info[f"provenance.object_{name}"] = corner
+    return result
 
 
 def _run(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fit.loss import LossWeights
 from mi_nerfattack.fit.scores import ViewScore
@@ -144,6 +146,24 @@ class FitResult:
     steps: int
     exposure: np.ndarray | None = None
     poses: np.ndarray | None = None
+
+    def save(self, path: Path, provenance: Mapping[str, str]) -> None:
+        """Write the field, with what it was fitted to and how well.
+
+        Args:
+            path: field file.
+            provenance: source and settings, for the file's header.
+        """
+        about = {
+            **provenance,
+            "steps": str(self.steps),
+            "held_out": "every 8th image, from the first",
+            "frame": "that of the poses, right-handed",
+            "psnr_heldout_db": f"{self.psnr_heldout_db:.3f}",
+            "ssim_heldout": f"{self.ssim_heldout:.4f}",
+        }
+        self.field.info.update({f"fit.{key}": text for key, text in about.items()})
+        save_field(path, self.field)
 
 
 ProgressCallback = Callable[[FitProgress], None]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.deploy.sites import AbstractSite
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.exported.program import SUFFIX, export_program
 from mi_nerfattack.training.dataset import FramesFile
+from mi_nerfattack.training.imitate import Imitated
 from mi_nerfattack.training.settings import ImitationSettings
 
 
@@ -52,6 +55,46 @@ def training_record(
         },
     }
     return json.loads(json.dumps(record, default=str))
+
+
+def write_trained(path: Path, result: Imitated, record: Mapping[str, Any]) -> None:
+    """Write a policy, and beside it its program and its record.
+
+    Args:
+        path: of the weights (.safetensors).
+        result: of the training.
+        record: see `training_record`.
+    """
+    result.module.save(path)
+    export_program(result.module, path.with_suffix(SUFFIX))
+    document = {
+        "schema": 2,
+        "environments": result.card,
+        "training": result.history,
+        "best_round": result.best_round,
+        **record,
+    }
+    files.write_json(path.with_suffix(".json"), document)
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """Read what training writes beside a policy; None for JSON of something else.
+
+    Raises:
+        InputError: unreadable, or no JSON.
+    """
+    found = files.read_json(path)
+    ours = (
+        isinstance(found, dict)
+        and type(found.get("schema")) is int
+        and isinstance(found.get("training"), list)
+        and all(_is_history(rows) for rows in found["training"])
+    )
+    return found if ours else None
+
+
+def _is_history(rows: Any) -> bool:
+    return isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
 
 
 def _settings(settings: ImitationSettings) -> dict[str, Any]:

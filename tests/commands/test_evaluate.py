@@ -15,7 +15,6 @@ from helpers.shards import write_shard
 from mi_nerfattack import cli
 from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.shared.evaluate_options import PlaceOptions
-from mi_nerfattack.commands.shared.training_record import read_record
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.registry import make_environment
@@ -27,7 +26,7 @@ from mi_nerfattack.report.pages.policy import policy_name, summary, training_fac
 from mi_nerfattack.scenario.policy import HttpSection, ProgramSection
 from mi_nerfattack.system.workers import InThisProcess, Processes
 from mi_nerfattack.training.imitate import ImitationSettings
-from mi_nerfattack.training.record import training_record
+from mi_nerfattack.training.record import read_record, training_record
 
 pytestmark = pytest.mark.usefixtures("variant")
 

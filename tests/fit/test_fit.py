@@ -15,7 +15,7 @@ from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.capture.posed_images import held_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, NGPLayout
-from mi_nerfattack.fit.fit import FitOptions, fit_grid, fit_ngp
+from mi_nerfattack.fit import FitOptions, fit_grid, fit_ngp
 from mi_nerfattack.fit.scores import compare, evaluate
 from mi_nerfattack.fit.training import unpack
 from mi_nerfattack.io import files

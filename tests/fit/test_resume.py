@@ -14,8 +14,8 @@ from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridLayout, NGPLayout
+from mi_nerfattack.fit import FitOptions, FitResult, fit_grid, fit_ngp
 from mi_nerfattack.fit import checkpoint as fit_checkpoint
-from mi_nerfattack.fit.fit import FitOptions, FitResult, fit_grid, fit_ngp
 from mi_nerfattack.fit.loss import LossWeights
 from mi_nerfattack.fit.scores import FieldRenderer
 from mi_nerfattack.io import files
@@ -245,8 +245,8 @@ def test_exposure_of_each_image_is_found():
 
 
 def test_what_is_learned_of_cameras_is_written(tmp_path):
-    from mi_nerfattack.commands.shared.fit_report import write_cameras
     from mi_nerfattack.render.camera.conventions import opengl_to_opencv
+    from mi_nerfattack.report.pages.fit import write_cameras
 
     images, _ = sphere_views(3, alpha=False)
     learned = np.arange(6.0).reshape(2, 3), images.camera_to_world[1:]

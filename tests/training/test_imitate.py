@@ -358,8 +358,8 @@ def test_what_cannot_be_written_is_told_before_the_first_frame(tmp_path, capsys,
 def test_frames_of_rounds_that_are_not_done_need_no_environment():
     """The preset's rounds have surrogate frames, and the room has no field."""
     train = Train(Path("o"), Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)
-    preset = find_preset("laptop")
-    settings, room = train._settings(preset), bundled_place("room")
+    preset, room = train._preset(), bundled_place("room")
+    settings = train._settings(preset)
     assert [site.name for site in train._sites(preset, room, settings)] == ["mitsuba"]
 
 

@@ -125,19 +125,12 @@ def compare_folder(output: Path) -> Path:
 
 def print_comparison(comparison: Comparison, output: Path) -> None:
     """Print a table of the routes, and what it comes to."""
-    import rich.box
     from rich.console import Console
-    from rich.table import Table
 
-    from mi_nerfattack.report.pages.compare import COLUMNS, rows, settings_line, verdict
+    from mi_nerfattack.report.pages.compare import routes_table, settings_line, verdict
 
-    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for i, name in enumerate(COLUMNS):
-        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0)
-    for cells in rows(comparison):
-        table.add_row(*cells)
     console = Console()
-    console.print(table)
+    console.print(routes_table(comparison))
     page = compare_folder(output) / "report.html"
     for line in (settings_line(comparison), verdict(comparison), f"Wrote {page}."):
         console.print(line, soft_wrap=True, highlight=False)

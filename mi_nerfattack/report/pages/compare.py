@@ -7,7 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import rich.box
 from matplotlib.lines import Line2D
+from rich.table import Table
 
 from mi_nerfattack.evaluation.field_and_scene import (
     ComparedFrame,
@@ -196,6 +198,16 @@ COLUMNS = (
     "wrong\n(%)",
     "hazy\n(%)",
 )
+
+
+def routes_table(comparison: Comparison) -> Table:
+    """Return the figures of the routes as a table for a terminal."""
+    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, name in enumerate(COLUMNS):
+        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0)
+    for cells in rows(comparison):
+        table.add_row(*cells)
+    return table
 
 
 def _number(value: float, digits: int) -> str:

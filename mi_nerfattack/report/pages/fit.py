@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
-from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fit.options import FitProgress, FitResult
 from mi_nerfattack.fit.scores import ViewScore, reference, worst_views
 from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.conventions import opencv_to_opengl
 from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.pages.verdict import (
     OBJECT,
@@ -86,8 +88,42 @@ def write_fit_report(
         scores=sorted(result.per_view, key=lambda score: score.psnr_db),
         settings=result.field.metadata(),
     )
+    write_cameras(root / "cameras.json", result, images)
     files.write_text(root / "report.html", text)
     return root / "report.html"
+
+
+def write_cameras(path: Path, result: FitResult, images: PosedImages) -> None:
+    """Write what the fit learned of the cameras, image by image; nothing if nothing.
+
+    Args:
+        path: JSON file: for each fitted image its ``file_path`` and, where learned,
+            ``exposure`` (factors of linear radiance) and ``transform_matrix`` (OpenGL).
+        result: of the fit.
+        images: that were fitted to.
+    """
+    if result.exposure is None and result.poses is None:
+        path.unlink(missing_ok=True)  # of an earlier fit
+        return
+    skipped = set(held_out(len(images)).tolist())
+    names = [name for i, name in enumerate(images.names) if i not in skipped]
+    frames: list[dict[str, object]] = [{"file_path": name} for name in names]
+    for i, frame in enumerate(frames):
+        if result.exposure is not None:
+            frame["exposure"] = result.exposure[i].tolist()
+        if result.poses is not None:
+            frame["transform_matrix"] = opencv_to_opengl(result.poses[i]).tolist()
+    files.write_json(path, {"frames": frames})
+
+
+def scores_table(result: FitResult) -> Table:
+    """Return the scores of the held-out views as a table for a terminal."""
+    table = Table("held-out view", "PSNR dB", "SSIM")
+    for score in sorted(result.per_view, key=lambda score: score.psnr_db):
+        table.add_row(score.name, f"{score.psnr_db:.2f}", f"{score.ssim:.4f}")
+    mean = f"{result.psnr_heldout_db:.2f}", f"{result.ssim_heldout:.4f}"
+    table.add_row("mean", *mean, style="bold")
+    return table
 
 
 def summary(result: FitResult) -> dict[str, Any]:
