@@ -9,22 +9,18 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers.carla_stand_in import Server
 from helpers.recorded_drives import write_folder
 from helpers.tiny_place import write_place
 
 from mi_nerfattack.deploy import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.car import CAR
-from mi_nerfattack.deploy.carla.drivers import KinematicDriver
-from mi_nerfattack.deploy.carla.environment import CarlaEnvironment
-from mi_nerfattack.deploy.carla.session import CarlaServer
 from mi_nerfattack.deploy.gym import FAR_M, DrivingEnv, make_gym
 from mi_nerfattack.deploy.mujoco.opengl import make_context
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import ENVIRONMENTS, kinematic_vehicle
 from mi_nerfattack.deploy.vehicle import checked_pose
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -100,18 +96,6 @@ def test_gymnasiums_checker_passes(name, tmp_path):
     environment.reset(seed=1)
     assert environment.render().shape == (image.height, image.width, 3)
     environment.close()
-
-
-def test_gymnasiums_checker_passes_for_carla_of_the_stand_in():
-    route = Route("straight", 0, np.array([[2.0, 0.0], [90.0, 0.0]]))
-    driver = KinematicDriver(kinematic_vehicle(CAR, 0.1))
-    where, camera = CarlaServer(timeout_s=0.2), from_fov(8, 6, 90.0)
-    environment = CarlaEnvironment(
-        where, camera, CameraMount(), driver, api=Server().api()
-    )
-    driving = DrivingEnv(environment, [route], render_mode="rgb_array")
-    check_env(driving, skip_render_check=True)  # that needs gymnasium.make
-    driving.close()
 
 
 @pytest.mark.parametrize("name", SIMULATED)

@@ -54,12 +54,6 @@ def test_carla_by_name_without_a_server(server):
         make_environment("carla", replace(PLACE, server="127.0.0.1:2001"))
 
 
-def test_carla_is_not_installed(monkeypatch):
-    monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(InputError, match=r"pip install 'mi-nerfattack\[carla\]'"):
-        make_environment("carla", PLACE)
-
-
 def test_carla_equals_its_copy_for_100_steps(server):
     controls = np.random.default_rng(0).normal(0, 0.3, 100)
     runs = []
@@ -91,11 +85,6 @@ def test_gymnasium_accepts_a_recording(tmp_path):
     ends = [env.step(np.zeros(1, np.float32))[3] for _ in range(5)]
     assert ends == [False, False, False, False, True]  # truncated at its end
     env.close()
-
-
-def test_a_place_without_a_recording():
-    with pytest.raises(InputError, match="the place has no recording; give it a"):
-        make_environment("replay", PLACE)
 
 
 DOCS = Path(__file__).parents[2] / "docs" / "environments.md"

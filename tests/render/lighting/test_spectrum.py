@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
+from helpers.variants import MONO, RGB, SPECTRAL
 
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.render.lighting import spectrum
@@ -115,6 +116,7 @@ def test_conversion_is_linear_and_so_is_its_derivative(convert, rng) -> None:
 
 
 @pytest.mark.usefixtures("each_variant")
+@pytest.mark.parametrize("each_variant", RGB + SPECTRAL + MONO, indirect=True)
 def test_mono_is_luminance_and_rgb_stays() -> None:
     spectrum.prepare()
     values = np.array([0.2, 0.5, 0.9])

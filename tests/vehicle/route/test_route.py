@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle import (
@@ -23,9 +20,6 @@ from mi_nerfattack.vehicle import (
 from mi_nerfattack.vehicle.expert import LaneFollower
 
 INTEGRATORS = [ExplicitEuler(), RK4(), ImplicitMidpoint()]
-ROUTES_FILE = Path(__file__).parents[3] / "scenes" / "intersection" / "routes.json"
-
-
 pytestmark = pytest.mark.usefixtures("variant")
 
 
@@ -50,89 +44,7 @@ def lane(lead=15.0, radius=6.0, turn=np.pi / 2, tail=15.0, step=0.5):
     return Route("lane", 0, np.stack([x, sign * y], axis=1))
 
 
-def track(route, states):
-    """Evaluate the Dr.Jit cross-track error of states (n, 3) and its gradient."""
-    state = array64(np.atleast_2d(states).T)
-    dr.enable_grad(state)
-    error = route.cross_track(state)
-    dr.backward(dr.sum(error))
-    return error.numpy(), dr.grad(state).numpy().T
-
-
 STRAIGHT = Route("straight", 0, [[0, 0], [3, 0], [10, 0]])
-
-
-@pytest.mark.parametrize(
-    ("state", "error"),
-    [
-        ([5, 1.5, 0], 1.5),
-        ([5, -1.5, 0], -1.5),
-        ([3, 0, 0], 0.0),
-        ([-4, 0.5, 0], 0.5),
-        ([25, -0.25, 0], -0.25),
-    ],
-)
-def test_cross_track_of_straight(state, error):
-    value, gradient = track(STRAIGHT, state)
-    assert value[0] == pytest.approx(error, abs=1e-15)
-    np.testing.assert_allclose(gradient[0], [0, 1, 0], atol=1e-15)
-    assert STRAIGHT.cross_track_numpy(state)[0] == pytest.approx(error, abs=1e-15)
-
-
-def test_cross_track_of_arc():
-    route = lane(lead=1.0, radius=6.0, step=0.005)
-    angle, offset = np.meshgrid(np.linspace(0.1, 1.4, 9), [-1.0, -0.2, 0.3, 2.0])
-    radius = 6 - offset.ravel()
-    angle = angle.ravel()
-    states = np.stack(
-        [1 + radius * np.sin(angle), 6 - radius * np.cos(angle), angle], axis=1
-    )
-    value, gradient = track(route, states)
-    np.testing.assert_allclose(value, offset.ravel(), atol=1e-6)
-    inward = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    np.testing.assert_allclose(gradient, inward, atol=1e-3)
-    heading = route.heading_error(array64(states.T)).numpy()
-    np.testing.assert_allclose(heading, 0, atol=1e-3)
-
-
-def test_cross_track_at_sharp_bend():
-    """Distance to the vertex outside the bend, also beyond a right angle."""
-    right = Route("bend", 0, [[0, 0], [10, 0], [10, -10]])
-    value, gradient = track(right, [[13, 4, 0], [9, -0.5, 0], [10, 0, 0]])
-    np.testing.assert_allclose(value, [5, -0.5, 0], atol=1e-15)
-    np.testing.assert_allclose(gradient[0], [0.6, 0.8, 0], atol=1e-15)
-    hairpin = Route("hairpin", 0, [[0, 0], [10, 0], [0, 1]])
-    value, _ = track(hairpin, [[10, -2, 0], [10.5, 2, 0], [13, -1, 0], [9, 0.01, 0]])
-    # The bend is to the left: its outside is on the right, so errors are negative.
-    assert (value[:3] < 0).all() and value[3] > 0
-    np.testing.assert_allclose(value[2], -np.hypot(3, 1), atol=1e-12)
-
-
-def test_prolongation_does_not_reach_other_segments():
-    loop = Route("loop", 0, [[0, 0], [10, 0], [10, 10], [5, 10], [5, 5]])
-    # On the prolongation of the last segment, but beside the first one.
-    np.testing.assert_allclose(track(loop, [5, 1, 0])[0], [1.0])
-
-
-@given(st.lists(st.tuples(*[st.floats(-40, 40)] * 2), min_size=1, max_size=20))
-@settings(max_examples=30)
-def test_numpy_equals_drjit(positions):
-    route = Route("z", 0, [[0, 0], [10, 0], [12, 5], [8, 9], [20, 20], [20, 0]])
-    states = np.array([[x, y, 0.1] for x, y in positions])
-    numpy_error = route.cross_track_numpy(states)
-    drjit_error, gradient = track(route, states)
-    np.testing.assert_allclose(np.abs(drjit_error), np.abs(numpy_error), atol=1e-6)
-    np.testing.assert_allclose(np.hypot(*gradient.T[:2]), 1, atol=1e-9)
-
-
-def test_cross_track_gradient_by_central_differences():
-    rng = np.random.default_rng(3)
-    route = lane()
-    states = route.pose_at(rng.uniform(1, 35, 30), rng.normal(size=30), 0.2)
-    step = 1e-6 * rng.normal(size=(30, 3))
-    _, gradient = track(route, states)
-    up, down = track(route, states + step)[0], track(route, states - step)[0]
-    np.testing.assert_allclose((up - down) / 2, (gradient * step).sum(1), atol=1e-11)
 
 
 def test_pose_at_inverts_projection():
@@ -241,11 +153,3 @@ def test_expert_follows_and_recovers(integrator, turn):
     errors = drive(route, integrator, start, 70)
     assert errors[28:].max() < 0.1
     assert errors[-5:].max() < 0.05
-
-
-@pytest.mark.skipif(not ROUTES_FILE.exists(), reason="scene not built")
-@pytest.mark.parametrize("name", ["straight", "right", "left"])
-def test_expert_on_bundled_routes(name):
-    route = Route.from_file(ROUTES_FILE, name)
-    steps = int(route.length / 0.5)
-    assert drive(route, RK4(), route.pose_at(0.0), steps).mean() < 0.03
