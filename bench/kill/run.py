@@ -34,7 +34,14 @@ from bench.kill.scenario import EVERY, HORIZON, WRITING, make_scenario, run_job
 from mi_nerfattack.io import files, locks
 
 _LIFE_S = 300.0  # after which a process is taken to hang
-_AIMS = {"any moment": 8, "start": 2, "checkpoint": 4, "write": 6, "results": 3}
+_AIMS = {
+    "any moment": 8,
+    "start": 2,
+    "drive": 4,
+    "checkpoint": 4,
+    "write": 6,
+    "results": 3,
+}
 # The attack is checked by itself; the attribution is a part of the results, which a
 # resumed run writes anew.
 _NOT_DRIVES = {"surrogate: attack", "surrogate: attribution", WRITING}
@@ -211,6 +218,8 @@ class Campaign:
             stage, done, _ = life.lines[-1]
             if aim == "write":
                 return 0.0 if stage == WRITING else None
+            if aim == "drive":
+                return None if stage in _NOT_DRIVES else draw.uniform(0, 0.02)
             if aim == "results":
                 late = life.done("deployment: gradient") == HORIZON
                 return draw.uniform(0, 0.2 * whole) if late else None
