@@ -219,14 +219,12 @@ class Training:
         for name, value in zip(_STATE, tensors["state"], strict=True):
             setattr(self, name, int(value))
         for name in list(self._values()):
-            old, promoted, rate, _ = self.optimiser.state[name]
+            _, promoted, rate, _ = self.optimiser.state[name]
             kinds = {"first": mi.Float, "second": mi.Float, "time": mi.UInt32}
             first, second, time = (
                 kind(tensors[f"{part}.{name}"].copy()) for part, kind in kinds.items()
             )
             fresh = mi.Float(tensors[f"value.{name}"].copy())
-            if dr.width(fresh) != dr.width(old):
-                raise KeyError(f"value.{name}")
             dr.make_opaque(fresh, first, second)
             dr.enable_grad(fresh)
             moments = (time, first, second, None)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import exr, files
+from mi_nerfattack.io.resumable import differences, refuse
 from mi_nerfattack.io.video import check_fps, write_video
 from mi_nerfattack.render.pathtrace.frames import (
     Frame,
@@ -138,12 +138,9 @@ def _render(
 def check_same(path: str | Path, expected: dict[str, str]) -> None:
     """Raise InputError if an EXR file was not rendered from what `expected` says."""
     present = exr.read_metadata(path)
-    for key in _COMPARED:
-        if present.get(key) != expected[key]:
-            raise InputError(
-                f"{path}: has {key} {present.get(key)!r}, not {expected[key]!r}; "
-                "render without --skip-existing, or to another folder"
-            )
+    kept = {key: present[key] for key in _COMPARED if key in present}
+    found = differences(kept, {key: expected[key] for key in _COMPARED})
+    refuse(path, found, "render without --skip-existing, or to another folder")
 
 
 def _read_srgb(paths: list[Path]) -> Iterator[np.ndarray]:
