@@ -18,7 +18,7 @@ from mi_nerfattack.plugins.properties import (
 )
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.attached import attached
-from mi_nerfattack.render.march import Rays
+from mi_nerfattack.render.rays import Rays
 
 
 class FieldEmitter(mi.Emitter):

@@ -24,7 +24,7 @@ from mi_nerfattack.render.backdrop import only_fields
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
-from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.rays import March, Rays
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):

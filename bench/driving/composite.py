@@ -26,8 +26,8 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.scenes import bundled
 
 PLACE = (2.0, -1.75)  # in the lane; the road is at z = 0

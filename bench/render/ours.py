@@ -16,8 +16,9 @@ from mi_nerfattack.fields import GridField, GridLayout, load_grid
 from mi_nerfattack.render.camera.intrinsics import look_at
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import MAX_INTERVALS, March, Rays, seek
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import Walk
 from mi_nerfattack.scenes import bundled
 
 NGP_PARAMETERS = ("table", "density_weights", "colour_weights")
@@ -168,19 +169,14 @@ def _packed(field: GridField) -> Leaf:
 @dr.syntax
 def count_samples(posed: PosedField, rays: Rays, stop: float) -> mi.UInt32:
     """Count the evaluations of a field along each ray, (n,)."""
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    active = mi.Bool(rays.active) & (near < far)
-    index = dr.floor(posed.lattice_index(near))
+    walk, active = Walk.start(posed, rays)
+    (path,) = walk.paths
     tau = mi.Float(0)  # optical depth so far
     count = mi.UInt32(0)
     while active:
-        index, t, width, active = seek(
-            posed, o, d, index, near, far, rays.jitter, active
-        )
-        count += dr.select(active, 1, 0)
-        density = posed.eval(o + t * d, mi.Vector3f(d), active)[0]
-        tau += dr.select(active, density * width, 0)
-        index += 1
-        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
+        walk, here = walk.next([posed], active)
+        count += dr.select(here.active, 1, 0)
+        density = posed.eval(path.at(here.t), path.heading, here.active)[0]
+        tau += here.depths([density])[0]
+        active = here.active & (dr.exp(-tau) > stop)
     return count

@@ -15,7 +15,7 @@ from mi_nerfattack.experiment.attribution import attribute, write_attribution
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import exr, files
 from mi_nerfattack.render.camera.intrinsics import mount_matrix
-from mi_nerfattack.render.march import March
+from mi_nerfattack.render.rays import March
 from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.plots import drives as plots
 from mi_nerfattack.report.plots.strip import first_person_strip

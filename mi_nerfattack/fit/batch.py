@@ -12,9 +12,9 @@ from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fit.cameras import POSES
 from mi_nerfattack.fit.loss import LossWeights, loss_and_cotangent
 from mi_nerfattack.fit.rays import RayBank, RayBatch
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.sample_count import sample_count
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import sample_count
 
 _PROBE = 2048  # rays that tell how many samples a ray has
 _STEPS_BEHIND = 4  # marching steps that a ray goes on behind a known surface
@@ -172,5 +172,5 @@ def mean_samples(posed: PosedField, source: BatchSource, seed: int) -> float:
     """
     random = mi.PCG32(_PROBE, seed)  # pyright: ignore[reportCallIssue]
     rays = source.draw(random, dr.opaque(mi.UInt32, _PROBE)).rays
-    count = sample_count(posed, rays.origin, rays.direction, rays.t_max, rays.jitter)
+    count = sample_count(posed, rays)
     return float(dr.mean(count)[0])

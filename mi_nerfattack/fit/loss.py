@@ -12,7 +12,7 @@ import mitsuba as mi
 from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.rays import RayBatch
-from mi_nerfattack.render.march import March
+from mi_nerfattack.render.rays import March
 
 # Rounding may lift a white pixel above 1, where the sRGB curve has no derivative.
 _BELOW_WHITE = 1 - 1e-5

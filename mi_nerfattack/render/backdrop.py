@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 
 class AbstractBackdrop(ABC):

@@ -6,17 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.fields.base import AbstractPoints
-from mi_nerfattack.render.march import (
-    MAX_INTERVALS,
-    March,
-    Rays,
-    absorption,
-    march_derivative,
-    pick_rays,
-    private_gradients,
-    seek,
-)
+from mi_nerfattack.render.march import march_derivative, private_gradients
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays, pick_rays
+from mi_nerfattack.render.sums import Rest
+from mi_nerfattack.render.walk import Walk
 
 CAPACITY = 1 << 17  # points collected at a time, whatever the number of samples
 FIRST_RAYS = 1 << 13  # in the first batch; then as many as fill the capacity
@@ -71,33 +65,19 @@ def _collect(
     stop: float,
 ) -> mi.Vector3f:
     """Replay a march, collect its points, and return the rays' local directions."""
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    heading = dr.normalize(d)
-    jitter = rays.jitter
-    active = mi.Bool(rays.active) & (near < far)
+    walk, active = Walk.start(posed, rays)
+    heading = walk.paths[0].heading
     ray = dr.arange(mi.UInt32, dr.width(rays.direction))
-
-    index = dr.floor(posed.lattice_index(near))
-    tau = mi.Float(0)
-    rest = mi.Color3f(primal.radiance)
-    rest_moment = mi.Float(primal.moment)
+    rest = Rest.of(primal)
     while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        density, colour, place = points.eval(o + t * d, heading, active)
-        x = dr.select(active, posed.in_world(density) * width, 0)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
-        behind = dr.exp(-tau - x)
-        rest -= weight * colour
-        rest_moment -= weight * t
-        by_density = width * (
-            dr.dot(cotangent.radiance, behind * colour - rest)
-            + cotangent.opacity * (1 - primal.opacity)
-            + cotangent.moment * (behind * t - rest_moment)
-        )
-        by_radiance = weight * cotangent.radiance
-        points.append(place, posed.in_world(by_density), by_radiance, ray, active)
-        tau += x
-        index += 1
-        active &= (behind > stop) & (index < MAX_INTERVALS)
+        walk, here = walk.next([posed], active)
+        point = walk.paths[0].at(here.t)
+        density, colour, place = points.eval(point, heading, here.active)
+        (x,) = here.depths([posed.in_world(density)])
+        rest, slope = rest.minus([x], [colour], here.t)
+        by_light = slope.given * cotangent.radiance
+        by_depth = cotangent.pair(slope.by_depth) + dr.dot(by_light, colour)
+        by_density = posed.in_world(here.width * by_depth)
+        points.append(place, by_density, x * by_light, ray, here.active)
+        active = here.active & (dr.exp(-rest.tau) > stop)
     return heading

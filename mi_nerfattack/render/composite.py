@@ -12,12 +12,11 @@ import mitsuba as mi
 
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
 from mi_nerfattack.render.batched import march_gradient
-from mi_nerfattack.render.march import March, Rays, march, march_derivative, pick_rays
+from mi_nerfattack.render.march import RayTangent, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays, pick_rays
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
-#: Tangents or cotangents of origins and directions of n rays, `mi.Vector3f` each.
-RayTangent = tuple[Any, Any]
 #: What to do where a backdrop has no derivative by the rays.
 DETACH = "keep the camera detached"
 

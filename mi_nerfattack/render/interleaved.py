@@ -1,16 +1,13 @@
 """The exact composite: one march through all fields at once.
 
 Along a ray, the lattice intervals of all fields are merged into segments on which the
-set of fields does not change. A segment of width δ at transmittance T, with density
-``sigma = sum_k sigma_k`` and emission ``E = sum_k sigma_k L_k`` taken as constant on
-it, adds ``T δ phi(sigma δ) E`` to the radiance, ``phi(x) = (1 - exp(-x)) / x``.
+set of fields does not change (`walk.py`); each is one sample of all (`sums.py`).
 """
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
 
@@ -22,21 +19,20 @@ from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
-    RayTangent,
     Seen,
     Task,
     select,
 )
-from mi_nerfattack.render.march import March, Rays, absorption, march, private_gradients
-from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.segments import (
-    Cursor,
-    Path,
-    Segment,
-    advance,
-    enter,
-    next_segment,
+from mi_nerfattack.render.march import (
+    RayTangent,
+    integrate,
+    march,
+    private_gradients,
+    replay,
 )
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import MergedWalk
 
 
 class InterleavedComposite(AbstractComposite):
@@ -60,7 +56,9 @@ class InterleavedComposite(AbstractComposite):
             share = march(lit[0], *rays, stop)
             return Seen(share, [share])
         with dr.suspend_grad():
-            shares = _march(lit, rays, stop)
+            walk, active = MergedWalk.start(lit, rays)
+            looks = [item.eval for item in lit], [path.heading for path in walk.paths]
+            shares = integrate(lit, walk, active, *looks, stop).shares
         return Seen(_total(shares), shares)
 
     def keep(self, seen: Seen) -> Any:
@@ -92,7 +90,7 @@ class InterleavedComposite(AbstractComposite):
         if not any(item.has_gradients for item in fields):
             return March()
         with dr.suspend_grad():
-            return _derivative(mode, fields, rays, seen.total, March(), stop, False)[0]
+            return _replay(mode, fields, rays, seen.total, March(), stop, False)[0]
 
     def tasks(
         self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
@@ -116,7 +114,7 @@ class InterleavedComposite(AbstractComposite):
             march_gradient(item, rays, task.primal, task.cotangent, stop)
             return
         with dr.suspend_grad(), private_gradients():
-            _derivative(mode, fields, rays, task.primal, task.cotangent, stop, False)
+            _replay(mode, fields, rays, task.primal, task.cotangent, stop, False)
 
     def backward_rays(
         self,
@@ -130,9 +128,7 @@ class InterleavedComposite(AbstractComposite):
         """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
-            by_field = _derivative(
-                mode, fields, rays, seen.total, cotangent, stop, True
-            )[1]
+            by_field = _replay(mode, fields, rays, seen.total, cotangent, stop, True)[1]
         return [by_field[k] for k in wanted]
 
 
@@ -151,184 +147,8 @@ def _total(shares: list[March]) -> March:
     return reduce(lambda a, b: a.plus(b, mi.Bool(True)), shares)
 
 
-@dr.syntax
-def _march(posed: list[PosedField], rays: Rays, stop: float) -> list[March]:
-    paths, cursors = _enter_all(posed, rays)
-    shares = [March() for _ in posed]  # what each field has given so far
-    active = mi.Bool(rays.active)
-    t = mi.Float(0)  # end of the segments behind, metres
-    tau = mi.Float(0)  # optical depth so far
-    while active:
-        cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
-        here = next_segment(cursors, t, rays.jitter, active)
-        active &= here.end < dr.inf
-        values, _ = _evaluate(posed, paths, here, False)
-        depth = _density(values) * here.width
-        given = dr.exp(-tau) * here.width * absorption(depth)[0]
-        shares = _share(shares, values, dr.select(active, given, 0), here.t)
-        tau += dr.select(active, depth, 0)
-        t = dr.select(active, here.end, t)
-        active &= dr.exp(-tau) > stop
-    return shares
-
-
-@dr.syntax
-def _derivative(
-    mode: dr.ADMode,
-    posed: list[PosedField],
-    rays: Rays,
-    primal: March,
-    cotangent: March,
-    stop: float,
-    with_rays: bool,
+def _replay(
+    mode: dr.ADMode, posed: list[PosedField], rays: Rays, *options: Any
 ) -> tuple[March, list[RayTangent]]:
-    posed = rays.light(posed)
-    paths, cursors = _enter_all(posed, rays)
-    slopes = [_RayGradient() for _ in posed]
-    tangent = March()
-    active = mi.Bool(rays.active)
-    t, tau = mi.Float(0), mi.Float(0)
-    rest = primal.copy()  # what is still to come; opacity stays that of the ray
-    while active:
-        cursors = _advance_all(posed, paths, cursors, t, rays.jitter, active)
-        here = next_segment(cursors, t, rays.jitter, active)
-        active &= here.end < dr.inf
-        with dr.resume_grad():
-            values, places = _evaluate(posed, paths, here, with_rays)
-            rest, change = _change(values, here, tau, rest)
-            if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                dr.backward_from(dr.select(active, cotangent.pair(change), 0))
-                slopes = _collect(slopes, places, here.t, active, with_rays)
-            else:
-                tangent = tangent.plus(dr.forward_to(change), active)
-        depth = dr.detach(_density(values)) * here.width
-        tau += dr.select(active, depth, 0)
-        t = dr.select(active, here.end, t)
-        active &= dr.exp(-tau) > stop
-    return tangent, _finish(posed, paths, slopes)
-
-
-def _enter_all(posed: list[PosedField], rays: Rays) -> tuple[list[Path], list[Cursor]]:
-    entries = [enter(item, rays) for item in posed]
-    return [path for path, _ in entries], [cursor for _, cursor in entries]
-
-
-def _advance_all(
-    posed: list[PosedField],
-    paths: list[Path],
-    cursors: list[Cursor],
-    t: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
-) -> list[Cursor]:
-    return [
-        advance(item, path, cursor, t, jitter, active)
-        for item, path, cursor in zip(posed, paths, cursors, strict=True)
-    ]
-
-
-def _density(values: list) -> mi.Float:
-    return sum((density for density, _ in values), mi.Float(0))
-
-
-def _share(
-    shares: list[March], values: list, given: mi.Float, t: mi.Float
-) -> list[March]:
-    """Add each field's part of a segment to its share."""
-    result = []
-    for share, (density, colour) in zip(shares, values, strict=True):
-        weight = given * density
-        result.append(
-            March(
-                share.radiance + weight * colour,
-                share.opacity + weight,
-                share.moment + weight * t,
-            )
-        )
-    return result
-
-
-def _change(
-    values: list, here: Segment, tau: mi.Float, rest: March
-) -> tuple[March, March]:
-    """Linearise the march in one segment.
-
-    Returns:
-        what comes behind the segment, and a quantity whose derivative by the values
-        of the fields is that of the whole march.
-    """
-    density = _density(values)
-    emission = sum((a * b for a, b in values), mi.Color3f(0))
-    sigma, light = dr.detach(density), dr.detach(emission)
-    through = dr.exp(-tau)
-    behind = dr.exp(-tau - sigma * here.width)
-    phi, slope = absorption(sigma * here.width)
-    given = through * phi * here.width
-    radiance = rest.radiance - light * given
-    moment = rest.moment - sigma * given * here.t
-    curve = through * here.width * here.width * slope
-    change = March(
-        given * emission + density * (curve * light - here.width * radiance),
-        density * here.width * (1 - rest.opacity),
-        density * here.width * (behind * here.t - moment),
-    )
-    return March(radiance, rest.opacity, moment), change
-
-
-@dataclass
-class _RayGradient:
-    """Derivatives by the ray in the frame of one field, so far."""
-
-    origin: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
-    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
-    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
-
-
-def _evaluate(
-    posed: list[PosedField], paths: list[Path], here: Segment, with_rays: bool
-) -> tuple[list, list]:
-    """Evaluate all fields, attached; also return the points and directions used."""
-    values, places = [], []
-    for item, path, inside in zip(posed, paths, here.inside, strict=True):
-        point = mi.Point3f(path.o + here.t * path.d)
-        heading = mi.Vector3f(path.heading)
-        if with_rays:
-            dr.enable_grad(point, heading)
-        values.append(item.eval(point, heading, inside))
-        places.append((point, heading))
-    return values, places
-
-
-def _collect(
-    slopes: list[_RayGradient],
-    places: list,
-    t: mi.Float,
-    active: mi.Bool,
-    with_rays: bool,
-) -> list[_RayGradient]:
-    if not with_rays:
-        return slopes
-    result = []
-    for slope, (point, heading) in zip(slopes, places, strict=True):
-        by_point = dr.select(active, mi.Vector3f(dr.grad(point)), 0)
-        by_heading = dr.select(active, dr.grad(heading), 0)
-        result.append(
-            _RayGradient(
-                slope.origin + by_point,
-                slope.direction + t * by_point,
-                slope.heading + by_heading,
-            )
-        )
-    return result
-
-
-def _finish(
-    posed: list[PosedField], paths: list[Path], slopes: list[_RayGradient]
-) -> list[RayTangent]:
-    """Return each field's derivatives by origin and direction in the world."""
-    result = []
-    for item, path, slope in zip(posed, paths, slopes, strict=True):
-        along = path.heading * dr.dot(path.heading, slope.heading)
-        turned = (slope.heading - along) * dr.rcp(dr.norm(path.d))
-        result.append(item.to_world_gradient(slope.origin, slope.direction + turned))
-    return result
+    lit = rays.light(posed)
+    return replay(mode, lit, *MergedWalk.start(lit, rays), *options)

@@ -30,103 +30,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.sums import Rest, Sums
+from mi_nerfattack.render.walk import MergedWalk, Path, Segment, Walk
 
-MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
 STOP = 1e-3
 PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
 
-
 #: Maps local points, directions in a form of its own, and a mask to density and colour.
 Evaluate = Callable[[Any, Any, Any], tuple[Any, Any]]
-
-
-@dataclass
-class Rays:
-    """Rays in the world, and where a march places its samples on them.
-
-    Attributes:
-        origin: (3, n), metres.
-        direction: (3, n), unit vectors.
-        t_max: (n,), metres; where the ray ends.
-        jitter: (n,) in [0, 1), position of the sample in its interval.
-        active: (n,) mask.
-        gains: factors of the radiance of each field, (3, n) each; none for 1. They
-            are constants of every derivative.
-    """
-
-    origin: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
-    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0, 0, 1))
-    t_max: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
-    jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
-    active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
-    gains: list[mi.Color3f] = field(default_factory=list)
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield what :func:`march` takes after the field, in its order."""
-        yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
-
-    def light(self, posed: Sequence[Any]) -> list[Any]:
-        """Return the fields with the rays' gains, one each unless there are none."""
-        if not self.gains:
-            return list(posed)
-        pairs = zip(posed, self.gains, strict=True)
-        return [item.with_gain(gain) for item, gain in pairs]
-
-
-@dataclass
-class March:
-    """What a march gives, per ray.
-
-    Attributes:
-        radiance: (3, n) premultiplied radiance I, linear.
-        opacity: (n,) a = 1 - T(t_max).
-        moment: (n,) integral of t sigma T dt, metres; depth times opacity.
-    """
-
-    radiance: mi.Color3f = field(default_factory=lambda: mi.Color3f(0))
-    opacity: mi.Float = field(default_factory=lambda: mi.Float(0))
-    moment: mi.Float = field(default_factory=lambda: mi.Float(0))
-
-    @staticmethod
-    def zeros(count: int) -> March:
-        """Return a march of `count` empty rays."""
-        black = dr.zeros(mi.Color3f, count)
-        return March(black, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
-
-    def copy(self) -> March:
-        """Return a march of the same values with no derivatives attached."""
-        colour = mi.Color3f(dr.detach(self.radiance))
-        opacity, moment = dr.detach(self.opacity), dr.detach(self.moment)
-        return March(colour, mi.Float(opacity), mi.Float(moment))
-
-    def plus(self, other: March, active: mi.Bool) -> March:
-        """Add another march on the rays of a mask (n,)."""
-        return March(
-            self.radiance + dr.select(active, other.radiance, 0),
-            self.opacity + dr.select(active, other.opacity, 0),
-            self.moment + dr.select(active, other.moment, 0),
-        )
-
-    def pair(self, other: March) -> mi.Float:
-        """Return the inner product with another march, ray by ray (n,)."""
-        return (
-            dr.dot(self.radiance, other.radiance)
-            + self.opacity * other.opacity
-            + self.moment * other.moment
-        )
-
-    @property
-    def depth(self) -> mi.Float:
-        """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
-        hit = self.opacity > 0
-        return dr.select(hit, self.moment / dr.select(hit, self.opacity, 1), dr.inf)
+#: Tangents or cotangents of origins and directions of n rays, `mi.Vector3f` each.
+RayTangent = tuple[Any, Any]
 
 
 @contextmanager
@@ -144,73 +65,6 @@ def private_gradients() -> Iterator[None]:
         yield
     finally:
         dr.set_expand_threshold(before)
-
-
-@dr.syntax
-def seek(
-    posed: PosedField,
-    o: mi.Point3f,
-    d: mi.Vector3f,
-    index: mi.Float,
-    near: mi.Float,
-    far: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.Bool]:
-    """Advance local rays (n,) to their next lattice interval in an occupied cell.
-
-    Returns:
-        index, sample position and width (metres) of the interval, and which rays
-        found one before `far`; each (n,).
-    """
-    occupancy = posed.field.occupancy
-    t = mi.Float(0)
-    width = mi.Float(0)
-    searching = mi.Bool(active)
-    found = mi.Bool(False)
-    while searching:
-        start = dr.maximum(posed.lattice(index), near)
-        end = dr.minimum(posed.lattice(index + 1), far)
-        t = start + jitter * (end - start)
-        width = end - start
-        searching &= (start < far) & (index < MAX_INTERVALS)
-        unit = posed.field.unit(o + t * d)
-        distance, cell = occupancy.query(unit, searching)
-        found = searching & (distance == 0)
-        searching &= ~found
-        scale = posed.field.unit(mi.Point3f(d)) - posed.field.unit(mi.Point3f(0))
-        t_exit = t + occupancy.exit(unit, mi.Vector3f(scale), cell, distance)
-        jump = dr.maximum(index + 1, dr.floor(posed.lattice_index(t_exit)))
-        index = dr.select(searching, jump, index)
-    return index, t, dr.maximum(width, 0), found
-
-
-def pick_rays(value: Any, index: mi.UInt32) -> Any:
-    """Gather rays of dataclasses and lists of arrays; one entry for all stays so."""
-    if isinstance(value, list):
-        return [pick_rays(item, index) for item in value]
-    if is_dataclass(value):
-        parts = {item.name: getattr(value, item.name) for item in fields(value)}
-        return type(value)(**{k: pick_rays(v, index) for k, v in parts.items()})
-    return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
-
-
-def absorption(x: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Return ``phi(x) = (1 - exp(-x)) / x`` and its derivative, accurate at 0.
-
-    ``x phi(x)`` is the opacity of optical depth x; in single precision ``1 - exp(-x)``
-    loses the digits that thin media live on.
-    """
-    small = x < 0.1
-    safe = dr.select(small, 1, x)
-    passed = dr.exp(-safe)
-    phi = (1 - passed) / safe
-    series = 1 + x * (-1 / 2 + x * (1 / 6 + x * (-1 / 24 + x / 120)))
-    slope = -1 / 2 + x * (1 / 3 + x * (-1 / 8 + x * (1 / 30 - x / 144)))
-    return (
-        dr.select(small, series, phi),
-        dr.select(small, slope, (passed - phi) / safe),
-    )
 
 
 def march(
@@ -239,7 +93,9 @@ def march(
     with dr.suspend_grad():
         rays = Rays(origin, direction, t_max, jitter, active)
         heading = dr.normalize(posed.turn(direction))
-        return integrate(posed, rays, posed.eval, heading, stop)
+        walk, active = Walk.start(posed, rays)
+        sums = integrate([posed], walk, active, [posed.eval], [heading], stop)
+        return sums.march()
 
 
 def march_derivative(  # noqa: D417  one entry describes seven
@@ -253,16 +109,16 @@ def march_derivative(  # noqa: D417  one entry describes seven
     primal: March,
     cotangent: March,
     stop: float = STOP,
-    t_rays: tuple[mi.Vector3f, mi.Vector3f] | None = None,
+    t_rays: RayTangent | None = None,
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     """Replay :func:`march` and propagate derivatives through the field.
 
     With ``w_k`` the weight and ``T_k+1`` the transmittance behind sample k:
     ``dI/dL_k = w_k``, ``dI/dsigma_k = width_k (T_k+1 L_k - sum_{j>k} w_j L_j)``, and
-    likewise for opacity and moment. Parameters of the field (and nothing else) get
-    their derivatives through Dr.Jit's graph: in backward mode they are accumulated
-    into ``dr.grad`` of every parameter with gradients enabled; in forward mode they
-    are read from there.
+    likewise for opacity and moment; `sums.Rest` names the terms. Parameters of the
+    field (and nothing else) get their derivatives through Dr.Jit's graph: in backward
+    mode they are accumulated into ``dr.grad`` of every parameter with gradients
+    enabled; in forward mode they are read from there.
 
     Sample positions and the ends of the interval count as constants along the ray;
     rays that only touch the box are not differentiated with respect to that.
@@ -283,114 +139,137 @@ def march_derivative(  # noqa: D417  one entry describes seven
     """
     rays = Rays(origin, direction, t_max, jitter, active)
     with dr.suspend_grad(), private_gradients():
-        return _march_derivative(mode, posed, rays, primal, cotangent, stop, t_rays)
-
-
-def enter(
-    posed: PosedField, rays: Rays
-) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool]:
-    """Take rays into a field's frame.
-
-    Returns:
-        local origins and directions, the interval inside the field's box (metres), and
-        which rays have one; each (n,).
-    """
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    return o, d, near, far, mi.Bool(rays.active) & (near < far)
+        walk, active = Walk.start(posed, rays)
+        with_rays = mode == dr.ADMode.Backward or t_rays is not None
+        fixed = [posed], walk, active, primal, cotangent, stop
+        tangent, ((by_origin, by_direction),) = replay(mode, *fixed, with_rays, t_rays)
+    return tangent, by_origin, by_direction
 
 
 @dr.syntax
 def integrate(
-    posed: PosedField, rays: Rays, evaluate: Evaluate, towards: Any, stop: float
-) -> March:
-    """Do what :func:`march` does, with an evaluation of the caller's.
+    posed: Sequence[PosedField],
+    walk: Walk | MergedWalk,
+    active: mi.Bool,
+    evaluate: Sequence[Evaluate],
+    towards: Sequence[Any],
+    stop: float,
+) -> Sums:
+    """Do what :func:`march` does, for one or several fields.
 
     Args:
-        posed: the field's pose, box, steps and occupancy.
-        rays: n rays.
-        evaluate: maps local points (3, n), `towards` and a mask to density, in
-            1/(world metre), and radiance.
+        posed: the fields' poses, boxes, steps and occupancies.
+        walk: n rays before their first samples.
+        active: (n,), rays that may have samples.
+        evaluate: for each field; maps local points (3, n), its `towards` and a mask
+            to density, in 1/(world metre), and radiance.
         towards: what `evaluate` needs to know of the rays' directions.
         stop: transmittance below which a ray ends.
     """
-    o, d, near, far, active = enter(posed, rays)
-    jitter = rays.jitter
-    index = dr.floor(posed.lattice_index(near))  # lattice interval in hand
-    tau = mi.Float(0)  # optical depth from the origin to the interval
-    radiance = mi.Color3f(0)  # premultiplied radiance so far
-    moment = mi.Float(0)  # integral of t sigma T so far
+    sums = Sums.zeros(len(posed))
     while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        density, colour = evaluate(mi.Point3f(o + t * d), towards, active)
-        x = dr.select(active, density * width, 0)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
-        radiance += weight * colour
-        moment += weight * t
-        tau += x
-        index += 1
-        active &= (dr.exp(-tau) > stop) & (index < MAX_INTERVALS)
-    return March(radiance, tau * absorption(tau)[0], moment)
+        walk, here = walk.next(posed, active)
+        points = [path.at(here.t) for path in walk.paths]
+        densities, colours = _evaluate(evaluate, points, towards, here)
+        sums = sums.plus(here.depths(densities), colours, here.t)
+        active = here.active & (dr.exp(-sums.tau) > stop)
+    return sums
+
+
+@dataclass
+class RayGradient:
+    """Derivatives by the rays in the frame of one field, so far."""
+
+    origin: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+
+    def plus(self, point: Any, heading: Any, here: Segment) -> RayGradient:
+        """Add what a sample's point and heading got, where there is a sample."""
+        by_point = dr.select(here.active, mi.Vector3f(dr.grad(point)), 0)
+        by_heading = dr.select(here.active, dr.grad(heading), 0)
+        return RayGradient(
+            self.origin + by_point,
+            self.direction + here.t * by_point,
+            self.heading + by_heading,
+        )
+
+    def in_world(self, posed: PosedField, path: Path) -> RayTangent:
+        """Return the derivatives by origin and direction in the world."""
+        along = path.heading * dr.dot(path.heading, self.heading)
+        turned = (self.heading - along) * dr.rcp(dr.norm(path.d))
+        return posed.to_world_gradient(self.origin, self.direction + turned)
 
 
 @dr.syntax
-def _march_derivative(
+def replay(  # noqa: D417  one entry describes four
     mode: dr.ADMode,
-    posed: PosedField,
-    rays: Rays,
+    posed: Sequence[PosedField],
+    walk: Walk | MergedWalk,
+    active: mi.Bool,
     primal: March,
     cotangent: March,
     stop: float,
-    t_rays: tuple[mi.Vector3f, mi.Vector3f] | None,
-) -> tuple[March, mi.Vector3f, mi.Vector3f]:
-    backward = mode == dr.ADMode.Backward
-    moving = t_rays is not None
-    o, d, near, far, active = enter(posed, rays)
-    heading, jitter = dr.normalize(d), rays.jitter
+    with_rays: bool,
+    t_rays: RayTangent | None = None,
+) -> tuple[March, list[RayTangent]]:
+    """Replay :func:`integrate` of the fields, and propagate derivatives.
 
-    index = dr.floor(posed.lattice_index(near))
-    tau = mi.Float(0)
-    rest = mi.Color3f(primal.radiance)  # premultiplied radiance still to come
-    rest_moment = mi.Float(primal.moment)
-    d_origin, d_direction, d_heading = (mi.Vector3f(0) for _ in range(3))
-    tangent = March()
-    t_o, t_d, t_heading = posed.local_tangents(d, heading, t_rays)
+    Args:
+        mode: forward or backward.
+        posed, walk, active, stop: as given to :func:`integrate`.
+        primal: what the rays gathered.
+        cotangent: derivative of the objective by it; ignored in forward mode.
+        with_rays: differentiate by the rays, too.
+        t_rays: their tangents in forward mode.
+
+    Returns:
+        as :func:`march_derivative`, the derivatives by rays for each field.
+    """
+    count = range(len(posed))
+    tangents = [walk.paths[k].tangents(posed[k], t_rays) for k in count]
+    rest, tangent = Rest.of(primal), March()
+    by_rays = [RayGradient() for _ in posed]
     while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        point = mi.Point3f(o + t * d)
-        towards = mi.Vector3f(heading)
+        walk, here = walk.next(posed, active)
         with dr.resume_grad():
-            if dr.hint(backward or moving, mode="scalar"):
-                dr.enable_grad(point, towards)
-            if dr.hint(moving, mode="scalar"):
-                dr.set_grad(point, t_o + t * t_d)
-                dr.set_grad(towards, t_heading)
-            density, colour = posed.eval(point, towards, active)
-            sigma, value = dr.detach(density), dr.detach(colour)
-            x = dr.select(active, sigma * width, 0)
-            weight = dr.exp(-tau) * x * absorption(x)[0]
-            behind = dr.exp(-tau - x)
-            rest -= weight * value
-            rest_moment -= weight * t
-            by_density = dr.select(active, width, 0)
-            shift = by_density * density
-            change = March(
-                weight * colour + shift * (behind * value - rest),
-                shift * (1 - primal.opacity),
-                shift * (behind * t - rest_moment),
+            points, headings = _attach(walk.paths, here.t, with_rays, tangents)
+            densities, colours = _evaluate(
+                [item.eval for item in posed], points, headings, here
             )
-            if dr.hint(backward, mode="scalar"):
+            depths = here.depths(densities)
+            rest, slope = rest.minus(dr.detach(depths), dr.detach(colours), here.t)
+            change = slope.change(depths, colours)
+            if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                 dr.backward_from(cotangent.pair(change))
-                d_point = dr.select(active, mi.Vector3f(dr.grad(point)), 0)
-                d_origin += d_point
-                d_direction += t * d_point
-                d_heading += dr.select(active, dr.grad(towards), 0)
+                by_rays = [by_rays[k].plus(points[k], headings[k], here) for k in count]
             else:
-                tangent = tangent.plus(dr.forward_to(change), active)
-        tau += x
-        index += 1
-        active &= (behind > stop) & (index < MAX_INTERVALS)
-    unit = d_heading - heading * dr.dot(heading, d_heading)
-    d_direction += unit * dr.rcp(dr.norm(d))
-    d_origin, d_direction = posed.to_world_gradient(d_origin, d_direction)
-    return tangent, d_origin, d_direction
+                tangent = tangent.plus(dr.forward_to(change), here.active)
+        active = here.active & (dr.exp(-rest.tau) > stop)
+    return tangent, list(map(RayGradient.in_world, by_rays, posed, walk.paths))
+
+
+def _evaluate(
+    evaluate: Sequence[Evaluate],
+    points: Sequence[Any],
+    towards: Sequence[Any],
+    here: Segment,
+) -> tuple[list, list]:
+    """Evaluate all fields at a sample: their densities and their radiances."""
+    parts = zip(evaluate, points, towards, here.inside, strict=True)
+    values = [see(point, look, inside) for see, point, look, inside in parts]
+    return [density for density, _ in values], [colour for _, colour in values]
+
+
+def _attach(
+    paths: list[Path], t: mi.Float, with_rays: bool, tangents: list
+) -> tuple[list, list]:
+    """Return points and headings of a sample in each field, as leaves if asked for."""
+    points = [path.at(t) for path in paths]
+    headings = [mi.Vector3f(path.heading) for path in paths]
+    if with_rays:
+        dr.enable_grad(points, headings)
+        for k, (t_o, t_d, t_heading) in enumerate(tangents):
+            dr.set_grad(points[k], t_o + t * t_d)
+            dr.set_grad(headings[k], t_heading)
+    return points, headings

@@ -93,28 +93,6 @@ class PosedField:
             *[dr.dot(column, vector) * self._inverse_scale for column in self._columns]
         )
 
-    def local_tangents(
-        self,
-        d: mi.Vector3f,
-        heading: mi.Vector3f,
-        t_rays: tuple[mi.Vector3f, mi.Vector3f] | None,
-    ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
-        """Map tangents of world rays to those of the local ones; zeros for None.
-
-        Args:
-            d: (3, n), local directions.
-            heading: (3, n), the same of unit length.
-            t_rays: tangents of origin and direction in the world.
-
-        Returns:
-            tangents of local origin, local direction and heading.
-        """
-        if t_rays is None:
-            return mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)
-        t_o, t_d = (self.turn(tangent) for tangent in t_rays)
-        along = heading * dr.dot(heading, t_d)
-        return t_o, t_d, (t_d - along) * dr.rcp(dr.norm(d))
-
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Return what lies behind the field, (3, n), linear; it turns with the field.
 

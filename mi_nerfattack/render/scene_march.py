@@ -11,8 +11,10 @@ import mitsuba as mi
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.fields.cpu.ngp import PackedNGP
 from mi_nerfattack.fields.ngp import NGPField
-from mi_nerfattack.render.march import March, Rays, integrate, march
+from mi_nerfattack.render.march import integrate, march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import Walk
 
 
 class AbstractSceneMarch(ABC):
@@ -97,7 +99,9 @@ class PackedMarch(AbstractSceneMarch):
     def _record(self, rays: Rays) -> March:
         with dr.suspend_grad():
             view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
-            result = integrate(self.posed, rays, self._evaluate, view, self.stop)
+            walk, active = Walk.start(self.posed, rays)
+            posed, looks = [self.posed], ([self._evaluate], [view])
+            result = integrate(posed, walk, active, *looks, self.stop).march()
             for (gain,) in [rays.gains] if rays.gains else []:
                 result.radiance *= gain
         return result

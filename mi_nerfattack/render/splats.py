@@ -33,7 +33,7 @@ from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.backdrop import AbstractBackdrop
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.rays import March, Rays
 
 REACH = 3.0  # standard deviations at which a splat ends
 MAX_OPACITY = 0.9999

@@ -25,8 +25,9 @@ from mi_nerfattack.render.composite import (
     Seen,
     Task,
 )
-from mi_nerfattack.render.march import STOP, March, Rays
+from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.rollout.offset import offset_gradient, offset_pose, wrench_of
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 

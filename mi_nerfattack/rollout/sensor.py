@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.render.composite import Seen
-from mi_nerfattack.render.march import Rays
+from mi_nerfattack.render.rays import Rays
 
 
 @dataclass(frozen=True)

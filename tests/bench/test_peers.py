@@ -33,8 +33,8 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop

@@ -24,7 +24,7 @@ from mi_nerfattack.fit.loss import LossWeights, _geometry_loss
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.distortion import distort
 from mi_nerfattack.render.camera.intrinsics import Camera, look_at
-from mi_nerfattack.render.march import March
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 

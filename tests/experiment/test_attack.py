@@ -199,7 +199,7 @@ def test_pasting_follows_depth_and_opacity():
     import mitsuba as mi
 
     from mi_nerfattack.deploy import paste_layer
-    from mi_nerfattack.render.march import March
+    from mi_nerfattack.render.rays import March
 
     rgb = np.zeros((1, 4, 3), np.float32)
     depth = np.array([[5.0, 5.0, 1.0, np.inf]])

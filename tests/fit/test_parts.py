@@ -17,9 +17,9 @@ from mi_nerfattack.fit.cells import cells_near_surfaces, grid_shape
 from mi_nerfattack.fit.loss import LossWeights, huber, loss_and_cotangent
 from mi_nerfattack.fit.rays import RayBank, RayBatch
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
-from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.sample_count import sample_count
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.walk import sample_count
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -211,6 +211,5 @@ def test_depth_that_does_not_fit_is_an_error(tmp_path, fault):
 
 def test_samples_are_counted_by_the_cells_that_rays_cross():
     grid, origin, direction = small.half_occupied()
-    posed, far = PosedField(grid), mi.Float(dr.inf)
-    count = sample_count(posed, origin, direction, far, mi.Float(0.5))
+    count = sample_count(PosedField(grid), Rays(origin, direction))
     assert count.numpy().tolist() == [4, 2, 0]

@@ -12,7 +12,7 @@ from scipy.special import erf
 from mi_nerfattack.fields import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import Rays
+from mi_nerfattack.render.rays import Rays
 
 WAVES = np.array([[1.0, 0.3, -0.5], [-0.4, 1.2, 0.2], [0.1, -0.6, 0.9]])
 PHASES = np.array([0.3, 1.1, 2.5])

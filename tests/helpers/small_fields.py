@@ -8,8 +8,8 @@ import numpy as np
 
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March
 
 ONES = np.ones(3)
 SMALL = GridLayout(levels=3, base_resolution=4, max_resolution=12)

@@ -15,7 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.march import MAX_INTERVALS, March, absorption, seek
+from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.sums import absorption
+from mi_nerfattack.render.walk import Path, Walk
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sweep import Gradient
 
@@ -131,27 +133,20 @@ def taped_march(posed, rays, stop):
     pose, and the rays. Positions of samples and ends of the interval are constants,
     as for `march_derivative`.
     """
-    o, d = posed.to_local(rays.origin, rays.direction)
-    fixed_o, fixed_d = dr.detach(o), dr.detach(d)
-    near, far = posed.interval(fixed_o, fixed_d, rays.t_max)
-    near, far = dr.detach(near), dr.detach(far)
-    heading = dr.normalize(d)
-    active = mi.Bool(rays.active) & (near < far)
-    index = dr.detach(dr.floor(posed.lattice_index(near)))
-    tau = dr.zeros(mi.Float, dr.width(d))
-    radiance = dr.zeros(mi.Color3f, dr.width(d))
-    moment = dr.zeros(mi.Float, dr.width(d))
+    path = Path.of(posed, rays)
+    walk, active = dr.detach(Walk.start(posed, rays))
+    count = dr.width(path.d)
+    tau = dr.zeros(mi.Float, count)
+    radiance = dr.zeros(mi.Color3f, count)
+    moment = dr.zeros(mi.Float, count)
     while dr.hint(active, mode="evaluated"):
         with dr.suspend_grad():
-            index, t, width, active = seek(
-                posed, fixed_o, fixed_d, index, near, far, rays.jitter, active
-            )
-        density, colour = posed.eval(o + t * d, heading, active)
-        x = dr.select(active, density * width, 0)
+            walk, here = walk.next([posed], active)
+        density, colour = posed.eval(path.at(here.t), path.heading, here.active)
+        x = dr.select(here.active, density * here.width, 0)
         weight = dr.exp(-tau) * x * absorption(x)[0]
         radiance += weight * colour
-        moment += weight * t
+        moment += weight * here.t
         tau += x
-        index += 1
-        active &= (dr.exp(-dr.detach(tau)) > stop) & (index < MAX_INTERVALS)
+        active = here.active & (dr.exp(-dr.detach(tau)) > stop)
     return March(radiance, tau * absorption(tau)[0], moment)

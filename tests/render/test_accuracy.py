@@ -22,8 +22,9 @@ from mi_nerfattack.fields import save_field
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import March, march
+from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 

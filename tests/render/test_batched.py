@@ -11,8 +11,9 @@ from helpers import small_fields as small
 from mi_nerfattack.fields import NGPField
 from mi_nerfattack.render import batched
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March, Rays, march, march_derivative
+from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 

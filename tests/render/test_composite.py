@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mi_nerfattack.render.composite import depth_composite, over, sort_by_depth
-from mi_nerfattack.render.march import March
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 

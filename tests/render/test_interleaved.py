@@ -13,8 +13,10 @@ from helpers.variants import later
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import March, Rays, absorption, march
+from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.sums import absorption
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March, march
+from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -14,8 +14,9 @@ from helpers.variants import later
 
 from mi_nerfattack.fields import AbstractField, GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March, march, march_derivative
+from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
 

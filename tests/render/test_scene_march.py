@@ -18,8 +18,9 @@ from mi_nerfattack.render.camera.intrinsics import (
     mount_pose,
 )
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import STOP, Rays, march
+from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.render.scene_march import FieldMarch, PackedMarch, scene_march
 from mi_nerfattack.scenes import bundled
 

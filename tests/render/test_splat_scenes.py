@@ -17,8 +17,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.splats import SplatBackground
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.march import March, Rays
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.splats import SplatBackground
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -18,8 +18,9 @@ from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
-from mi_nerfattack.render.march import STOP, March, Rays
+from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 
 class FieldView(AbstractView):

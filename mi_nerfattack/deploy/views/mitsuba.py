@@ -14,9 +14,9 @@ from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.march import March
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March
 
 #: Samples of a pixel that are added up in one order whatever the threads do.
 _PART = 16

@@ -15,8 +15,9 @@ from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.composite import DepthComposite
-from mi_nerfattack.render.march import STOP, March, Rays
+from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 #: Opacity from which on a field's pixel counts as solid.
 OPAQUE = 0.5

@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
-from mi_nerfattack.render.march import Rays
+from mi_nerfattack.render.rays import Rays
 
 
 class PixelRays:

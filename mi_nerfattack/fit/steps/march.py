@@ -10,16 +10,10 @@ import mitsuba as mi
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fit.batch import BatchSource, Draw, Score
 from mi_nerfattack.render.batched import march_gradient
-from mi_nerfattack.render.march import (
-    STOP,
-    March,
-    Rays,
-    march,
-    march_derivative,
-    pick_rays,
-)
+from mi_nerfattack.render.march import STOP, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.sample_count import sample_count
+from mi_nerfattack.render.rays import March, Rays, pick_rays
+from mi_nerfattack.render.walk import sample_count
 
 
 class MarchStep:
@@ -46,11 +40,7 @@ class MarchStep:
         """
         draw = self.source.draw(random, limit)
         rays = draw.rays
-        ends = dr.select(rays.active, rays.t_max, 0)
-        crossed = sample_count(
-            self.posed, rays.origin, rays.direction, ends, rays.jitter
-        )
-        count = mi.UInt32(crossed)
+        count = mi.UInt32(sample_count(self.posed, rays))
         # rays of a packet take as long as the longest of them
         order = mi.UInt32(dr.argsort(count))
         sorted_rays = pick_rays(rays, order)

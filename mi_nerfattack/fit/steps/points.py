@@ -28,8 +28,9 @@ from mi_nerfattack.fit.steps.samples import (
     list_samples,
     measure_spread,
 )
-from mi_nerfattack.render.march import STOP, Rays, private_gradients
+from mi_nerfattack.render.march import STOP, private_gradients
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 
 class PointStep:

@@ -12,9 +12,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.march import March, Rays, absorption, seek
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.sample_count import sample_count
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.sums import Sums, sample_weight
+from mi_nerfattack.render.walk import Walk, sample_count
 
 
 @dataclass
@@ -47,14 +48,12 @@ def list_samples(posed: PosedField, rays: Rays, capacity: int) -> Samples:
         capacity: number of slots; from the ray whose samples do not fit, rays stay
             empty.
     """
-    o, d, ends, jitter, active = rays
-    ends = dr.select(active, ends, 0)
-    count = mi.UInt32(sample_count(posed, o, d, ends, jitter))
+    count = mi.UInt32(sample_count(posed, rays))
     first, fits = _places(count, capacity)
     samples = Samples(
         first,
         dr.select(fits, count, 0),
-        fits & active,
+        fits & rays.active,
         dr.zeros(mi.UInt32, capacity),
         dr.zeros(mi.Float, capacity),
         dr.zeros(mi.Float, capacity),
@@ -103,21 +102,17 @@ def _places(count: mi.UInt32, capacity: int) -> tuple[mi.UInt32, mi.Bool]:
 
 @dr.syntax
 def _fill(posed: PosedField, rays: Rays, samples: Samples) -> None:
-    o, d = posed.to_local(rays.origin, rays.direction)
-    near, far = posed.interval(o, d, rays.t_max)
-    jitter = rays.jitter
     slot, end = mi.UInt32(samples.first), samples.first + samples.count
     ray = dr.arange(mi.UInt32, dr.width(samples.first))
-    index = dr.floor(posed.lattice_index(near))
+    walk = Walk.start(posed, rays)[0]
     active = slot < end
     while active:
-        index, t, width, active = seek(posed, o, d, index, near, far, jitter, active)
-        dr.scatter(samples.ray, ray, slot, active)
-        dr.scatter(samples.t, t, slot, active)
-        dr.scatter(samples.width, width, slot, active)
+        walk, here = walk.next([posed], active)
+        dr.scatter(samples.ray, ray, slot, here.active)
+        dr.scatter(samples.t, here.t, slot, here.active)
+        dr.scatter(samples.width, here.width, slot, here.active)
         slot += 1
-        index += 1
-        active &= slot < end
+        active = here.active & (slot < end)
 
 
 @dr.syntax
@@ -153,17 +148,15 @@ def composite(samples: Samples, depths: mi.Float, colour: Any) -> March:
         colour: (3, m), radiance of each.
     """
     slot, end = mi.UInt32(samples.first), samples.first + samples.count
-    tau, moment, radiance = mi.Float(0), mi.Float(0), mi.Color3f(0)
+    sums = Sums.zeros(1)
     active = slot < end
     while active:
         x = dr.gather(mi.Float, depths, slot, active)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
-        radiance += weight * _pick(colour, slot, active)
-        moment += weight * dr.gather(mi.Float, samples.t, slot, active)
-        tau += x
+        t = dr.gather(mi.Float, samples.t, slot, active)
+        sums = sums.plus([x], [_pick(colour, slot, active)], t)
         slot += 1
         active &= slot < end
-    return March(radiance, tau * absorption(tau)[0], moment)
+    return sums.march()
 
 
 def _pick(colour: mi.Color3f, slot: mi.UInt32, active: mi.Bool) -> mi.Color3f:
@@ -230,7 +223,7 @@ def measure_spread(
     while active:
         x = dr.gather(mi.Float, depths, slot, active)
         s = dr.gather(mi.Float, place, slot, active)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
+        weight = sample_weight(tau, x)
         # each pair is met once, at its farther sample
         penalty += weight * (2 * (s * before - moment) + weight * width / 3)
         before += weight
@@ -254,7 +247,8 @@ def cotangents(
 
     With ``w_k`` the weight of a sample, ``T_k+1`` the transmittance behind it and
     ``g_k`` the objective's derivative by the weight:
-    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``.
+    ``dJ/dx_k = T_k+1 g_k - sum_{j>k} w_j g_j``. This is :class:`Rest` in one sum, of
+    ``w_j g_j``, in place of one for each part of a march.
 
     Args:
         samples: n rays, m slots.
@@ -281,7 +275,7 @@ def cotangents(
         x = dr.gather(mi.Float, depths, slot, active)
         s = dr.gather(mi.Float, spread.place, slot, active)
         value = _pick(colour, slot, active)
-        weight = dr.exp(-tau) * x * absorption(x)[0]
+        weight = sample_weight(tau, x)
         g = (
             dr.dot(cotangent.radiance, value)
             + cotangent.opacity

@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.render.composite import AbstractComposite
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 
 def attached(

@@ -35,8 +35,9 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.lighting.surface import Surface, expected_surface, geometry
-from mi_nerfattack.render.march import STOP, Rays, march
+from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 LIGHT_SAMPLES = 16
 CLEARANCE = 2.0  # marching steps between a surface and where its shadow rays start

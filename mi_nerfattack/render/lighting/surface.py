@@ -18,8 +18,9 @@ import numpy as np
 
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.render.march import March, Rays, march, march_derivative
+from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 FAINT = 1e-2  # opacity below which there is no surface to speak of
 

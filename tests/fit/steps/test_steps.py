@@ -26,8 +26,8 @@ from mi_nerfattack.fit.steps.samples import (
     measure_spread,
 )
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
-from mi_nerfattack.render.march import March, Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import March, Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,8 +12,8 @@ from helpers.derivatives import central_difference
 from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.lighting.attached import attached
-from mi_nerfattack.render.march import Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 

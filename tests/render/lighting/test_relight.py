@@ -18,8 +18,8 @@ from mi_nerfattack.fields import GridField, GridLayout, save_field
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.lighting.relight import Relighting
 from mi_nerfattack.render.lighting.surface import expected_surface, geometry
-from mi_nerfattack.render.march import Rays
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 RAW = 0.3
 RHO = small.sigmoid_to_linear(np.array(RAW))

@@ -1,0 +1,102 @@
+"""Rays, and what a march gives of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Rays:
+    """Rays in the world, and where a march places its samples on them.
+
+    Attributes:
+        origin: (3, n), metres.
+        direction: (3, n), unit vectors.
+        t_max: (n,), metres; where the ray ends.
+        jitter: (n,) in [0, 1), position of the sample in its interval.
+        active: (n,) mask.
+        gains: factors of the radiance of each field, (3, n) each; none for 1. They
+            are constants of every derivative.
+    """
+
+    origin: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0, 0, 1))
+    t_max: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
+    jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
+    active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+    gains: list[mi.Color3f] = field(default_factory=list)
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield what :func:`march` takes after the field, in its order."""
+        yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
+
+    def light(self, posed: Sequence[Any]) -> list[Any]:
+        """Return the fields with the rays' gains, one each unless there are none."""
+        if not self.gains:
+            return list(posed)
+        pairs = zip(posed, self.gains, strict=True)
+        return [item.with_gain(gain) for item, gain in pairs]
+
+
+def pick_rays(value: Any, index: mi.UInt32) -> Any:
+    """Gather rays of dataclasses and lists of arrays; one entry for all stays so."""
+    if isinstance(value, list):
+        return [pick_rays(item, index) for item in value]
+    if is_dataclass(value):
+        parts = {item.name: getattr(value, item.name) for item in fields(value)}
+        return type(value)(**{k: pick_rays(v, index) for k, v in parts.items()})
+    return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
+
+
+@dataclass
+class March:
+    """What a march gives, per ray.
+
+    Attributes:
+        radiance: (3, n) premultiplied radiance I, linear.
+        opacity: (n,) a = 1 - T(t_max).
+        moment: (n,) integral of t sigma T dt, metres; depth times opacity.
+    """
+
+    radiance: mi.Color3f = field(default_factory=lambda: mi.Color3f(0))
+    opacity: mi.Float = field(default_factory=lambda: mi.Float(0))
+    moment: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    @staticmethod
+    def zeros(count: int) -> March:
+        """Return a march of `count` empty rays."""
+        black = dr.zeros(mi.Color3f, count)
+        return March(black, dr.zeros(mi.Float, count), dr.zeros(mi.Float, count))
+
+    def copy(self) -> March:
+        """Return a march of the same values with no derivatives attached."""
+        colour = mi.Color3f(dr.detach(self.radiance))
+        opacity, moment = dr.detach(self.opacity), dr.detach(self.moment)
+        return March(colour, mi.Float(opacity), mi.Float(moment))
+
+    def plus(self, other: March, active: mi.Bool) -> March:
+        """Add another march on the rays of a mask (n,)."""
+        return March(
+            self.radiance + dr.select(active, other.radiance, 0),
+            self.opacity + dr.select(active, other.opacity, 0),
+            self.moment + dr.select(active, other.moment, 0),
+        )
+
+    def pair(self, other: March) -> mi.Float:
+        """Return the inner product with another march, ray by ray (n,)."""
+        return (
+            dr.dot(self.radiance, other.radiance)
+            + self.opacity * other.opacity
+            + self.moment * other.moment
+        )
+
+    @property
+    def depth(self) -> mi.Float:
+        """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
+        hit = self.opacity > 0
+        return dr.select(hit, self.moment / dr.select(hit, self.opacity, 1), dr.inf)

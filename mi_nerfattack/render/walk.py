@@ -1,0 +1,254 @@
+"""The way of rays from sample to sample, past one field or several.
+
+A :class:`Walk` follows the lattice of one field. A :class:`MergedWalk` merges the
+lattice intervals of all fields into segments on which the set of fields does not
+change; each is one sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
+
+MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
+
+
+@dataclass
+class Path:
+    """Rays in the frame of a field, and where they are inside its box.
+
+    Attributes:
+        o: (3, n), origins.
+        d: (3, n), directions per world metre.
+        heading: (3, n), directions of unit length.
+        near: (n,), metres in the world.
+        far: (n,), likewise.
+    """
+
+    o: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
+    d: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    near: mi.Float = field(default_factory=lambda: mi.Float(0))
+    far: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    @staticmethod
+    def of(posed: PosedField, rays: Rays) -> Path:
+        """Take rays into a field's frame."""
+        o, d = posed.to_local(rays.origin, rays.direction)
+        return Path(o, d, dr.normalize(d), *posed.interval(o, d, rays.t_max))
+
+    def at(self, t: mi.Float) -> mi.Point3f:
+        """Return points (3, n) at distances (n,) in world metres."""
+        return mi.Point3f(self.o + t * self.d)
+
+    def tangents(self, posed: PosedField, t_rays: Any) -> list[mi.Vector3f]:
+        """Return those of o, d and heading (3, n), of rays with tangents; 0 for None.
+
+        Args:
+            posed: the field.
+            t_rays: tangents of origins and directions in the world, (3, n) each.
+        """
+        if t_rays is None:
+            return [mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)]
+        t_o, t_d = (posed.turn(tangent) for tangent in t_rays)
+        along = self.heading * dr.dot(self.heading, t_d)
+        return [t_o, t_d, (t_d - along) * dr.rcp(dr.norm(self.d))]
+
+
+@dataclass
+class Segment:
+    """Part of rays that a sample stands for.
+
+    Attributes:
+        t: (n,), position of the sample, metres.
+        width: (n,), length of the part, metres.
+        active: (n,), rays that have one.
+        inside: (n,) for each field, rays on which it has one.
+    """
+
+    t: mi.Float
+    width: mi.Float
+    active: mi.Bool
+    inside: list[mi.Bool]
+
+    def depths(self, densities: Sequence[mi.Float]) -> list[mi.Float]:
+        """Return the optical depth of each field, (n,), 0 where there is none."""
+        return [dr.select(self.active, x * self.width, 0) for x in densities]
+
+
+@dataclass
+class Walk:
+    """Rays on their way through the lattice of one field.
+
+    Attributes:
+        paths: of the field, one.
+        jitter: (n,), position of the samples in their intervals.
+        index: (n,), the lattice interval ahead.
+    """
+
+    paths: list[Path] = field(default_factory=list)
+    jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
+    index: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    @staticmethod
+    def start(posed: PosedField, rays: Rays) -> tuple[Walk, mi.Bool]:
+        """Return rays before their first interval, and those that meet the box."""
+        path = Path.of(posed, rays)
+        index = dr.floor(posed.lattice_index(path.near))
+        active = mi.Bool(rays.active) & (path.near < path.far)
+        return Walk([path], rays.jitter, index), active
+
+    def next(
+        self, posed: Sequence[PosedField], active: mi.Bool
+    ) -> tuple[Walk, Segment]:
+        """Go on to the next interval in an occupied cell."""
+        found, t, width, active = seek(
+            posed[0], self.paths[0], self.index, self.jitter, active
+        )
+        walk = Walk(self.paths, self.jitter, found + 1)
+        return walk, Segment(t, width, active, [active])
+
+
+@dr.syntax
+def seek(
+    posed: PosedField, path: Path, index: mi.Float, jitter: mi.Float, active: mi.Bool
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Bool]:
+    """Advance rays (n,) to their next lattice interval in an occupied cell.
+
+    Returns:
+        index, sample position and width (metres) of the interval, and which rays
+        found one before they left the box; each (n,).
+    """
+    occupancy = posed.field.occupancy
+    t = mi.Float(0)
+    width = mi.Float(0)
+    searching = mi.Bool(active)
+    found = mi.Bool(False)
+    while searching:
+        start = dr.maximum(posed.lattice(index), path.near)
+        end = dr.minimum(posed.lattice(index + 1), path.far)
+        t = start + jitter * (end - start)
+        width = end - start
+        searching &= (start < path.far) & (index < MAX_INTERVALS)
+        unit = posed.field.unit(path.at(t))
+        distance, cell = occupancy.query(unit, searching)
+        found = searching & (distance == 0)
+        searching &= ~found
+        scale = posed.field.unit(mi.Point3f(path.d)) - posed.field.unit(mi.Point3f(0))
+        t_exit = t + occupancy.exit(unit, mi.Vector3f(scale), cell, distance)
+        jump = dr.maximum(index + 1, dr.floor(posed.lattice_index(t_exit)))
+        index = dr.select(searching, jump, index)
+    return index, t, dr.maximum(width, 0), found
+
+
+@dataclass
+class Cursor:
+    """One field's lattice interval at or ahead of the march, metres."""
+
+    following: mi.Float = field(default_factory=lambda: mi.Float(0))
+    start: mi.Float = field(default_factory=lambda: mi.Float(0))
+    end: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    @staticmethod
+    def before(posed: PosedField, path: Path) -> Cursor:
+        """Return a cursor before the first interval."""
+        missed = ~(path.near < path.far)
+        start = dr.select(missed, dr.inf, 0)
+        end = dr.select(missed, dr.inf, -1)  # spent: the first interval is sought
+        return Cursor(dr.floor(posed.lattice_index(path.near)), start, end)
+
+    def advance(
+        self,
+        posed: PosedField,
+        path: Path,
+        t: mi.Float,
+        jitter: mi.Float,
+        active: mi.Bool,
+    ) -> Cursor:
+        """Move on to the next occupied interval where the present one lies behind t."""
+        spent = active & (self.end <= t)
+        index, _, _, found = seek(posed, path, self.following, jitter, spent)
+        start = dr.maximum(posed.lattice(index), path.near)
+        end = dr.maximum(dr.minimum(posed.lattice(index + 1), path.far), start)
+        start, end = dr.select(found, start, dr.inf), dr.select(found, end, dr.inf)
+        return Cursor(
+            dr.select(spent, index + 1, self.following),
+            dr.select(spent, start, self.start),
+            dr.select(spent, end, self.end),
+        )
+
+
+@dataclass
+class MergedWalk:
+    """Rays on their way through the lattices of several fields.
+
+    Attributes:
+        paths: one of each field.
+        jitter: (n,), position of the samples in their segments.
+        cursors: one of each field.
+        t: (n,), end of the segments behind, metres.
+    """
+
+    paths: list[Path] = field(default_factory=list)
+    jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
+    cursors: list[Cursor] = field(default_factory=list)
+    t: mi.Float = field(default_factory=lambda: mi.Float(0))
+
+    @staticmethod
+    def start(posed: Sequence[PosedField], rays: Rays) -> tuple[MergedWalk, mi.Bool]:
+        """Return rays before their first segment, and those that may have one."""
+        paths = [Path.of(item, rays) for item in posed]
+        pairs = zip(posed, paths, strict=True)
+        cursors = [Cursor.before(item, path) for item, path in pairs]
+        walk = MergedWalk(paths, rays.jitter, cursors, mi.Float(0))
+        return walk, mi.Bool(rays.active)
+
+    def next(
+        self, posed: Sequence[PosedField], active: mi.Bool
+    ) -> tuple[MergedWalk, Segment]:
+        """Go on to the next segment that a field covers."""
+        fields = zip(self.cursors, posed, self.paths, strict=True)
+        cursors = [
+            cursor.advance(item, path, self.t, self.jitter, active)
+            for cursor, item, path in fields
+        ]
+        nearest = mi.Float(dr.inf)
+        for cursor in cursors:
+            nearest = dr.minimum(nearest, cursor.start)
+        active = active & (nearest < dr.inf)
+        begin = dr.maximum(self.t, nearest)
+        end = mi.Float(dr.inf)
+        inside = []
+        for cursor in cursors:
+            entered = cursor.start <= begin
+            end = dr.minimum(end, dr.select(entered, cursor.end, cursor.start))
+            inside.append(active & entered & (cursor.end < dr.inf))
+        width = dr.select(active, end - begin, 0)
+        sample = dr.select(active, begin + self.jitter * width, 0)
+        t = dr.select(active, end, self.t)
+        walk = MergedWalk(self.paths, self.jitter, cursors, t)
+        return walk, Segment(sample, width, active, inside)
+
+
+@dr.syntax
+def sample_count(posed: PosedField, rays: Rays) -> mi.Float:
+    """Count the samples a march would take if nothing stopped it, (n,).
+
+    Args:
+        posed: the field and its pose; only its occupancy is looked at.
+        rays: n rays.
+    """
+    walk, active = Walk.start(posed, rays)
+    count = mi.Float(0)
+    while active:
+        walk, here = walk.next([posed], active)
+        active = here.active
+        count += dr.select(active, 1.0, 0.0)
+    return count
