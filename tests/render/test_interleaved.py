@@ -78,39 +78,6 @@ def test_fields_apart_are_the_depth_composite(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(as_rows(exact), as_rows(folded), atol=2e-6)
 
 
-def test_overlap_against_a_float64_reference(rng: np.random.Generator) -> None:
-    fields, rays = pair(rng), make_rays(rng)
-    seen = InterleavedComposite().render(fields, rays, 0.0)
-    dt = 5e-4
-    t = (np.arange(int(7 / dt)) + 0.5) * dt
-    for k in range(0, COUNT, 6):
-        origin, direction = (
-            np.array(v, float)[:, k] for v in (rays.origin, rays.direction)
-        )
-        world = origin + t[:, None] * direction
-        sigma, emission = np.zeros(len(t)), np.zeros((len(t), 3))
-        for posed in fields:
-            pose = posed.pose
-            local = (world - pose.translation) @ pose.rotation / pose.scale
-            density, colour = small.eval_grid(posed.field, local)
-            sigma += density / pose.scale
-            emission += (density / pose.scale)[:, None] * colour
-        tau = np.concatenate([[0], np.cumsum(sigma * dt)])
-        through = np.exp(-(tau[:-1] + tau[1:]) / 2)
-        rows = as_rows(seen.total)[:, k]
-        # the midpoint rule errs by (step / blob)^2
-        np.testing.assert_allclose(rows[:3], through @ emission * dt, rtol=5e-3)
-        assert rows[3] == pytest.approx(1 - np.exp(-tau[-1]), rel=3e-3)
-        assert rows[4] == pytest.approx((through * sigma * t).sum() * dt, rel=5e-3)
-
-
-def test_shares_add_up_to_the_total(rng: np.random.Generator) -> None:
-    seen = InterleavedComposite().render(pair(rng), make_rays(rng), 0.0)
-    total = sum(as_rows(layer) for layer in seen.layers)
-    np.testing.assert_allclose(as_rows(seen.total), total, atol=1e-6)
-    assert all(layer.opacity.numpy().max() > 0.1 for layer in seen.layers)
-
-
 @pytest.mark.parametrize(
     ("move", "t_max"),
     [
