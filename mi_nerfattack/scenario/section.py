@@ -9,10 +9,10 @@ its keys lie *flat*, among those of the table.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -42,6 +42,7 @@ Count = Annotated[int, Field(ge=1)]
 Whole = Annotated[int, Field(ge=0)]
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 
+_Value = TypeVar("_Value")
 #: Keys and indices that lead to a value of the file.
 Location = tuple[str | int, ...]
 
@@ -79,21 +80,21 @@ class Section(BaseModel):
             else:
                 yield (name,), value
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _gather(cls, data: Any) -> Any:
+    def _gather(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Refuse unknown keys, and put those of each flat union under its alias."""
         if not isinstance(data, dict):
-            return data
-        known, data = cls.defaults(), {k: _frozen(v) for k, v in data.items()}
-        if unknown := [key for key in data if key not in known]:
-            allowed = ", ".join(known)
-            _refuse(dict.fromkeys(unknown, f"unknown key; allowed: {allowed}"))
+            return handler(data)
+        known = cls.defaults()
+        problem = f"unknown key; allowed: {', '.join(known)}"
+        unknown = {key: problem for key in data if key not in known}
+        data = {k: _frozen(v) for k, v in data.items() if k in known}
         for field in cls.model_fields.values():
             if isinstance(alias := field.validation_alias, str):
                 keys = _defaults(get_args(field.annotation)).keys() & data.keys()
                 data[alias] = {key: data.pop(key) for key in keys}
-        return data
+        return _with(unknown, lambda: handler(data))
 
     @model_serializer(mode="wrap")
     def _spread(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -141,22 +142,19 @@ class Kinds:
         member = [*chosen, *members][0]
         own, others = member.defaults(), _defaults(members)
         value, wrong = own[self.key] if given is None else given, {}
-        here = f'{self.key} = "{value}"'
+        here, without = f'{self.key} = "{value}"', f"without {self.key}"
         for key in [key for key in data if key in others and key not in own]:
-            if data[key] == others[key]:
-                data = {name: item for name, item in data.items() if name != key}
-                continue
             having = [member for member in members if key in member.defaults()]
-            wrong[key] = (
-                f"has no meaning {f'with {here}' if value else f'without {self.key}'}; "
-                f"leave it out, or set {self.key} to {_either(self._values(*having))}"
-            )
+            if data[key] != others[key]:
+                wrong[key] = (
+                    f"has no meaning {f'with {here}' if value else without}; leave it "
+                    f"out, or set {self.key} to {_either(self._values(*having))}"
+                )
         for key, field in member.model_fields.items():
             if field.is_required() and key not in data:
                 wrong[key] = f"is missing; {here} needs it"
-        if wrong:
-            _refuse(wrong)
-        return member.model_validate(data, context=info.context)
+        kept = {k: v for k, v in data.items() if k in own or k not in others}
+        return _with(wrong, lambda: member.model_validate(kept, context=info.context))
 
     def _values(self, *members: type[Section]) -> tuple[str | None, ...]:
         fields = [member.model_fields[self.key] for member in members]
@@ -165,19 +163,33 @@ class Kinds:
 
 def refuse(key: str, reason: str) -> NoReturn:
     """Raise an error of a key that a check of the whole section found."""
-    _refuse({key: reason})
+    raise ValidationError.from_exception_data(
+        "", [_error(tuple(key.split(".")), reason)]
+    )
 
 
-def _refuse(reasons: Mapping[str, str]) -> NoReturn:
-    errors = [
-        InitErrorDetails(
-            type=PydanticCustomError("told", "{why}", {"why": why}),
-            loc=tuple(key.split(".")),
-            input="",
-        )
-        for key, why in reasons.items()
-    ]
+def _with(reasons: Mapping[str, str], validate: Callable[[], _Value]) -> _Value:
+    """Validate, and raise what is wrong together with further reasons, by key."""
+    errors = [_error((key,), reason) for key, reason in reasons.items()]
+    try:
+        result = validate()
+    except ValidationError as err:
+        errors += [
+            _error(error["loc"], error["msg"], error["type"], error["input"])
+            for error in err.errors()
+            if error["loc"][:1] not in {(key,) for key in reasons}
+        ]
+    else:
+        if not errors:
+            return result
     raise ValidationError.from_exception_data("", errors)
+
+
+def _error(
+    place: Location, message: str, kind: Any = "told", value: Any = None
+) -> InitErrorDetails:
+    error = PydanticCustomError(kind, "{why}", {"why": message})
+    return InitErrorDetails(type=error, loc=place, input=value)
 
 
 def read_section(name: str, kind: Any, values: Any, folder: str | Path) -> Any:

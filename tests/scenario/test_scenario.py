@@ -133,6 +133,19 @@ def test_errors_name_key_and_line(write, old, new, line, words):
         assert f"{path}:{line}" in message
 
 
+def test_all_problems_of_a_table_are_told_at_once(write):
+    text = (
+        MINIMAL + "poses = 0\nfoo = 1\nsegment = 2\n[vehicle]\nspeed_ms = -1\nx = 1\n"
+    )
+    with pytest.raises(InputError) as caught:
+        load_scenario(write(text + 'model = "custom"\n'))
+    keys = [line.split(": ")[1] for line in str(caught.value).split("\n")]
+    assert sorted(keys) == [
+        *(f"attack.{key}" for key in ("foo", "poses", "segment")),
+        *(f"vehicle.{key}" for key in ("control_limit", "function", "speed_ms", "x")),
+    ]
+
+
 def test_a_wrong_object_is_one_problem(write):
     text = MINIMAL.replace("position_m = [1.0, 2.0, 0.0]\nscale", "scale")
     first = MINIMAL.index("[[objects]]")
