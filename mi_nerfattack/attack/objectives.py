@@ -13,12 +13,13 @@ from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.ranges import Positive, checked
 from mi_nerfattack.rollout.objective import AbstractObjective, StateHistory
-from mi_nerfattack.vehicle.dynamics import require_positive
 from mi_nerfattack.vehicle.route.route import Route, smooth_absolute
 
 
 @dataclass(frozen=True)
+@checked("CrossTrackDeviation")
 class CrossTrackDeviation:
     """Minus the distance from the lane centre, rounded at zero.
 
@@ -30,10 +31,7 @@ class CrossTrackDeviation:
     """
 
     route: Route
-    rounding_m: float = 0.05
-
-    def __post_init__(self) -> None:
-        require_positive("CrossTrackDeviation", rounding_m=self.rounding_m)
+    rounding_m: Positive = 0.05
 
     def __call__(self, state: Any) -> Any:
         """Evaluate at states (m, k): (k,), metres, at most 0."""
@@ -58,6 +56,7 @@ class AbsoluteDeviation:
 
 
 @dataclass(frozen=True)
+@checked("HeadingDeviation")
 class HeadingDeviation:
     """Minus the angle to the lane's direction, rounded at zero.
 
@@ -71,10 +70,7 @@ class HeadingDeviation:
     """
 
     route: Route
-    rounding: float = 0.02
-
-    def __post_init__(self) -> None:
-        require_positive("HeadingDeviation", rounding=self.rounding)
+    rounding: Positive = 0.02
 
     def __call__(self, state: Any) -> Any:
         """Evaluate at states (m, k): (k,), radians, at most 0."""
@@ -82,6 +78,7 @@ class HeadingDeviation:
 
 
 @dataclass(frozen=True)
+@checked("TargetDistance")
 class TargetDistance:
     """Distance to a path of the attacker's, rounded at zero.
 
@@ -94,10 +91,7 @@ class TargetDistance:
     """
 
     path: Route
-    rounding_m: float = 0.05
-
-    def __post_init__(self) -> None:
-        require_positive("TargetDistance", rounding_m=self.rounding_m)
+    rounding_m: Positive = 0.05
 
     def __call__(self, state: Any) -> Any:
         """Evaluate at states (m, k): (k,), metres, at least 0."""
@@ -105,6 +99,7 @@ class TargetDistance:
 
 
 @dataclass(frozen=True, eq=False)
+@checked("DepartureTime")
 class DepartureTime(AbstractObjective):
     """Expected time until the vehicle leaves its lane, seconds.
 
@@ -127,13 +122,8 @@ class DepartureTime(AbstractObjective):
     """
 
     route: Route
-    limit_m: float
-    softness_m: float = 0.25
-
-    def __post_init__(self) -> None:
-        require_positive(
-            "DepartureTime", limit_m=self.limit_m, softness_m=self.softness_m
-        )
+    limit_m: Positive
+    softness_m: Positive = 0.25
 
     def evaluate(self, states: StateHistory) -> Any:
         """See :meth:`AbstractObjective.evaluate`."""

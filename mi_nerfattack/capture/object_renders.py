@@ -15,6 +15,7 @@ from mi_nerfattack.backend.colour import straight_rgba
 from mi_nerfattack.capture.mesh.mesh import TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Share, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     from_fov,
@@ -31,6 +32,7 @@ _SHARE_BELOW, _LOWEST = 0.15, -0.4
 
 
 @dataclass(frozen=True)
+@checked()
 class Lighting:
     """White light of a constant part and a soft key light.
 
@@ -45,14 +47,9 @@ class Lighting:
         key: direction towards the key light, any length.
     """
 
-    ambient: float = 0.75
+    ambient: Share = 0.75
     sharpness: float = 16.0
     key: tuple[float, float, float] = (0.5, -0.6, 1.0)
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not 0 <= self.ambient <= 1:
-            raise InputError(f"ambient: {self.ambient}; must be in [0, 1]")
 
     def emitter(self) -> dict[str, Any]:
         """Describe the light as an `envmap` (64 x 128), z up."""

@@ -22,6 +22,7 @@ from mi_nerfattack.capture.colmap.reconstruct import (
 from mi_nerfattack.capture.transforms import begin_posed, write_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Count, Positive, Seed, checked
 from mi_nerfattack.render.camera.intrinsics import Camera
 
 _LEAST = 3
@@ -30,6 +31,7 @@ _MAX_SEED = 1 << 31  # of COLMAP's generator
 
 
 @dataclass(frozen=True)
+@checked()
 class PoseOptions:
     """How poses are estimated.
 
@@ -45,19 +47,9 @@ class PoseOptions:
 
     matching: Matching = "exhaustive"
     lens: Lens = "OPENCV"
-    long_edge_px: int = 1600
-    metres_per_unit: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.long_edge_px < 1:
-            raise InputError(f"long_edge_px: {self.long_edge_px}; must be at least 1")
-        scale = self.metres_per_unit
-        if scale is not None and not (np.isfinite(scale) and scale > 0):
-            raise InputError(f"metres_per_unit: {scale}; must be positive")
-        if not 0 <= self.seed < _MAX_SEED:
-            raise InputError(f"seed: {self.seed}; must be in [0, 2^31)")
+    long_edge_px: Count = 1600
+    metres_per_unit: Positive | None = None
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)

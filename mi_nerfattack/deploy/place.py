@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Count, Finite, Positive, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
 
 
 @dataclass(frozen=True)
+@checked("place")
 class Place:
     """Files of a scene in its forms, and what drives there.
 
@@ -36,18 +37,14 @@ class Place:
     objects: tuple[Path, ...]
     camera: Camera
     mount: CameraMount
-    period: float = 0.1
+    period: Positive = 0.1
     car: Car = CAR
     recording: Path | None = None
     server: str = "127.0.0.1:2000"
 
-    def __post_init__(self) -> None:
-        """Check the period."""
-        if not 0 < self.period < float("inf"):
-            raise InputError(f"place.period: {self.period!r}; a positive time, seconds")
-
 
 @dataclass(frozen=True)
+@checked()
 class Conditions:
     """What changes between drives at one place.
 
@@ -60,18 +57,14 @@ class Conditions:
     """
 
     sky: str = "day"
-    exposure_ev: float = 0.0
-    spp: int = 16
+    exposure_ev: Finite = 0.0
+    spp: Count = 16
     built_in: tuple[BuiltInObject, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the sky."""
         if self.sky not in DAYLIGHT:
             raise InputError(f"sky: {self.sky!r}; one of {', '.join(DAYLIGHT)}")
-        if not math.isfinite(self.exposure_ev):
-            raise InputError(f"exposure_ev: {self.exposure_ev}; must be finite")
-        if not isinstance(self.spp, int) or self.spp < 1:
-            raise InputError(f"spp: {self.spp!r}; at least 1 sample per pixel, whole")
 
 
 def bundled_place(name: str = "intersection") -> Place:

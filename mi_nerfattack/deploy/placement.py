@@ -12,6 +12,7 @@ from scipy.stats import truncnorm
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.ranges import NonNegative, Share, checked
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -23,6 +24,7 @@ _HALF_CAR_M = 0.9
 
 
 @dataclass(frozen=True)
+@checked("Scatter")
 class Scatter:
     """Deviations of vehicles from the lane centre, normal and cut.
 
@@ -32,20 +34,11 @@ class Scatter:
         close_share: share of the vehicles whose deviations are a fifth of the drawn.
     """
 
-    lateral_sd_m: float = 0.5
-    lateral_max_m: float = 1.5
-    heading_sd: float = 0.12
-    heading_max: float = 0.4
-    close_share: float = 0.4
-
-    def __post_init__(self) -> None:
-        for name in ("lateral_sd_m", "lateral_max_m", "heading_sd", "heading_max"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(
-                    f"Scatter.{name}: {getattr(self, name)!r}; at least 0, finite"
-                )
-        if not 0 <= self.close_share <= 1:
-            raise InputError(f"Scatter.close_share: {self.close_share!r}; in [0, 1]")
+    lateral_sd_m: NonNegative = 0.5
+    lateral_max_m: NonNegative = 1.5
+    heading_sd: NonNegative = 0.12
+    heading_max: NonNegative = 0.4
+    close_share: Share = 0.4
 
     def states(
         self, route: Route, arc: np.ndarray, rng: np.random.Generator

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.rays import RayBatch
+from mi_nerfattack.ranges import NonNegative, Positive, checked
 from mi_nerfattack.render.rays import March
 
 # Rounding may lift a white pixel above 1, where the sRGB curve has no derivative.
@@ -21,6 +20,7 @@ _OPACITY_DELTA = 0.02  # small: a bright sky shines through a road of opacity 0.
 
 
 @dataclass(frozen=True)
+@checked()
 class LossWeights:
     """Weights and shapes of the terms of the loss.
 
@@ -32,18 +32,10 @@ class LossWeights:
             an NGP on a CPU alone.
     """
 
-    huber: float = 0.1
-    depth: float = 0.1
-    opacity: float = 0.05
-    spread: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("depth", "opacity", "spread"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; must not be negative")
-        if not 0 < self.huber < math.inf:
-            raise InputError(f"huber: {self.huber}; must be positive")
+    huber: Positive = 0.1
+    depth: NonNegative = 0.1
+    opacity: NonNegative = 0.05
+    spread: NonNegative = 0.0
 
 
 def huber(error: Any, delta: float) -> Any:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fit.loss import LossWeights
 from mi_nerfattack.fit.scores import ViewScore
+from mi_nerfattack.ranges import Count, Fraction, Positive, SomeShare, Whole, checked
 
 
 @dataclass(frozen=True)
+@checked()
 class FitOptions:
     """How a field is fitted.
 
@@ -48,50 +48,23 @@ class FitOptions:
         loss: weights of the terms.
     """
 
-    steps: int | None = None
-    epochs: float = 50.0
-    budget_minutes: float | None = None
-    patience: int | None = None
-    batch_rays: int = 1 << 14
-    samples: int = 1 << 16
-    seed: int = 0
-    learning_rate: float = 1e-2
-    final_rate: float = 0.03
-    occupancy_resolution: int = 128
-    occupancy_every: int = 16
-    occupancy_start: int = 128
+    steps: Count | None = None
+    epochs: Positive = 50.0
+    budget_minutes: Positive | None = None
+    patience: Count | None = None
+    batch_rays: Count = 1 << 14
+    samples: Count = 1 << 16
+    seed: Whole = 0
+    learning_rate: Fraction = 1e-2
+    final_rate: SomeShare = 0.03
+    occupancy_resolution: Count = 128
+    occupancy_every: Count = 16
+    occupancy_start: Whole = 128
     sky: bool = True
     exposure: bool = False
     poses: bool = False
-    camera_rate: float = 0.02
+    camera_rate: Positive = 0.02
     loss: LossWeights = field(default_factory=LossWeights)
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in (
-            "steps",
-            "patience",
-            "batch_rays",
-            "samples",
-            "occupancy_resolution",
-            "occupancy_every",
-        ):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{name}: {value}; must be at least 1")
-        if self.seed < 0 or self.occupancy_start < 0:
-            raise InputError(
-                f"seed, occupancy_start: {self.seed}, {self.occupancy_start}; must "
-                "not be negative"
-            )
-        if not 0 < self.final_rate <= 1:
-            raise InputError(f"final_rate: {self.final_rate}; must be in (0, 1]")
-        for name in ("epochs", "budget_minutes", "camera_rate"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name}: {value}; must be positive")
-        if not 0 < self.learning_rate < 1:
-            raise InputError(f"learning_rate: {self.learning_rate}; must be in (0, 1)")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, flatten
+from mi_nerfattack.ranges import Count, Share, checked
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.training.dataset import shard_columns
@@ -40,6 +41,7 @@ class ShardRecord(Record):
 
 
 @dataclass(frozen=True)
+@checked("CollectSettings")
 class CollectSettings:
     """Choices of a collection; the same settings and site give the same frames.
 
@@ -59,29 +61,18 @@ class CollectSettings:
         roadside: sizes and places of the objects.
     """
 
-    frames: int = 9000
+    frames: Count = 9000
     seed: int = 0
-    shard: int = 64
-    group: int = 8
-    groups_a_texture: int = 2
-    object_share: float = 0.75
-    original_share: float = 0.1
+    shard: Count = 64
+    group: Count = 8
+    groups_a_texture: Count = 2
+    object_share: Share = 0.75
+    original_share: Share = 0.1
     spread_m: float = 3.0
     ahead_m: tuple[float, float] = (4.0, 20.0)
     margin_m: float = 2.0
     scatter: Scatter = field(default_factory=Scatter)
     roadside: Roadside = field(default_factory=Roadside)
-
-    def __post_init__(self) -> None:
-        for name in ("frames", "shard", "group", "groups_a_texture"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise InputError(f"CollectSettings.{name}: {value!r}; at least 1")
-        for name in ("object_share", "original_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(
-                    f"CollectSettings.{name}: {getattr(self, name)!r}; in [0, 1]"
-                )
 
     @property
     def shards(self) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+from mi_nerfattack.ranges import Count, Fraction, Share, Whole, checked
 from mi_nerfattack.training.collect import CollectSettings
 from mi_nerfattack.training.sources import (
     AbstractSource,
@@ -18,17 +19,10 @@ from mi_nerfattack.training.train import TrainSettings
 
 #: Scattered states and recoveries of the expert.
 CLONING = Mixture((Scattered(), ExpertDrives()), (0.7, 0.3))
-#: Least values of settings.
-_LEAST = {
-    "dagger_rounds": 0,
-    "dagger_epochs": 1,
-    "horizon": 1,
-    "seed": 0,
-    "validate_every": 1,
-}
 
 
 @dataclass(frozen=True)
+@checked()
 class ImitationSettings:
     """Choices of the whole way from a place to a policy.
 
@@ -54,16 +48,16 @@ class ImitationSettings:
         final: of those at the end.
     """
 
-    frames: Mapping[str, int]
-    validation_frames: Mapping[str, int] = field(default_factory=dict)
-    dagger_rounds: int = 0
-    dagger_frames: Mapping[str, int] = field(default_factory=dict)
-    dagger_epochs: int = 3
-    dagger_rate: float = 5e-4
-    expert_share: float = 0.0
-    horizon: int = 16
-    seed: int = 0
-    validate_every: int = 4
+    frames: Mapping[str, Whole]
+    validation_frames: Mapping[str, Whole] = field(default_factory=dict)
+    dagger_rounds: Whole = 0
+    dagger_frames: Mapping[str, Whole] = field(default_factory=dict)
+    dagger_epochs: Count = 3
+    dagger_rate: Fraction = 5e-4
+    expert_share: Share = 0.0
+    horizon: Count = 16
+    seed: Whole = 0
+    validate_every: Count = 4
     validate_in: tuple[str, ...] = ()
     cloning: AbstractSource = CLONING
     collecting: CollectSettings = field(default_factory=CollectSettings)
@@ -74,20 +68,6 @@ class ImitationSettings:
     final: EvaluateSettings = field(default_factory=lambda: EvaluateSettings(runs=2))
 
     def __post_init__(self) -> None:
-        for name in ("frames", "validation_frames", "dagger_frames"):
-            for site, count in getattr(self, name).items():
-                if not isinstance(count, int) or count < 0:
-                    raise InputError(f"{name}: {count!r} of {site!r}; at least 0")
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise InputError(
-                    f"{name}: {value!r}; a whole number of at least {least}"
-                )
-        if not 0 < self.dagger_rate < 1:
-            raise InputError(f"dagger_rate: {self.dagger_rate!r}; in (0, 1)")
-        if not 0 <= self.expert_share <= 1:
-            raise InputError(f"expert_share: {self.expert_share!r}; in [0, 1]")
         if self.dagger_rounds and not sum(self.dagger_frames.values()):
             raise InputError(
                 f"dagger_rounds: {self.dagger_rounds} without dagger_frames, which "

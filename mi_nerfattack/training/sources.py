@@ -15,6 +15,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.ranges import Share, checked
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -128,6 +129,7 @@ class ExpertDrives(AbstractSource):
 
 
 @dataclass(frozen=True)
+@checked()
 class PolicyDrives(AbstractSource):
     """A policy drives from the first pose of a group, the expert labels (DAgger).
 
@@ -141,12 +143,8 @@ class PolicyDrives(AbstractSource):
 
     weights: Path
     horizon: int = 16
-    expert_share: float = 0.0
+    expert_share: Share = 0.0
     kind: ClassVar[str] = "policy"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.expert_share <= 1:
-            raise InputError(f"expert_share: {self.expert_share!r}; in [0, 1]")
 
     def describe(self) -> dict[str, Any]:
         """Return numbers and the weights' checksum."""

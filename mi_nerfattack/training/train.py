@@ -15,6 +15,7 @@ import torch
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.ranges import Count, Fraction, checked
 from mi_nerfattack.training.augment import Augmentation
 from mi_nerfattack.training.dataset import FrameDataset
 from mi_nerfattack.training.validation import (
@@ -36,6 +37,7 @@ class TrainRecord(Record):
 
 
 @dataclass(frozen=True)
+@checked("TrainSettings")
 class TrainSettings:
     """Choices of a training run; the same settings and data give the same policy.
 
@@ -50,25 +52,13 @@ class TrainSettings:
         augmentation: changes of the training images.
     """
 
-    epochs: int = 10
-    batch: int = 128
-    learning_rate: float = 1e-3
+    epochs: Count = 10
+    batch: Count = 128
+    learning_rate: Fraction = 1e-3
     weight_decay: float = 1e-4
-    held_out: float = 0.1
+    held_out: Fraction = 0.1
     seed: int = 0
     augmentation: Augmentation = field(default_factory=Augmentation)
-
-    def __post_init__(self) -> None:
-        for name in ("epochs", "batch"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise InputError(f"TrainSettings.{name}: {value!r}; at least 1")
-        if not 0 < self.learning_rate < 1:
-            raise InputError(
-                f"TrainSettings.learning_rate: {self.learning_rate!r}; in (0, 1)"
-            )
-        if not 0 < self.held_out < 1:
-            raise InputError(f"TrainSettings.held_out: {self.held_out!r}; in (0, 1)")
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.ranges import Acute, Positive, checked
 from mi_nerfattack.vehicle.dynamics import (
     AbstractDynamics,
-    require_positive,
-    require_steer,
     soft_limit,
 )
 
 
 @dataclass(frozen=True)
+@checked("RateLimitedAckermann")
 class RateLimitedAckermann(AbstractDynamics):
     """`Ackermann` whose steering angle delta is a state that follows its command u.
 
@@ -36,21 +36,11 @@ class RateLimitedAckermann(AbstractDynamics):
         time_constant: tau, seconds.
     """
 
-    speed: float = 5.0
-    wheelbase: float = 2.7
-    max_steer: float = 0.6
-    max_steer_rate: float = 0.7
-    time_constant: float = 0.1
-
-    def __post_init__(self) -> None:
-        require_positive(
-            "RateLimitedAckermann",
-            speed=self.speed,
-            wheelbase=self.wheelbase,
-            max_steer_rate=self.max_steer_rate,
-            time_constant=self.time_constant,
-        )
-        require_steer("RateLimitedAckermann", self.max_steer)
+    speed: Positive = 5.0
+    wheelbase: Positive = 2.7
+    max_steer: Acute = 0.6
+    max_steer_rate: Positive = 0.7
+    time_constant: Positive = 0.1
 
     @property
     def state_size(self) -> int:

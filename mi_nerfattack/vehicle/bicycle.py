@@ -7,15 +7,15 @@ from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.ranges import Acute, Positive, checked
 from mi_nerfattack.vehicle.dynamics import (
     AbstractDynamics,
-    require_positive,
-    require_steer,
     soft_limit,
 )
 
 
 @dataclass(frozen=True)
+@checked("KinematicBicycle")
 class KinematicBicycle(AbstractDynamics):
     """Bicycle model of fixed speed whose position is that of its centre of gravity.
 
@@ -32,19 +32,10 @@ class KinematicBicycle(AbstractDynamics):
         max_steer: limit of |u|, radians, below pi/2.
     """
 
-    speed: float = 5.0
-    front_m: float = 1.35
-    rear_m: float = 1.35
-    max_steer: float = 0.6
-
-    def __post_init__(self) -> None:
-        require_positive(
-            "KinematicBicycle",
-            speed=self.speed,
-            front_m=self.front_m,
-            rear_m=self.rear_m,
-        )
-        require_steer("KinematicBicycle", self.max_steer)
+    speed: Positive = 5.0
+    front_m: Positive = 1.35
+    rear_m: Positive = 1.35
+    max_steer: Acute = 0.6
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""

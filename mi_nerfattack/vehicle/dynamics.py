@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Acute, Positive, checked
 
 
 def soft_limit(value: Any, limit: float) -> Any:
@@ -136,6 +137,7 @@ class AbstractDynamics(ABC):
 
 
 @dataclass(frozen=True)
+@checked("Dubins")
 class Dubins(AbstractDynamics):
     """Vehicle of fixed speed steered by its heading rate.
 
@@ -146,13 +148,8 @@ class Dubins(AbstractDynamics):
         max_heading_rate: limit of |u|, radians per second.
     """
 
-    speed: float = 5.0
-    max_heading_rate: float = 1.5
-
-    def __post_init__(self) -> None:
-        require_positive(
-            "Dubins", speed=self.speed, max_heading_rate=self.max_heading_rate
-        )
+    speed: Positive = 5.0
+    max_heading_rate: Positive = 1.5
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and heading rate (n,) in rad/s."""
@@ -165,6 +162,7 @@ class Dubins(AbstractDynamics):
 
 
 @dataclass(frozen=True)
+@checked("Ackermann")
 class Ackermann(AbstractDynamics):
     """Bicycle model of fixed speed steered by the angle of its front wheels.
 
@@ -178,13 +176,9 @@ class Ackermann(AbstractDynamics):
         max_steer: limit of |u|, radians, below pi/2.
     """
 
-    speed: float = 5.0
-    wheelbase: float = 2.7
-    max_steer: float = 0.6
-
-    def __post_init__(self) -> None:
-        require_positive("Ackermann", speed=self.speed, wheelbase=self.wheelbase)
-        require_steer("Ackermann", self.max_steer)
+    speed: Positive = 5.0
+    wheelbase: Positive = 2.7
+    max_steer: Acute = 0.6
 
     def derivative(self, state: Any, control: Any) -> Any:
         """Compute (3, n) from state (3, n) and steering angle (n,) in radians."""

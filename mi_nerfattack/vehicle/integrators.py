@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Count, checked
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.linear import solve_columns
 
@@ -89,6 +90,7 @@ class RK4(AbstractIntegrator):
 
 
 @dataclass(frozen=True)
+@checked("ImplicitMidpoint")
 class ImplicitMidpoint(AbstractIntegrator):
     """`x = x_prev + dt f((x_prev + x)/2, u)`: second order, A-stable, symmetric.
 
@@ -100,13 +102,7 @@ class ImplicitMidpoint(AbstractIntegrator):
         iterations: Newton iterations; the error squares with each.
     """
 
-    iterations: int = 6
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InputError(
-                f"ImplicitMidpoint.iterations: {self.iterations!r}; at least 1"
-            )
+    iterations: Count = 6
 
     def step(self, dynamics: AbstractDynamics, x: Any, u: Any, dt: float) -> Any:
         """Advance (m, n) by dt seconds; call `check` with the result."""

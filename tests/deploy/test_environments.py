@@ -301,9 +301,9 @@ def test_scene_without_a_sun_has_one_time_of_day():
 def test_conditions_and_place_are_checked(tmp_path):
     place = write_place(tmp_path)
     for change, message in (
-        ({"spp": 0}, "spp: 0; at least 1"),
+        ({"spp": 0}, "spp: 0; must be a whole number of at least 1"),
         ({"spp": 2.5}, "spp: 2.5; at least 1 sample per pixel, whole"),
-        ({"exposure_ev": math.inf}, "exposure_ev: inf; must be finite"),
+        ({"exposure_ev": math.inf}, "exposure_ev: inf; must be a finite number"),
     ):
         with pytest.raises(InputError, match=message):
             Conditions(**change)

@@ -236,7 +236,7 @@ def test_folder_of_other_settings_is_refused(site, weights, tmp_path):
 
 
 def test_exposures_of_the_weather_are_checked():
-    with pytest.raises(InputError, match="exposure_ev: nan; must be finite"):
+    with pytest.raises(InputError, match="exposure_ev: nan; must be a finite number"):
         Weather(("day",), (0.0, float("nan")))
 
 

@@ -7,12 +7,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.ranges import Acute, Positive, checked
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
 
 @dataclass(frozen=True, eq=False)
+@checked("LaneFollower")
 class LaneFollower(AbstractExpert):
     """Feed-forward of the route's curvature with feedback of both errors.
 
@@ -36,25 +37,18 @@ class LaneFollower(AbstractExpert):
     """
 
     route: Route
-    speed: float | None = None
-    look_ahead_m: float = 2.75
+    speed: Positive | None = None
+    look_ahead_m: Positive = 2.75
     preview_m: float = 0.25
     heading_preview_m: float = 0.0
-    max_heading_rate: float = 1.5
-    window_m: float = 1.0
+    max_heading_rate: Positive = 1.5
+    window_m: Positive = 1.0
 
     control_unit: ClassVar[str] = "rad/s"
 
     def __post_init__(self) -> None:
         if self.speed is None:
             object.__setattr__(self, "speed", float(self.route.speed_ms))
-        require_positive(
-            "LaneFollower",
-            speed=float(self.speed or 0),
-            look_ahead_m=self.look_ahead_m,
-            max_heading_rate=self.max_heading_rate,
-            window_m=self.window_m,
-        )
 
     def control(self, states: Any) -> np.ndarray:
         """Compute the heading rate of a Dubins vehicle.
@@ -76,6 +70,7 @@ class LaneFollower(AbstractExpert):
 
 
 @dataclass(frozen=True, eq=False)
+@checked("SteeringFollower")
 class SteeringFollower(AbstractExpert):
     """Lane follower of a car: the steering angle `atan(l w / v)` of a heading rate w.
 
@@ -86,14 +81,10 @@ class SteeringFollower(AbstractExpert):
     """
 
     follower: LaneFollower
-    wheelbase: float = 2.7
-    max_control: float = 0.6
+    wheelbase: Positive = 2.7
+    max_control: Acute = 0.6
 
     control_unit: ClassVar[str] = "rad"
-
-    def __post_init__(self) -> None:
-        require_positive("SteeringFollower", wheelbase=self.wheelbase)
-        require_steer("SteeringFollower", self.max_control)
 
     def control(self, states: Any) -> np.ndarray:
         """Compute steering angles (n,), radians, of states (n, m) or (m,)."""

@@ -1,0 +1,87 @@
+"""Ranges of numbers as types, and dataclasses that hold their fields to them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
+
+from mi_nerfattack.errors import InputError
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+SomeShare = Annotated[float, Field(gt=0, le=1)]
+Acute = Annotated[float, Field(gt=0, lt=math.pi / 2, description=", radians")]
+Whole = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=1 << 31)]
+
+_T = TypeVar("_T")
+
+
+def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
+    """Let a dataclass check its fields when an object is made; stands below it.
+
+    A field whose type is a range, or a mapping or alternative with one, raises
+    `InputError` for another type of number or a number outside. A `__post_init__`
+    of the class comes afterwards.
+
+    Args:
+        owner: what the message calls the object, ``owner.field``.
+    """
+
+    def decorate(cls: type[_T]) -> type[_T]:
+        further = cls.__dict__.get("__post_init__")
+
+        def check(self: Any) -> None:
+            for name, (hint, adapter) in _ranges(cls).items():
+                value = getattr(self, name)
+                plain = value.item() if isinstance(value, np.generic) else value
+                try:
+                    adapter.validate_python(plain, strict=True)
+                except ValidationError as err:
+                    where = f"{owner}.{name}" if owner else name
+                    problem = f"{value!r}; must be {_allowed(hint)}"
+                    raise InputError(f"{where}: {problem}") from err
+            if further is not None:
+                further(self)
+
+        cls.__post_init__ = check  # type: ignore[attr-defined]
+        return cls
+
+    return decorate
+
+
+@cache
+def _ranges(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
+    hints = get_type_hints(cls, include_extras=True)
+    return {n: (h, TypeAdapter(h)) for n, h in hints.items() if _range(h) is not None}
+
+
+def _range(hint: Any) -> Any:
+    """Return the range in a type, None where there is none."""
+    if get_origin(hint) is Annotated:
+        return hint
+    return next(filter(None, map(_range, get_args(hint))), None)
+
+
+def _allowed(hint: Any) -> str:
+    kind, field = get_args(_range(hint))
+    noun = "a whole number" if kind is int else "a finite number"
+    limits = {n: getattr(m, n) for m in field.metadata for n in _SIGNS if hasattr(m, n)}
+    if len(limits) == 2:
+        (low, least), (high, most) = limits.items()
+        interval = f"{_SIGNS[low]}{least:.10g}, {most:.10g}{_SIGNS[high]}"
+        return f"{noun} in {interval}{field.description or ''}"
+    words = {"gt": " above ", "ge": " of at least "}
+    return noun + "".join(f"{words[n]}{limit}" for n, limit in limits.items())
+
+
+_SIGNS = {"gt": "(", "ge": "[", "lt": ")", "le": "]"}
