@@ -14,6 +14,7 @@ from mi_nerfattack.errors import InputError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False, description=", seconds")]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -75,13 +76,14 @@ def _range(hint: Any) -> Any:
 def _allowed(hint: Any) -> str:
     kind, field = get_args(_range(hint))
     noun = "a whole number" if kind is int else "a finite number"
+    unit = field.description or ""
     limits = {n: getattr(m, n) for m in field.metadata for n in _SIGNS if hasattr(m, n)}
     if len(limits) == 2:
         (low, least), (high, most) = limits.items()
         interval = f"{_SIGNS[low]}{least:.10g}, {most:.10g}{_SIGNS[high]}"
-        return f"{noun} in {interval}{field.description or ''}"
+        return f"{noun} in {interval}{unit}"
     words = {"gt": " above ", "ge": " of at least "}
-    return noun + "".join(f"{words[n]}{limit}" for n, limit in limits.items())
+    return noun + "".join(f"{words[n]}{limit}" for n, limit in limits.items()) + unit
 
 
 _SIGNS = {"gt": "(", "ge": "[", "lt": ")", "le": "]"}

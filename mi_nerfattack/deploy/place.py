@@ -8,7 +8,7 @@ from pathlib import Path
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Count, Finite, Positive, checked
+from mi_nerfattack.ranges import Count, Finite, Seconds, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
 
@@ -37,7 +37,7 @@ class Place:
     objects: tuple[Path, ...]
     camera: Camera
     mount: CameraMount
-    period: Positive = 0.1
+    period: Seconds = 0.1
     car: Car = CAR
     recording: Path | None = None
     server: str = "127.0.0.1:2000"

@@ -302,12 +302,14 @@ def test_conditions_and_place_are_checked(tmp_path):
     place = write_place(tmp_path)
     for change, message in (
         ({"spp": 0}, "spp: 0; must be a whole number of at least 1"),
-        ({"spp": 2.5}, "spp: 2.5; at least 1 sample per pixel, whole"),
+        ({"spp": 2.5}, "spp: 2.5; must be a whole number of at least 1"),
         ({"exposure_ev": math.inf}, "exposure_ev: inf; must be a finite number"),
     ):
         with pytest.raises(InputError, match=message):
             Conditions(**change)
-    with pytest.raises(InputError, match="place.period: 0; a positive time"):
+    with pytest.raises(
+        InputError, match="place.period: 0; must be .* above 0, seconds"
+    ):
         replace(place, period=0)
     with pytest.raises(InputError, match="camera.width: 0; must be positive"):
         replace(place, camera=replace(place.camera, width=0))

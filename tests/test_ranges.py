@@ -1,0 +1,53 @@
+"""Ranges of numbers as types, and what their dataclasses refuse."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Acute, Count, Finite, Fraction, Whole, checked
+
+
+@dataclass(frozen=True)
+@checked("sizes")
+class Sizes:
+    count: Count | None = None
+    part: Fraction = 0.5
+    angle: Acute = 1.0
+    offset: Finite = 0.0
+    frames: Mapping[str, Whole] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.name == "none":
+            raise InputError("sizes.name: none")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"count": 0}, "sizes.count: 0; must be a whole number of at least 1"),
+        ({"count": 2.0}, "sizes.count: 2.0; must be a whole number"),
+        ({"count": "3"}, "sizes.count: '3'; must be a whole number"),
+        ({"count": True}, "sizes.count: True; must be a whole number"),
+        ({"part": 1}, r"sizes.part: 1; must be a finite number in \(0, 1\)"),
+        ({"part": math.nan}, "sizes.part: nan; must"),
+        ({"angle": 1.6}, r"sizes.angle: 1.6; must .* in \(0, 1.570796327\), radians"),
+        ({"offset": -math.inf}, "sizes.offset: -inf; must be a finite number$"),
+        ({"frames": {"a": -1}}, "sizes.frames: {'a': -1}; must .* of at least 0"),
+        ({"name": "none"}, "sizes.name: none"),
+    ],
+)
+def test_what_is_outside_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        Sizes(**change)
+
+
+def test_numbers_of_numpy_are_numbers():
+    found = Sizes(count=np.int64(2), part=np.float32(0.25), frames={"a": 0})
+    assert found.count == 2 and found.part == 0.25
