@@ -114,7 +114,7 @@ def metrics_document(
         seed: the run's seed; also that of the bootstrap.
         drives: all drives of the run, at least one.
         limits: departure limit of each route, metres.
-        cost: `wall_s`, `peak_memory_mb` and `renders`; more keys are kept.
+        cost: `wall_s`, `peak_memory_mb`, `renders` and, as of `Effort`, more.
 
     Returns:
         A document for `files.write_json`.
@@ -160,12 +160,13 @@ def validate(document: Any) -> None:
 
 
 class _Model(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+    model_config = pydantic.ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
 
 
 class _Run(_Model):
     run: pydantic.NonNegativeInt
     seed: pydantic.NonNegativeInt
+    steps: pydantic.PositiveInt
     cross_track_mean_m: pydantic.NonNegativeFloat
     cross_track_max_m: pydantic.NonNegativeFloat
     cross_track_total: pydantic.NonNegativeFloat
@@ -175,9 +176,12 @@ class _Run(_Model):
 class _Case(_Model):
     n: pydantic.PositiveInt
     cross_track_mean_m: pydantic.NonNegativeFloat
+    cross_track_mean_ci95_m: list[pydantic.NonNegativeFloat] | None
+    cross_track_mean_worst_run_m: pydantic.NonNegativeFloat
     cross_track_max_m: pydantic.NonNegativeFloat
     cross_track_total: pydantic.NonNegativeFloat
     steps_departed: pydantic.NonNegativeInt
+    drives_departed: pydantic.NonNegativeInt
     per_run: list[_Run]
 
     @pydantic.model_validator(mode="after")
@@ -191,17 +195,17 @@ class _Cost(_Model):
     wall_s: pydantic.NonNegativeFloat
     peak_memory_mb: pydantic.NonNegativeFloat
     renders: pydantic.NonNegativeInt
+    checkpoint_s: pydantic.NonNegativeFloat = 0.0
+    processes: pydantic.NonNegativeInt = 1
 
 
-class _Cases(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+class _Cases(_Model):
     unperturbed: _Case | None = None
     random: _Case | None = None
     gradient: _Case | None = None
 
 
-class _Environments(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(strict=True, extra="forbid")
+class _Environments(_Model):
     surrogate: _Cases | None = None
     deployment: _Cases | None = None
 
@@ -210,8 +214,11 @@ class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
     seed: pydantic.NonNegativeInt
+    departure_limits_m: dict[str, pydantic.PositiveFloat]
     routes: dict[str, _Environments] = pydantic.Field(min_length=1)
     cost: _Cost
+    object_poses: dict[str, Any] | None = None
+    ignored_changes: list[str] | None = None
 
 
 def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -142,9 +143,13 @@ class Piece(AbstractWork):
         pass
 
 
-def test_a_dead_worker_is_told():
-    with pytest.raises(InputError, match=r"ended by signal 9 in piece 2; it may have"):
-        Processes(1).run(Piece(signal.SIGKILL), range(8), lambda units: None)
+def test_a_dead_worker_is_told_in_a_line_and_leaves_no_other(capfd):
+    with pytest.raises(
+        InputError, match=r"ended by signal 9 in piece 2; it may"
+    ) as end:
+        Processes(2).run(Piece(signal.SIGKILL), range(8), lambda units: None)
+    assert "\n" not in str(end.value) and capfd.readouterr() == ("", "")
+    assert not multiprocessing.active_children()
 
 
 def test_an_error_in_a_worker_is_the_callers():
