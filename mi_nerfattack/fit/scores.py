@@ -16,6 +16,7 @@ from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
 MIN_EDGE_PX = 11  # of the window of SSIM
@@ -84,9 +85,8 @@ class FieldRenderer:
         """
         origin, rotation = pose_arrays(camera_to_world)
         o, d = generate_rays(camera, origin, rotation, 1)
-        half, far = mi.Float(0.5), mi.Float(dr.inf)
         with dr.suspend_grad():
-            result = march(self._posed, o, d, far, half, mi.Bool(True))
+            result = march(self._posed, Rays(o, d))
             behind = self._posed.background(d)
             if self._over_white:
                 behind = mi.Color3f(_WHITE)

@@ -35,7 +35,7 @@ def march_gradient(
     """
     if posed.has_gain or not posed.field.collects_points:
         mode = dr.ADMode.Backward
-        march_derivative(mode, posed, *rays, primal, cotangent, stop)
+        march_derivative(mode, posed, rays, primal, cotangent, stop)
         return
     start, width, total = 0, FIRST_RAYS, dr.width(rays.direction)
     capacity = CAPACITY

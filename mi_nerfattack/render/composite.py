@@ -215,7 +215,7 @@ class DepthComposite(AbstractComposite):
         if t_rays is not None:
             only_fields(posed, "a backdrop is not differentiated by rays", DETACH)
         tangents = [
-            march_derivative(mode, item, *rays, layer, none, stop, t_rays)[0]
+            march_derivative(mode, item, rays, layer, none, stop, t_rays)[0]
             if item.has_gradients or t_rays is not None
             else none
             for item, layer in zip(rays.light(posed), seen.layers, strict=True)
@@ -265,7 +265,7 @@ class DepthComposite(AbstractComposite):
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [
-            march_derivative(mode, item, *rays, seen.layers[k], parts[k], stop)[1:]
+            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop)[1:]
             for k, item in zip(wanted, fields, strict=True)
         ]
 
@@ -282,7 +282,7 @@ class DepthComposite(AbstractComposite):
 def _see(item: Layer, rays: Rays, stop: float) -> March:
     if isinstance(item, AbstractBackdrop):
         return item.march(rays, stop)
-    return march(item, *rays, stop)
+    return march(item, rays, stop)
 
 
 def select(

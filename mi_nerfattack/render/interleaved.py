@@ -53,7 +53,7 @@ class InterleavedComposite(AbstractComposite):
         """See :meth:`AbstractComposite.render`."""
         lit = rays.light(_fields(posed))
         if len(lit) == 1:  # nothing to merge
-            share = march(lit[0], *rays, stop)
+            share = march(lit[0], rays, stop)
             return Seen(share, [share])
         with dr.suspend_grad():
             walk, active = MergedWalk.start(lit, rays)

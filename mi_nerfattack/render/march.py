@@ -67,45 +67,28 @@ def private_gradients() -> Iterator[None]:
         dr.set_expand_threshold(before)
 
 
-def march(
-    posed: PosedField,
-    origin: mi.Point3f,
-    direction: mi.Vector3f,
-    t_max: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
-    stop: float = STOP,
-) -> March:
+def march(posed: PosedField, rays: Rays, stop: float = STOP) -> March:
     """Integrate radiance, opacity and depth moment along rays; not differentiable.
 
     Args:
         posed: the field and its pose.
-        origin: (3, n), metres in the world.
-        direction: (3, n), unit vectors.
-        t_max: (n,), metres; where the ray ends.
-        jitter: (n,) in [0, 1), position of the sample in its interval; 0.5 is the
-            midpoint rule.
-        active: (n,) mask; masked rays are empty.
+        rays: n rays; masked ones are empty. A jitter of 0.5 is the midpoint rule; gains
+            are left to `posed`.
         stop: transmittance below which a ray ends; bounds the error.
 
     Source: appendix A.1 to A.3, with the signs of Mildenhall et al. 2020, eq. 3.
     """
     with dr.suspend_grad():
-        rays = Rays(origin, direction, t_max, jitter, active)
-        heading = dr.normalize(posed.turn(direction))
+        heading = dr.normalize(posed.turn(rays.direction))
         walk, active = Walk.start(posed, rays)
         sums = integrate([posed], walk, active, [posed.eval], [heading], stop)
         return sums.march()
 
 
-def march_derivative(  # noqa: D417  one entry describes seven
+def march_derivative(  # noqa: D417  one entry describes three
     mode: dr.ADMode,
     posed: PosedField,
-    origin: mi.Point3f,
-    direction: mi.Vector3f,
-    t_max: mi.Float,
-    jitter: mi.Float,
-    active: mi.Bool,
+    rays: Rays,
     primal: March,
     cotangent: March,
     stop: float = STOP,
@@ -125,8 +108,7 @@ def march_derivative(  # noqa: D417  one entry describes seven
 
     Args:
         mode: forward or backward.
-        posed, origin, direction, t_max, jitter, active, stop: as in the pass
-            that gave `primal`.
+        posed, rays, stop: as in the pass that gave `primal`.
         primal: the result of :func:`march`.
         cotangent: derivative of the objective by radiance, opacity and moment;
             ignored in forward mode.
@@ -137,7 +119,6 @@ def march_derivative(  # noqa: D417  one entry describes seven
         the tangent of the march (forward mode; zeros otherwise), and the objective's
         derivative by origin and direction (3, n) (backward mode).
     """
-    rays = Rays(origin, direction, t_max, jitter, active)
     with dr.suspend_grad(), private_gradients():
         walk, active = Walk.start(posed, rays)
         with_rays = mode == dr.ADMode.Backward or t_rays is not None

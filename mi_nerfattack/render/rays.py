@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
@@ -30,10 +30,6 @@ class Rays:
     jitter: mi.Float = field(default_factory=lambda: mi.Float(0.5))
     active: mi.Bool = field(default_factory=lambda: mi.Bool(True))
     gains: list[mi.Color3f] = field(default_factory=list)
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield what :func:`march` takes after the field, in its order."""
-        yield from (self.origin, self.direction, self.t_max, self.jitter, self.active)
 
     def light(self, posed: Sequence[Any]) -> list[Any]:
         """Return the fields with the rays' gains, one each unless there are none."""

@@ -64,7 +64,7 @@ class FieldMarch(AbstractSceneMarch):
 
     def _record(self, rays: Rays) -> March:
         (posed,) = rays.light([self.posed])
-        return march(posed, *rays, self.stop)
+        return march(posed, rays, self.stop)
 
     def _state(self, rays: Rays) -> list[Any]:
         return [self, self.stop, dr.width(rays.direction), self.posed.state()]

@@ -21,6 +21,7 @@ from mi_nerfattack.fit.training import unpack
 from mi_nerfattack.io import files
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -96,14 +97,8 @@ def test_grid_learns_a_sphere(fitted):
 def test_fitted_sphere_is_solid_and_where_it_was(fitted):
     grid = fitted[2].field
     eye = 1.6 * directions(50).T
-    result = march(
-        PosedField(grid),
-        mi.Point3f(np.float32(eye)),
-        mi.Vector3f(np.float32(-eye / 1.6)),
-        mi.Float(dr.inf),
-        mi.Float(0.5),
-        mi.Bool(True),
-    )
+    rays = Rays(mi.Point3f(np.float32(eye)), mi.Vector3f(np.float32(-eye / 1.6)))
+    result = march(PosedField(grid), rays)
     assert np.median(result.opacity.numpy()) > 0.95
     assert abs(np.median(result.depth.numpy()) - (1.6 - RADIUS)) < 0.05
 

@@ -9,7 +9,7 @@ import numpy as np
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.rays import March, Rays
 
 ONES = np.ones(3)
 SMALL = GridLayout(levels=3, base_resolution=4, max_resolution=12)
@@ -180,11 +180,11 @@ def arguments(
     direction: mi.Vector3f,
     t_max: float = 10.0,
     jitter: float = 0.5,
-) -> tuple:
+) -> tuple[PosedField, Rays]:
     """Collect the arguments that march and march_derivative share, opaque."""
     numbers = [mi.Float(t_max), mi.Float(jitter)]
     dr.make_opaque(numbers)
-    return (posed, origin, direction, *numbers, mi.Bool(True))
+    return posed, Rays(origin, direction, *numbers)
 
 
 def half_occupied() -> tuple[GridField, mi.Point3f, mi.Vector3f]:

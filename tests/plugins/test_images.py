@@ -13,6 +13,7 @@ from helpers import small_fields as small
 from mi_nerfattack.fields import load_field, save_field
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -107,9 +108,7 @@ def test_integrator_shows_the_march(grid: Path, eye: str) -> None:
     image = render(loaded)
     ray = camera_rays(loaded)
     posed = PosedField(load_field(grid))
-    seen = march(
-        posed, ray.o, ray.d, mi.Float(dr.inf), mi.Float(0.5), mi.Bool(True), 0.0
-    )
+    seen = march(posed, Rays(ray.o, ray.d), 0.0)
     expected = [*seen.radiance, seen.opacity, seen.depth]
     expected += [*seen.radiance, seen.opacity, seen.depth]
     assert image.shape == (HEIGHT, WIDTH, 10)

@@ -47,7 +47,7 @@ def test_homogeneous_slab(density: float) -> None:
     # A sample counts for its interval: where that is opaque, depth knows no better.
     field.step_m = min(0.01, 0.05 / density)
     rays, o, d = rays_towards(np.zeros(3), 0.9)
-    seen = march(PosedField(field), *rays, 0.0)
+    seen = march(PosedField(field), rays, 0.0)
     colour = np.full(3, small.sigmoid_to_linear(np.array(0.3)))
     near, far = box_interval(o, d, Pose.identity(), 1.0)
     compare(seen, *piecewise([(near, far, density, colour)]))
@@ -59,7 +59,7 @@ def test_gaussian_blob(peak: float) -> None:
     place = Pose(np.eye(3), np.array([0.3, -0.2, 0.5]))
     rays, o, d = rays_towards(place.translation, 0.5)
     compare(
-        march(PosedField(field, place), *rays, 0.0),
+        march(PosedField(field, place), rays, 0.0),
         *quadrature([(field, place)], o, d),
     )
 

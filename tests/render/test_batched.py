@@ -48,7 +48,7 @@ def gradients(field: NGPField) -> list[np.ndarray]:
 
 def recorded(posed: PosedField, rays: Rays, primal: March, cotangent: March):
     attach(posed.field, NAMES)
-    march_derivative(dr.ADMode.Backward, posed, *rays, primal, cotangent, STOP)
+    march_derivative(dr.ADMode.Backward, posed, rays, primal, cotangent, STOP)
     return gradients(posed.field)
 
 
@@ -58,7 +58,7 @@ def test_equals_the_recorded_derivative(posed, rng, monkeypatch, capacity, block
     monkeypatch.setattr(batched, "CAPACITY", capacity)
     monkeypatch.setattr("mi_nerfattack.fields.cpu.matrices.BLOCK", block)
     rays = make_rays(rng)
-    primal = march(posed, *rays, STOP)
+    primal = march(posed, rays, STOP)
     cotangent = small.random_march(rng, COUNT)
     expected = recorded(posed, rays, primal, cotangent)
     attach(posed.field, NAMES)
@@ -72,7 +72,7 @@ def test_equals_the_recorded_derivative(posed, rng, monkeypatch, capacity, block
 @pytest.mark.parametrize("name", NAMES)
 def test_only_what_asks_gets_a_gradient(posed, rng, name) -> None:
     rays = make_rays(rng)
-    primal = march(posed, *rays, STOP)
+    primal = march(posed, rays, STOP)
     cotangent = small.random_march(rng, COUNT)
     attach(posed.field, (name,))
     batched.march_gradient(posed, rays, primal, cotangent, STOP)
@@ -83,7 +83,7 @@ def test_only_what_asks_gets_a_gradient(posed, rng, name) -> None:
 def test_rays_that_miss_add_nothing(posed, rng) -> None:
     rays = make_rays(rng)
     rays.origin += mi.Vector3f(0, 50, 0)
-    primal = march(posed, *rays, STOP)
+    primal = march(posed, rays, STOP)
     attach(posed.field, NAMES)
     batched.march_gradient(posed, rays, primal, small.random_march(rng, COUNT), STOP)
     assert all((found == 0).all() for found in gradients(posed.field))
@@ -91,7 +91,7 @@ def test_rays_that_miss_add_nothing(posed, rng) -> None:
 
 def test_gradients_add_up_over_passes(posed, rng) -> None:
     rays = make_rays(rng)
-    primal = march(posed, *rays, STOP)
+    primal = march(posed, rays, STOP)
     cotangent = small.random_march(rng, COUNT)
     attach(posed.field, NAMES)
     batched.march_gradient(posed, rays, primal, cotangent, STOP)
@@ -104,7 +104,7 @@ def test_gradients_add_up_over_passes(posed, rng) -> None:
 def test_nothing_is_compiled_for_other_numbers_of_points(posed, rng) -> None:
     def run(count: int) -> list:
         rays = make_rays(rng, count)
-        primal = march(posed, *rays, STOP)
+        primal = march(posed, rays, STOP)
         cotangent = small.random_march(rng, count)
         attach(posed.field, NAMES)
         dr.eval(rays, primal, cotangent)  # NumPy's strides are part of a kernel

@@ -16,7 +16,7 @@ from mi_nerfattack.render.composite import DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.rays import March, Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -42,7 +42,7 @@ def test_error_falls_by_four_when_the_step_halves(overlap: bool) -> None:
         posed = [PosedField(*blob) for blob in blobs]
         seen = InterleavedComposite().render(posed, rays, 0.0).total
         if not overlap:
-            seen = march(posed[0], *rays, 0.0)
+            seen = march(posed[0], rays, 0.0)
         return np.array(
             [
                 np.sqrt(np.mean((a - b) ** 2))
@@ -60,7 +60,7 @@ def test_error_falls_by_four_when_the_step_halves(overlap: bool) -> None:
 def test_step_bounds_the_error(step: float, peak: float) -> None:
     field = GaussianField(peak, 0.5, 0.7, step)
     rays, o, d = rays_towards(np.zeros(3), 0.5, 256)
-    seen = numbers(march(PosedField(field), *rays, 0.0))
+    seen = numbers(march(PosedField(field), rays, 0.0))
     expected = quadrature([(field, Pose.identity())], o, d)
     near, far = box_interval(o, d, Pose.identity(), field.half)
     length = far - near
@@ -90,15 +90,7 @@ def test_step_bounds_the_error_at_kinks(step: float) -> None:
 
     start = rng.uniform(2, 3, 32).astype(np.float32)  # the lattice starts at the eye
     origin = mi.Point3f(-mi.Float(start), 0.13, -0.4)
-    seen = march(
-        PosedField(field),
-        origin,
-        mi.Vector3f(1, 0, 0),
-        mi.Float(np.inf),
-        mi.Float(0.5),
-        mi.Bool(True),
-        0.0,
-    )
+    seen = march(PosedField(field), Rays(origin, mi.Vector3f(1, 0, 0)), 0.0)
     inner = planes[(planes > -1) & (planes < 1)]
     x = np.concatenate([[-1], inner, [1]])
     log = np.interp(x, planes, height)

@@ -61,7 +61,7 @@ def test_one_field_is_its_march(rng: np.random.Generator) -> None:
         posed = PosedField(field, Pose.upright((0.1, 0.0, 0.0), 0.3, 1.2))
         seen = InterleavedComposite().render([posed], rays, 0.0).total
         np.testing.assert_allclose(
-            as_rows(seen), as_rows(march(posed, *rays, 0.0)), rtol=1e-5, atol=1e-6
+            as_rows(seen), as_rows(march(posed, rays, 0.0)), rtol=1e-5, atol=1e-6
         )
 
 

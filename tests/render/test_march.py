@@ -15,7 +15,7 @@ from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.rays import March, Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -91,14 +91,8 @@ def test_rays_that_miss_are_empty_and_infinitely_far(kwargs) -> None:
 
 def test_masked_rays_are_empty() -> None:
     origin = mi.Point3f([-3, -3], 0, 0)
-    seen = march(
-        PosedField(small.homogeneous()),
-        origin,
-        mi.Vector3f(1, 0, 0),
-        mi.Float(10),
-        mi.Float(0.5),
-        mi.Bool([True, False]),
-    )
+    rays = Rays(origin, mi.Vector3f(1, 0, 0), active=mi.Bool([True, False]))
+    seen = march(PosedField(small.homogeneous()), rays)
     assert seen.opacity[0] > 0.7 and seen.opacity[1] == 0
 
 

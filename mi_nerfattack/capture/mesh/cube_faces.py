@@ -16,6 +16,7 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 _LONGEST_PX = 256
 _MAX_PX = 8192
@@ -133,17 +134,15 @@ def _render(
     away = float(np.abs(np.stack([field.lower, field.upper]) - middle).max())
     eye = middle + 1.1 * away * normal
     origin = eye + row[:, None, None] * up + column[:, None] * right
-    half, far = mi.Float(0.5), mi.Float(dr.inf)
+    half = mi.Float(0.5)
     dr.make_opaque(half)
     with dr.suspend_grad():
-        seen = march(
-            posed,
+        rays = Rays(
             mi.Point3f(np.ascontiguousarray(origin.reshape(-1, 3).T, np.float32)),
             mi.Vector3f(*map(float, -normal)),
-            far,
-            half,
-            mi.Bool(True),
+            jitter=half,
         )
+        seen = march(posed, rays)
         dr.eval(seen)
     return straight_rgba(
         seen.radiance.numpy().T.reshape(height, width, 3),

@@ -16,6 +16,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 
 _OPAQUE = 0.5  # opacity of one voxel from which there is a surface
 _BLOCK = np.ones((3, 3, 3))
@@ -196,7 +197,7 @@ def seen_colours(
         eye = points[part] + _OUTSIDE * voxel * normals[part]
         origin, direction = _point(eye), mi.Vector3f(_point(-normals[part]))
         with dr.suspend_grad():
-            seen = march(posed, origin, direction, far, half, mi.Bool(True))
+            seen = march(posed, Rays(origin, direction, far, half))
             place = _point(points[part])
             _, own = field.eval(place, direction, mi.Bool(True))
             clear = seen.opacity > _FAINT

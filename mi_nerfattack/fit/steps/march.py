@@ -45,7 +45,7 @@ class MarchStep:
         order = mi.UInt32(dr.argsort(count))
         sorted_rays = pick_rays(rays, order)
         with dr.suspend_grad():
-            found = march(self.posed, *sorted_rays, STOP)
+            found = march(self.posed, sorted_rays, STOP)
             primal = _put_back(found, order)
         dr.eval(primal, random)
         score, cotangent = self.source.compare(draw, primal, rays.active)
@@ -62,7 +62,7 @@ class MarchStep:
                 march_gradient(self.posed, rays, found, cotangent, STOP)
                 return
             _, by_origin, by_direction = march_derivative(
-                dr.ADMode.Backward, self.posed, *rays, found, cotangent, STOP
+                dr.ADMode.Backward, self.posed, rays, found, cotangent, STOP
             )
         self.source.backward_rays(
             draw, _put_back(by_origin, order), _put_back(by_direction, order)

@@ -174,7 +174,7 @@ def ratio(lit: mi.Color3f, unshadowed: mi.Color3f) -> mi.Color3f:
 def _transmittance(objects: list[PosedField], rays: Rays, stop: float) -> mi.Float:
     passed = mi.Float(1)
     for item in objects:
-        passed *= 1 - march(item, *rays, stop).opacity
+        passed *= 1 - march(item, rays, stop).opacity
     return passed
 
 

@@ -103,13 +103,13 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
     Source: appendix A.3 for the depth.
     """
     with dr.suspend_grad():
-        primal = march(shape, *rays, stop)
+        primal = march(shape, rays, stop)
         active = rays.active & (primal.opacity > 0)
         rate = dr.select(active, 1 / primal.opacity, 0)
         depth = dr.select(active, primal.moment * rate, 0)
         by_depth = March(mi.Color3f(0), -depth * rate, rate)
         mode = dr.ADMode.Backward
-        slope = march_derivative(mode, shape, *rays, primal, by_depth, stop)[1]
+        slope = march_derivative(mode, shape, rays, primal, by_depth, stop)[1]
         slope += rate * _entry_slope(shape, rays, depth, active)
         length = dr.norm(slope)
         clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)

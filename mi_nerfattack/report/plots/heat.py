@@ -27,6 +27,7 @@ from mi_nerfattack.render.camera.intrinsics import (
 )
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
 
 #: Sides of the object, by the compass of its own frame: degrees about z from +x.
@@ -270,8 +271,7 @@ def _render(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return premultiplied radiance (height, width, 3) and opacity."""
     origin, direction = generate_rays(camera, *pose_arrays(pose), 1)
-    far, middle = mi.Float(dr.inf), mi.Float(0.5)
-    seen = march(posed, origin, direction, far, middle, mi.Bool(True))
+    seen = march(posed, Rays(origin, direction))
     dr.eval(seen.radiance, seen.opacity)
     shape = (camera.height, camera.width)
     radiance = seen.radiance.numpy().T.reshape(*shape, 3)
