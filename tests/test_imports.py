@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "mi_nerfattack"
 # Each part imports only what stands to its left.
 ORDER = (
-    "_lazy errors ranges backend io system vehicle policy scenes fields render rollout "
+    "errors ranges backend io system vehicle policy scenes fields render rollout "
     "capture plugins attack deploy fit scenario evaluation training report experiment "
     "robot commands cli bench"
 ).split()

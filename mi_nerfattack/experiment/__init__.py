@@ -1,10 +1,5 @@
 """One attack as a job: stages, run folder, results."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mi_nerfattack._lazy import lazy
-
-if TYPE_CHECKING:
-    from .job import Job as Job
-
-__getattr__, __dir__ = lazy(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,17 +1,5 @@
 """Optimise a field to posed images."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mi_nerfattack._lazy import lazy
-
-if TYPE_CHECKING:
-    from .fit import fit_grid as fit_grid
-    from .fit import fit_ngp as fit_ngp
-    from .fit import fit_object as fit_object
-    from .loss import LossWeights as LossWeights
-    from .options import FitOptions as FitOptions
-    from .options import FitProgress as FitProgress
-    from .options import FitResult as FitResult
-    from .scores import FieldRenderer as FieldRenderer
-
-__getattr__, __dir__ = lazy(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,17 +1,5 @@
 """Files of all kinds, checked and atomic: the only place that opens user files."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mi_nerfattack._lazy import lazy
-
-if TYPE_CHECKING:
-    from .exr import read_layers as read_layers
-    from .exr import read_metadata as read_metadata
-    from .exr import write_layers as write_layers
-    from .files import read_image as read_image
-    from .files import read_json as read_json
-    from .files import write_image as write_image
-    from .files import write_json as write_json
-    from .video import write_video as write_video
-
-__getattr__, __dir__ = lazy(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

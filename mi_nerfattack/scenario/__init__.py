@@ -1,15 +1,5 @@
 """The scenario file as models."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mi_nerfattack._lazy import lazy
-
-if TYPE_CHECKING:
-    from .policy import PolicySection as PolicySection
-    from .policy import load_policy as load_policy
-    from .scenario import Scenario as Scenario
-    from .scenario import load_scenario as load_scenario
-    from .world import World as World
-    from .world import build_world as build_world
-
-__getattr__, __dir__ = lazy(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,14 +1,5 @@
 """Experts that follow a route: what policies imitate."""
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mi_nerfattack._lazy import lazy
-
-if TYPE_CHECKING:
-    from .base import AbstractExpert as AbstractExpert
-    from .choose import expert_for as expert_for
-    from .lane_follower import LaneFollower as LaneFollower
-    from .lane_follower import SteeringFollower as SteeringFollower
-    from .pid import PIDExpert as PIDExpert
-
-__getattr__, __dir__ = lazy(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

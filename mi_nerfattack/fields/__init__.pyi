@@ -1,0 +1,10 @@
+from .base import AbstractField as AbstractField
+from .grid import GridField as GridField
+from .grid import GridLayout as GridLayout
+from .io import load_field as load_field
+from .io import load_grid as load_grid
+from .io import save_field as save_field
+from .ngp import NGPField as NGPField
+from .ngp import NGPLayout as NGPLayout
+from .occupancy import Occupancy as Occupancy
+from .splats import read_splats as read_splats
