@@ -6,8 +6,6 @@ from .camera.pose import Pose as Pose
 from .composite import AbstractComposite as AbstractComposite
 from .composite import DepthComposite as DepthComposite
 from .interleaved import InterleavedComposite as InterleavedComposite
-from .rays import March as March
-from .rays import Rays as Rays
 from .pathtrace.frames import FrameRenderer as FrameRenderer
 from .pathtrace.frames import write_frame as write_frame
 from .pathtrace.load import load_scene as load_scene
@@ -15,4 +13,6 @@ from .pathtrace.sequence import Shot as Shot
 from .pathtrace.sequence import render_folder as render_folder
 from .pathtrace.sequence import render_video as render_video
 from .posed import PosedField as PosedField
+from .rays import March as March
+from .rays import Rays as Rays
 from .splats import SplatBackground as SplatBackground
