@@ -8,13 +8,14 @@ import numpy as np
 from pydantic import Field
 
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.ranges import Count, Positive
 from mi_nerfattack.rollout.adjoint import (
     AbstractAdjoint,
     Checkpointed,
     KeptBackgrounds,
     Replay,
 )
-from mi_nerfattack.scenario.section import Count, Kinds, Positive, Section
+from mi_nerfattack.scenario.section import Kinds, Section
 
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 

@@ -17,6 +17,7 @@ from mi_nerfattack.attack.objectives import (
     TargetDistance,
 )
 from mi_nerfattack.attack.user_cost import UserCost
+from mi_nerfattack.ranges import Finite, Positive, SomeShare
 from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.rollout.objective import (
     AbstractObjective,
@@ -27,7 +28,7 @@ from mi_nerfattack.rollout.objective import (
 )
 from mi_nerfattack.rollout.reduction import AbstractReduction, CVaR, Mean, Worst
 from mi_nerfattack.scenario.named_file import Code, File
-from mi_nerfattack.scenario.section import Finite, Kinds, Positive, Section, Trust
+from mi_nerfattack.scenario.section import Kinds, Section, Trust
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.state import to_state
@@ -63,7 +64,7 @@ class DiscountWeights(Section):
     """Weights that fade with time."""
 
     weights: Literal["discount"]
-    discount_per_s: Annotated[float, Field(gt=0, le=1)]
+    discount_per_s: SomeShare
 
     def build(self, steps: int, dt: float) -> np.ndarray:
         """Return the weights."""
@@ -249,7 +250,7 @@ class CVaRReduction(Section):
     """The mean of the largest costs."""
 
     reduction: Literal["cvar"]
-    cvar_fraction: Annotated[float, Field(gt=0, le=1)]
+    cvar_fraction: SomeShare
 
     def build(self) -> AbstractReduction:
         """Make the reduction."""

@@ -40,18 +40,9 @@ from mi_nerfattack.policy.preprocess import (
 )
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.policy.weights import load_drjit_state, load_state
+from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import Code, File
-from mi_nerfattack.scenario.section import (
-    Count,
-    Finite,
-    Kinds,
-    Positive,
-    Section,
-    Trust,
-    Whole,
-    read_section,
-    refuse,
-)
+from mi_nerfattack.scenario.section import Kinds, Section, Trust, read_section, refuse
 from mi_nerfattack.scenario.user_code import check_trust
 
 FILTERS = {"antialias": antialias, "bilinear": bilinear, "area": area}

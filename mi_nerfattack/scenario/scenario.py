@@ -19,23 +19,14 @@ from tomlkit.items import AoT, Item, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Count, Finite, NonNegative, Positive, Whole
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.scenario.attack import AttackSection
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import PilotNetSection, PolicySection
-from mi_nerfattack.scenario.section import (
-    Count,
-    Finite,
-    Location,
-    NonNegative,
-    Positive,
-    Section,
-    Whole,
-    problems,
-    refuse,
-)
+from mi_nerfattack.scenario.section import Location, Section, problems, refuse
 from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
 
 STEERED = ("ackermann", "ackermann_rate", "bicycle")

@@ -35,11 +35,6 @@ from pydantic_core.core_schema import with_info_plain_validator_function
 
 from mi_nerfattack.errors import InputError
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-Whole = Annotated[int, Field(ge=0)]
 Trust = Annotated[bool, Field(exclude=True)]  # results do not depend on it
 
 _Value = TypeVar("_Value")

@@ -8,17 +8,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import AnyCode
-from mi_nerfattack.scenario.section import (
-    Count,
-    Finite,
-    Kinds,
-    Positive,
-    Section,
-    Trust,
-    Whole,
-    refuse,
-)
+from mi_nerfattack.scenario.section import Kinds, Section, Trust, refuse
 from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
 from mi_nerfattack.vehicle.bicycle import KinematicBicycle
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, Ackermann, Dubins

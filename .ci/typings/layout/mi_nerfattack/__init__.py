@@ -1,0 +1,1 @@
+../../../../mi_nerfattack/__init__.py

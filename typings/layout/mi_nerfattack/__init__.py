@@ -1,1 +1,0 @@
-../../../mi_nerfattack/__init__.py
