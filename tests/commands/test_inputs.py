@@ -55,14 +55,6 @@ def with_infinity(folder: Path) -> None:
     path.write_text(path.read_text().replace(repr(matrix[0][2]), "1e999"))
 
 
-def cut(name: str) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        raw = (folder / name).read_bytes()
-        (folder / name).write_bytes(raw[: len(raw) // 2])
-
-    return change
-
-
 def garbage(name: str) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         (folder / name).write_bytes(np.random.default_rng(1).bytes(500))
