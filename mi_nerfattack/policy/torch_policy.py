@@ -1,4 +1,4 @@
-"""Interface of a driving policy to the closed loop, and the bridge to torch."""
+"""Policies that are modules of torch, with their derivatives."""
 
 from __future__ import annotations
 
