@@ -60,6 +60,7 @@ def test_both_at_once_go_on_from_their_tensors(single_thread):
     assert whole.best_offsets.any()
 
 
+@pytest.mark.slow
 def test_a_run_says_where_the_objects_stand(scenario_folder, tmp_path):
     text = (scenario_folder / "scenario.toml").read_text()
     scenario = scenario_folder / "both.toml"

@@ -150,6 +150,7 @@ def test_options_out_of_range(wrong):
         FitOptions(**wrong)
 
 
+@pytest.mark.slow
 def test_command_fits_a_folder(tmp_path, capsys):
     from mi_nerfattack.commands.fit import Fit
     from mi_nerfattack.fields import load_field

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.derivatives import Derivatives, images
-from helpers.variants import MONO, RGB, SPECTRAL
+from helpers.variants import MONO, RGB, SPECTRAL, later
 
 from mi_nerfattack.fields import GridField, NGPField, save_field
 from mi_nerfattack.render.lighting.spectrum import emission
@@ -25,6 +25,9 @@ pytestmark = pytest.mark.usefixtures("each_variant")
 WIDTH, HEIGHT = 12, 8
 #: For what does not meet the conversion of colours.
 IN_RGB = pytest.mark.parametrize("each_variant", RGB, indirect=True)
+IN_RGB_FIRST = pytest.mark.parametrize(
+    "each_variant", [*RGB, *later(*SPECTRAL, *MONO)], indirect=True
+)
 BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 NGP_PARAMETERS = ("table", "density_weights", "colour_weights", "sky")
 
@@ -224,6 +227,7 @@ def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=atol)
 
 
+@IN_RGB_FIRST
 @pytest.mark.parametrize(
     ("seeing", "eye"),
     [("path", (3, 2, 1)), ("direct", (0.7, 0.5, 0)), ("prb", (3, 2, 1))],
@@ -326,7 +330,9 @@ def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
 
 
 @IN_RGB
-@pytest.mark.parametrize("composite", ["interleaved", "depth"])
+@pytest.mark.parametrize(
+    "composite", [pytest.param("interleaved", marks=pytest.mark.slow), "depth"]
+)
 def test_touching_objects(grid: str, rng, composite: str) -> None:
     beside = mi.ScalarTransform4f().translate([0, 2, 0])
     one, two = volume(grid), volume(grid, to_world=beside)

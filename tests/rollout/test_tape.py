@@ -32,6 +32,7 @@ def assert_adjoints_agree(toy, loop, horizon, attached):
             assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attached", [True, False])
 def test_adjoints_agree(toy, attached):
     from mi_nerfattack.vehicle.integrators import RK4

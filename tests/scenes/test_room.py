@@ -123,6 +123,7 @@ def test_tape_is_green_where_the_loop_is(scene) -> None:
         assert np.all(np.ptp(albedo(offset), axis=1) < 0.1)
 
 
+@pytest.mark.slow
 def test_pictures_from_the_car(scene) -> None:
     """Exposed, the tape ahead, little noise at 16 samples, and no two sides alike."""
     renderer = ViewRenderer(scene, from_fov(100, 52, 90.0))

@@ -272,7 +272,9 @@ def bundled_site(name: str, **changes) -> PlaceSite:
     return PlaceSite(name, place, Weather(spp=1, **changes))
 
 
-@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+@pytest.mark.parametrize(
+    "name", ["surrogate", pytest.param("mitsuba", marks=pytest.mark.slow)]
+)
 def test_nothing_is_compiled_after_the_first_shard(name, tmp_path):
     site = bundled_site(name)
     routes = load_routes(site.place.routes)

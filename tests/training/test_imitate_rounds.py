@@ -70,6 +70,7 @@ def test_rows_that_are_held_out_are_never_trained_on(rounds, tmp_path):
     assert len(result.shards) == (48 + 24 + 24) // 4
 
 
+@pytest.mark.slow
 def test_rounds_of_other_seeds_have_other_frames(tmp_path):
     frames, order = {}, {}
     for seed in (0, 1):
@@ -93,6 +94,7 @@ def test_weights_to_start_with_are_not_those_of_the_run_before(tmp_path):
         imitate([SITE], ROUTES, settings, tmp_path, HERE, start=PilotNet(2))
 
 
+@pytest.mark.slow
 def test_frames_of_rounds_that_are_left_out_are_not_recorded(tmp_path):
     imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE)
     fewer = dataclasses.replace(SETTINGS, dagger_rounds=1)

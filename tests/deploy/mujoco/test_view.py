@@ -293,6 +293,7 @@ def test_bundled_intersection_agrees_in_depth_and_brightness(gl):
     view.close()
 
 
+@pytest.mark.slow
 def test_room_is_as_bright_as_its_lamps_make_it(gl):
     room, camera = load_scene(bundled("room/scene.xml")), from_fov(100, 33, 90.0)
     lighting = read_lighting(room)

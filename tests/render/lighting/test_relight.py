@@ -346,9 +346,8 @@ def problem(folder: Path, rng, name: str, composite: str) -> Derivatives:
     return Derivatives(params, key, images(loaded, params))
 
 
-@pytest.mark.parametrize(
-    "each_variant", [*RGB, *later(*SPECTRAL, *MONO)], indirect=True
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("each_variant", [*RGB, *SPECTRAL, *MONO], indirect=True)
 def test_gradients_in_every_variant(each_variant, tmp_path: Path, rng) -> None:
     found = problem(tmp_path, rng, "object.texture", "interleaved")
     found.check([rng.normal(0, 1, found.base.shape)])
