@@ -126,8 +126,8 @@ def pytest_collection_modifyitems(
 
 
 def _with_variant(name: str) -> Iterator[str]:
-    before = mi.variant()
+    before = mi.variant() or "llvm_ad_rgb"  # there is no way back to none
     mi.set_variant(name)
     yield name
-    if before is not None and before != name:
+    if before != name:
         mi.set_variant(before)

@@ -13,6 +13,7 @@ from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.cameras import CameraCorrections
 from mi_nerfattack.render.camera.intrinsics import Camera, Lens, lens_rays, pose_arrays
+from mi_nerfattack.render.rays import meet_box
 
 _CHUNK = 1 << 22
 
@@ -144,13 +145,13 @@ class RayBank:
         return image, *lens_rays(lens, origin, rotation, position)
 
     def _seeing(self, lower: np.ndarray, upper: np.ndarray) -> Any:
-        box = mi.BoundingBox3f(lower.tolist(), upper.tolist())
+        box = mi.Point3f(*lower.tolist()), mi.Point3f(*upper.tolist())
         found = []
         for start in range(0, self.count, _CHUNK):
             size = min(_CHUNK, self.count - start)
             index = dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
-            hit, _, far = box.ray_intersect(mi.Ray3f(*self._rays(index)[1:]))
-            seen = dr.compress(hit & (far > 0))
+            near, far = meet_box(*self._rays(index)[1:], *box)
+            seen = dr.compress((near <= far) & (far > 0))
             if dr.width(seen) > 0:
                 found.append(seen + start)
         if not found:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.rays import meet_box
 
 
 class PosedField:
@@ -119,10 +120,7 @@ class PosedField:
         """Intersect a local ray with the bounding box, clipped to [0, t_max]."""
         lower = mi.Point3f(*map(float, self.field.lower))
         upper = mi.Point3f(*map(float, self.field.upper))
-        safe = dr.select(dr.abs(d) < 1e-12, dr.copysign(mi.Vector3f(1e-12), d), d)
-        a, b = (lower - o) / safe, (upper - o) / safe
-        near = dr.max(dr.minimum(a, b))
-        far = dr.min(dr.maximum(a, b))
+        near, far = meet_box(o, d, lower, upper)
         return dr.maximum(near, 0), dr.minimum(far, t_max)
 
     def lattice(self, index: mi.Float) -> mi.Float:

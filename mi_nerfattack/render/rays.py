@@ -49,6 +49,19 @@ def pick_rays(value: Any, index: mi.UInt32) -> Any:
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
+def meet_box(
+    o: mi.Point3f, d: mi.Vector3f, lower: mi.Point3f, upper: mi.Point3f
+) -> tuple[mi.Float, mi.Float]:
+    """Return where lines enter and leave a box, (n,); those that miss, after leaving.
+
+    In place of `mi.BoundingBox3f.ray_intersect`, which takes the rays of the variant
+    alone that was set first in the process.
+    """
+    safe = dr.select(dr.abs(d) < 1e-12, dr.copysign(mi.Vector3f(1e-12), d), d)
+    a, b = (lower - o) / safe, (upper - o) / safe
+    return dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
+
+
 @dataclass
 class March:
     """What a march gives, per ray.
