@@ -103,9 +103,6 @@ def test_step_at_the_limit_has_not_departed():
     assert drive.departed(0.85).tolist() == [False, False, True, True]
 
 
-# Metrics
-
-
 def test_environments_of_your_own_come_after_ours():
     names = ("zoo", "mine", "deployment", "surrogate")
     drives = [make_drive([0.1], environment=name) for name in names]
