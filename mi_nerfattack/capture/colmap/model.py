@@ -88,12 +88,9 @@ def read_colmap(
             "leave them out (--skip-missing, or skip_missing=True)"
         )
     used = [record for record in records if record.name in found]
-    images, reduced = load_images(
-        [found[record.name] for record in used],
-        [cameras[record.camera_id] for record in used],
-        source,
-        long_edge_px,
-    )
+    paths = [found[record.name] for record in used]
+    lenses = [cameras[record.camera_id] for record in used]
+    images, reduced = load_images(paths, lenses, source, long_edge_px)
     return PosedImages(
         images,
         colmap_to_opencv([r.quaternion for r in used], [r.translation for r in used]),
