@@ -15,7 +15,6 @@ from scipy import ndimage
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.capture.mesh.atlas import lay_out
 from mi_nerfattack.deploy.built_in import BuiltInObject, built_in_shapes, make_built_in
-from mi_nerfattack.deploy.mujoco.opengl import make_context
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
@@ -211,64 +210,48 @@ class TestColours:
             make_built_in(box_field(), Pose.identity(), path)
 
 
-SUN = np.array([0.6, 0.0, -0.8])  # where its light goes
-IRRADIANCE = 2.0
+POSE = Pose.upright((1.0, 2.0, 0.0), 0.5 * np.pi, 2.0)
 
 
-def lit_scene(item: BuiltInObject | None) -> mi.Scene:
-    """Put an object on white ground under a sun."""
-    ground = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale([20, 20, 1]),
-        "bsdf": {"type": "diffuse", "reflectance": 1.0},
-    }
-    sun = {"type": "directional", "direction": SUN, "irradiance": IRRADIANCE}
-    shapes = built_in_shapes([] if item is None else [item])
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 2},
-            "ground": ground,
-            "sun": sun,
-            **shapes,
+def test_radiance_of_a_side(box_file):
+    """On white ground; turned by 90 degrees, the side of +y faces -x, the sun's."""
+    cosine, irradiance = 0.6, 2.0
+    item = make_built_in(box_field(), POSE, box_file)
+    reach = mi.ScalarTransform4f().scale([20, 20, 1])
+    white = {"type": "diffuse", "reflectance": 1.0}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "ground": {"type": "rectangle", "to_world": reach, "bsdf": white},
+        "sun": {
+            "type": "directional",
+            "direction": [cosine, 0.0, -0.8],  # where its light goes
+            "irradiance": irradiance,
         },
-        parallel=False,
-    )
+    }
+    lit = mi.load_dict(scene | built_in_shapes([item]), parallel=False)
+    renderer = ViewRenderer(lit, from_fov(48, 48, 20.0))
+    seen = renderer.render(look_at([-4.0, 2.0, 1.2], [1.0, 2.0, 1.2]), 4, 0).rgb
+    albedo = srgb_to_linear_numpy(np.array(SIDES[1, 1]))
+    expected = albedo * irradiance * cosine / np.pi
+    middle = seen[14:34, 14:34].reshape(-1, 3)
+    # 2 of 255 steps at a slope of at most 2.28
+    tolerance = 2 / 255 * 2.28 * irradiance * cosine / np.pi
+    assert np.abs(middle - expected).max() < tolerance
 
 
-class TestLight:
-    POSE = Pose.upright((1.0, 2.0, 0.0), 0.5 * np.pi, 2.0)
-
-    def seen(self, box_file, eye, target) -> np.ndarray:
-        item = make_built_in(box_field(), self.POSE, box_file)
-        renderer = ViewRenderer(lit_scene(item), from_fov(48, 48, 20.0))
-        return renderer.render(look_at(eye, target), 4, 0).rgb
-
-    def test_radiance_of_a_side(self, box_file):
-        """Turned by 90 degrees, the side of +y faces -x, the sun's side."""
-        seen = self.seen(box_file, [-4.0, 2.0, 1.2], [1.0, 2.0, 1.2])
-        cosine = 0.6
-        albedo = srgb_to_linear_numpy(np.array(SIDES[1, 1]))
-        expected = albedo * IRRADIANCE * cosine / np.pi
-        middle = seen[14:34, 14:34].reshape(-1, 3)
-        # 2 of 255 steps at a slope of at most 2.28
-        tolerance = 2 / 255 * 2.28 * IRRADIANCE * cosine / np.pi
-        assert np.abs(middle - expected).max() < tolerance
-
-
-class TestPose:
-    def test_world_vertices(self, box_file):
-        pose = Pose.upright((1.0, 2.0, 3.0), 0.5 * np.pi, 2.0)
-        item = make_built_in(box_field(), pose, box_file, texel_m=0.3)
-        expected = np.array([[0.2, 1.0, 3.0], [1.8, 3.0, 5.4]])
-        low, high = item.world_vertices.min(0), item.world_vertices.max(0)
-        np.testing.assert_allclose([low, high], expected, atol=1e-9)
-        box = built_in_shapes([item])["built_in_000"].bbox()
-        np.testing.assert_allclose([box.min, box.max], expected, atol=1e-6)
-        again = pickle.loads(pickle.dumps(item))  # as worker processes get it
-        np.testing.assert_array_equal(again.world_vertices, item.world_vertices)
-        moved = replace(item, pose=Pose.identity())
-        np.testing.assert_array_equal(moved.world_vertices, item.vertices)
+def test_world_vertices(box_file):
+    pose = Pose.upright((1.0, 2.0, 3.0), 0.5 * np.pi, 2.0)
+    item = make_built_in(box_field(), pose, box_file, texel_m=0.3)
+    expected = np.array([[0.2, 1.0, 3.0], [1.8, 3.0, 5.4]])
+    low, high = item.world_vertices.min(0), item.world_vertices.max(0)
+    np.testing.assert_allclose([low, high], expected, atol=1e-9)
+    box = built_in_shapes([item])["built_in_000"].bbox()
+    np.testing.assert_allclose([box.min, box.max], expected, atol=1e-6)
+    again = pickle.loads(pickle.dumps(item))  # as worker processes get it
+    np.testing.assert_array_equal(again.world_vertices, item.world_vertices)
+    moved = replace(item, pose=Pose.identity())
+    np.testing.assert_array_equal(moved.world_vertices, item.vertices)
 
 
 @pytest.mark.slow
@@ -294,22 +277,13 @@ def test_hydrant_covers_the_pixels_that_it_is_pasted_over():
     assert built.image[both].mean(0).argmax() == 0
 
 
-@pytest.fixture
-def opengl() -> None:
-    """Skip where MuJoCo's renderer has no OpenGL."""
-    try:
-        make_context(8, 8).free()
-    except InputError as error:
-        pytest.skip(str(error))
-
-
-@pytest.mark.usefixtures("opengl")
+@pytest.mark.usefixtures("gl")
 @pytest.mark.parametrize("side", [-1, 1])
 def test_mujoco_draws_it_as_mitsuba_does(side, box_file):
     """Three sides at a time: the outline, and each side's own colour on it."""
     from mi_nerfattack.deploy.mujoco.view import MujocoView
 
-    item = make_built_in(box_field(), TestLight.POSE, box_file)
+    item = make_built_in(box_field(), POSE, box_file)
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 2},

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from helpers.blank_view import blank_environment
 from helpers.recorded_drives import write_folder
 from helpers.tiny_place import write_place
 
-from mi_nerfattack.deploy import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.car import CAR
 from mi_nerfattack.deploy.gym import FAR_M, DrivingEnv, make_gym
-from mi_nerfattack.deploy.mujoco.opengl import make_context
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.registry import ENVIRONMENTS, kinematic_vehicle
-from mi_nerfattack.deploy.vehicle import checked_pose
+from mi_nerfattack.deploy.registry import ENVIRONMENTS
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -30,64 +25,25 @@ LINE = np.array([[0.0, 0.0], [30.0, 0.0]])
 SPP = Conditions(spp=2)
 
 
-class Blind(AbstractEnvironment):
-    """A kinematic car that sees nothing."""
-
-    def __init__(self) -> None:
-        self.name, self.camera, self.period = "blind", from_fov(4, 2, 90.0), 0.1
-        self.vehicle = kinematic_vehicle(CAR, 0.1)
-        self.max_control, self.control_unit = 1.5, "rad/s"
-        self.controls: list[float] = []
-
-    def reset(self, route, pose=None, seed=0):
-        start = checked_pose(route.pose_at(0.0) if pose is None else pose)
-        self.vehicle.reset(start, route.speed_ms)
-        return self._frame()
-
-    def step(self, control):
-        self.controls.append(control)
-        self.vehicle.advance(control)
-        return self._frame()
-
-    @property
-    def state(self):
-        return self.vehicle.state
-
-    def show(self, objects):
-        del objects
-
-    def close(self):
-        self.is_closed = True
-
-    def _frame(self):
-        depth = np.full((2, 4), np.inf, np.float32)
-        return CameraFrame(np.zeros((2, 4, 3), np.uint8), depth, np.eye(4))
-
-
-def place_for(name: str, folder: Path) -> Place:
-    """Write a place for an environment, or skip where there is no OpenGL for it."""
-    if name == "mujoco_gl":
-        try:
-            make_context(8, 8).free()
-        except InputError as error:
-            pytest.skip(str(error))
-    place = write_place(folder)
-    if name == "replay":
-        return replace(place, recording=write_folder(folder / "drive"))
-    return place
+@pytest.fixture
+def place(request, tmp_path) -> Place:
+    """A place with a recording, where there is OpenGL if MuJoCo's is asked for."""
+    if "mujoco_gl" in request.node.name:
+        request.getfixturevalue("gl")
+    return replace(write_place(tmp_path), recording=write_folder(tmp_path / "drive"))
 
 
 def blind(closed: bool = False, **options) -> DrivingEnv:
     points = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]) if closed else LINE
     route = Route("line", 1, points, 3.8, 5.0, closed)
-    return DrivingEnv(Blind(), [route], **options)
+    return DrivingEnv(blank_environment(), [route], **options)
 
 
 @pytest.mark.parametrize("name", [*SIMULATED, "replay"])
-def test_gymnasiums_checker_passes(name, tmp_path):
+def test_gymnasiums_checker_passes(name, place):
     environment = gymnasium.make(
         f"mi_nerfattack/{name}-v0",
-        place=place_for(name, tmp_path),
+        place=place,
         conditions=SPP,
         render_mode="rgb_array",
     )
@@ -99,8 +55,7 @@ def test_gymnasiums_checker_passes(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", SIMULATED)
-def test_two_copies_with_one_seed_give_equal_steps(name, tmp_path):
-    place = place_for(name, tmp_path)
+def test_two_copies_with_one_seed_give_equal_steps(name, place):
     copies = [make_gym(name, place, SPP, max_steps=1000) for _ in range(2)]
     observed = [copy.reset(seed=5, options={"route": "bend"}) for copy in copies]
     controls = np.random.default_rng(2).uniform(-0.4, 0.4, (20, 1))
@@ -136,7 +91,8 @@ def test_action_is_a_share_of_the_largest_control():
     driving = blind()
     driving.reset(seed=0)
     driving.step(np.array([-0.5], np.float32))
-    assert driving.environment.controls == [-0.75]
+    # the largest of the car is 1.5 rad/s, held for 0.1 s
+    assert driving.environment.state[2] == pytest.approx(-0.075, rel=1e-3)
 
 
 @pytest.mark.parametrize(("offset", "is_out"), [(0.99, False), (1.01, True)])
@@ -166,16 +122,15 @@ def test_a_lane_that_is_no_wider_than_the_car_is_refused(tmp_path):
     narrow, wide = (Route(str(w), 0, LINE, lane_width_m=w) for w in (0.6, 3.5))
     message = r"route '0.6': its lane is 0.6 m wide, the vehicle 1.8 m; give the vehi"
     with pytest.raises(InputError, match=message):
-        DrivingEnv(Blind(), [wide, narrow])
+        DrivingEnv(blank_environment(), [wide, narrow])
     with pytest.raises(InputError, match="the vehicle 0.0 m"):
-        DrivingEnv(Blind(), [wide], width=0.0)
-    driving = DrivingEnv(Blind(), [narrow], width=0.3)
+        DrivingEnv(blank_environment(), [wide], width=0.0)
+    driving = DrivingEnv(blank_environment(), [narrow], width=0.3)
     driving.reset(seed=0)
     assert not driving.step(np.zeros(1))[2]
 
 
-def test_images_of_a_recording_are_not_resized(tmp_path):
-    place = place_for("replay", tmp_path)
+def test_images_of_a_recording_are_not_resized(place):
     own = make_gym("replay", place)
     camera = own.environment.camera
     own.close()
@@ -186,7 +141,7 @@ def test_images_of_a_recording_are_not_resized(tmp_path):
 
 def test_a_refused_reset_leaves_the_episode_as_it_was():
     ahead, aside = (Route(str(i), i, LINE + [0, 9 * i]) for i in range(2))
-    driving = DrivingEnv(Blind(), [ahead, aside])
+    driving = DrivingEnv(blank_environment(), [ahead, aside])
     driving.reset(seed=0, options={"route": "0"})
     with pytest.raises(InputError, match="pose: .*three finite numbers"):
         driving.reset(options={"route": "1", "pose": (0.0, np.nan, 0.0)})
@@ -197,7 +152,7 @@ def test_a_refused_reset_leaves_the_episode_as_it_was():
 def test_bad_input(tmp_path):
     driving = blind()
     with pytest.raises(InputError, match="routes: none; at least one"):
-        DrivingEnv(Blind(), [])
+        DrivingEnv(blank_environment(), [])
     with pytest.raises(InputError, match="max_steps: 0; at least 1"):
         blind(max_steps=0)
     with pytest.raises(InputError, match="render_mode: 'human'; 'rgb_array' or None"):

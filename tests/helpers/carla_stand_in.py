@@ -1,10 +1,10 @@
 """A stand-in for CARLA's client and server, in this process and without rendering.
 
 No CARLA server runs where the tests run. These classes mimic those of the client
-0.9.16 as far as `mi_nerfattack.deploy` uses them; `test_carla.py` compares their names
-and parameters with the real client's where that is installed. A car is a bicycle model
-and an image is one colour with a wall at one distance: what they show says nothing
-about CARLA's pictures or physics.
+0.9.16 as far as `mi_nerfattack.deploy` uses them; `test_stand_in.py` compares their
+names and parameters with the real client's where that is installed. A car is a bicycle
+model and an image is one colour with a wall at one distance: what they show says
+nothing about CARLA's pictures or physics.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def log_messages(folder: Path) -> dict[str, tuple[str, list[dict]]]:
     return {
         "/camera/image": ("foxglove.CompressedImage", images),
         "/camera/pose": ("foxglove.PoseInFrame", poses),
-        "/camera/calibration": ("foxglove.CameraCalibration", [CALIBRATION]),
+        "/camera/calibration": ("foxglove.CameraCalibration", [dict(CALIBRATION)]),
     }
 
 
