@@ -23,6 +23,10 @@ Acute = Annotated[float, Field(gt=0, lt=math.pi / 2, description=", radians")]
 Whole = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=1 << 31)]
+Name = Annotated[str, Field(min_length=1, description="a name, not empty")]
+ControlUnit = Annotated[
+    str, Field(pattern="^rad(/s)?$", description="'rad/s' or 'rad'")
+]
 
 _T = TypeVar("_T")
 
@@ -30,12 +34,13 @@ _T = TypeVar("_T")
 def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
     """Let a dataclass check its fields when an object is made; stands below it.
 
-    A field whose type is a range, or a mapping or alternative with one, raises
-    `InputError` for another type of number or a number outside. A `__post_init__`
-    of the class comes afterwards.
+    A field whose type is a range or a kind of word, or a mapping or alternative with
+    one, raises `InputError` for another type or a value outside. A `__post_init__` of
+    the class comes afterwards.
 
     Args:
-        owner: what the message calls the object, ``owner.field``.
+        owner: what the message calls the object, ``owner.field``; a format string
+            with the object as ``self``.
     """
 
     def decorate(cls: type[_T]) -> type[_T]:
@@ -48,7 +53,7 @@ def checked(owner: str = "") -> Callable[[type[_T]], type[_T]]:
                 try:
                     adapter.validate_python(plain, strict=True)
                 except ValidationError as err:
-                    where = f"{owner}.{name}" if owner else name
+                    where = f"{owner.format(self=self)}.{name}" if owner else name
                     problem = f"{value!r}; must be {_allowed(hint)}"
                     raise InputError(f"{where}: {problem}") from err
             if further is not None:
@@ -75,6 +80,8 @@ def _range(hint: Any) -> Any:
 
 def _allowed(hint: Any) -> str:
     kind, field = get_args(_range(hint))
+    if kind is str:
+        return field.description
     noun = "a whole number" if kind is int else "a finite number"
     unit = field.description or ""
     limits = {n: getattr(m, n) for m in field.metadata for n in _SIGNS if hasattr(m, n)}

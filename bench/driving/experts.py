@@ -17,7 +17,7 @@ from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
 from mi_nerfattack.vehicle.integrators import RK4
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 LIMIT_M = 0.1
 LAPS = 2
@@ -146,7 +146,7 @@ def run(show: Callable[[int, int], None] = lambda done, total: None) -> list[Dri
     work = [
         (case, route, told)
         for case in cases()
-        for route in Route.all_from_file(case.place.routes)
+        for route in load_routes(case.place.routes)
         for told in (case.lag_s, LABEL_LAG_S)
     ]
     results = []

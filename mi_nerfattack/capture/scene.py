@@ -18,7 +18,7 @@ from mi_nerfattack.render.camera.intrinsics import (
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.pathtrace.views import iterate_views
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 _LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
 _HEADING_SD_DEG, _ANY_HEADING_SHARE = 15.0, 0.3
@@ -105,11 +105,7 @@ def capture_scene(
     Returns:
         Path of `transforms.json`.
     """
-    table = files.read_json(routes_path)
-    if not isinstance(table, dict) or not table:
-        raise InputError(f"{routes_path}: needs an object with one key per route")
-    routes = [Route.from_file(routes_path, name) for name in table]
-    poses = drive_poses(routes, n, seed)
+    poses = drive_poses(load_routes(routes_path), n, seed)
     scene = load_scene(scene_path)
     path = begin_posed(out_folder)
     root = path.parent

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Acute, ControlUnit, Positive, checked
 
 
 @dataclass(frozen=True)
+@checked("car")
 class Car:
     """A car with front-wheel steering; its state refers to the middle of the rear axle.
 
@@ -26,29 +27,17 @@ class Car:
             angle at most `max_steer`.
     """
 
-    wheelbase: float = 2.7
-    width: float = 1.8
-    length: float = 4.4
-    track: float = 1.55
-    wheel_radius: float = 0.32
-    mass: float = 1400.0
-    max_steer: float = 0.75
-    control_unit: str = "rad/s"
-    max_control: float = 1.5
+    wheelbase: Positive = 2.7
+    width: Positive = 1.8
+    length: Positive = 4.4
+    track: Positive = 1.55
+    wheel_radius: Positive = 0.32
+    mass: Positive = 1400.0
+    max_steer: Acute = 0.75
+    control_unit: ControlUnit = "rad/s"
+    max_control: Positive = 1.5
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
-        lengths = ("wheelbase", "width", "length", "track", "wheel_radius")
-        for name in (*lengths, "mass", "max_steer", "max_control"):
-            value = getattr(self, name)
-            if not 0 < value < float("inf"):
-                raise InputError(f"car.{name}: {value!r}; a positive number")
-        if self.max_steer >= math.pi / 2:
-            raise InputError(f"car.max_steer: {self.max_steer!r} rad; below pi / 2")
-        if self.control_unit not in ("rad/s", "rad"):
-            raise InputError(
-                f"car.control_unit: {self.control_unit!r}; 'rad/s' or 'rad'"
-            )
         if self.control_unit == "rad" and self.max_control > self.max_steer:
             raise InputError(
                 f"car.max_control: {self.max_control!r} rad; a steering angle of at "

@@ -14,7 +14,7 @@ from mi_nerfattack.deploy.place import Conditions, Place, bundled_place
 from mi_nerfattack.deploy.registry import ENVIRONMENTS, make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.drive import departure_limits
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 #: Depth that observations have where there is nothing, and the largest, metres.
 FAR_M = 1000.0
@@ -205,7 +205,7 @@ def make_gym(
     if routes:
         found = [Route.from_file(place.routes, route) for route in routes]
     else:
-        found = Route.all_from_file(place.routes)
+        found = load_routes(place.routes)
     environment = make_environment(name, place, conditions)
     more.setdefault("width", place.car.width)
     try:

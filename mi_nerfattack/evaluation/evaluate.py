@@ -20,6 +20,7 @@ from mi_nerfattack.evaluation.metrics import card_figures
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
+from mi_nerfattack.ranges import Count, Whole, checked
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import Drive, departure_limits
 from mi_nerfattack.vehicle.expert import AbstractExpert
@@ -35,6 +36,7 @@ STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0
 
 
 @dataclass(frozen=True)
+@checked("EvaluateSettings")
 class EvaluateSettings:
     """Choices of an evaluation; the same settings give the same drives.
 
@@ -55,24 +57,15 @@ class EvaluateSettings:
         roadside: sizes and places of the objects.
     """
 
-    runs: int = 20
-    objects: int = 1
-    seed: int = 0
+    runs: Count = 20
+    objects: Whole = 1
+    seed: Whole = 0
     margin_m: float = 2.0
-    horizon: int = 1000
+    horizon: Count = 1000
     scatter: Scatter = STARTS
     ahead_m: tuple[float, float] = (8.0, 2.0)
     car_width_m: float = 1.8
     roadside: Roadside = field(default_factory=Roadside)
-
-    def __post_init__(self) -> None:
-        for name, least in (("runs", 1), ("objects", 0), ("seed", 0), ("horizon", 1)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise InputError(
-                    f"EvaluateSettings.{name}: {value!r}; a whole number of at least "
-                    f"{least}"
-                )
 
     @property
     def cases(self) -> tuple[str, ...]:

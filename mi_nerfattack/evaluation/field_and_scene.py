@@ -10,14 +10,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fit.scores import FieldRenderer, Rendering, compare
-from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     CameraMount,
@@ -26,7 +27,7 @@ from mi_nerfattack.render.camera.intrinsics import (
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 _SOLID = 0.5  # opacity from which on a ray counts as stopped
 
@@ -37,6 +38,7 @@ def drive_camera() -> Camera:
 
 
 @dataclass(frozen=True)
+@checked()
 class CompareOptions:
     """Where and how the two are compared.
 
@@ -53,21 +55,12 @@ class CompareOptions:
 
     camera: Camera = field(default_factory=drive_camera)
     mount: CameraMount = field(default_factory=CameraMount)
-    spacing_m: float = 2.0
+    spacing_m: Positive = 2.0
     lateral_m: float = 0.0
-    spp: int = 64
-    near_m: float = 15.0
-    seed: int = 0
-    worst: int = 2
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name, least in (("spp", 2), ("worst", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: {getattr(self, name)}; at least {least}")
-        for name in ("spacing_m", "near_m"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: {getattr(self, name)}; must be positive")
+    spp: Annotated[int, Field(ge=2)] = 64
+    near_m: Positive = 15.0
+    seed: Whole = 0
+    worst: Whole = 2
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ def compare_with_scene(
     """
     started = time.perf_counter()
     options = options or CompareOptions()
-    routes = read_routes(routes_path)
+    routes = load_routes(routes_path)
     eyes = _Eyes(surrogate, load_scene(scene_path), options)
     arcs = [_stations(route.length, options.spacing_m) for route in routes]
     total, done, result = sum(map(len, arcs)), 0, []
@@ -200,18 +193,6 @@ def compare_with_scene(
             progress(done, total)
         result.append(tally.result())
     return Comparison(tuple(result), options, time.perf_counter() - started)
-
-
-def read_routes(path: str | Path) -> list[Route]:
-    """Read all routes of a routes file.
-
-    Raises:
-        InputError: the file has none, or one is wrong.
-    """
-    table = files.read_json(path)
-    if not isinstance(table, dict) or not table:
-        raise InputError(f"{path}: needs an object with one key per route")
-    return [Route.from_file(path, name) for name in table]
 
 
 def _stations(length: float, spacing: float) -> np.ndarray:

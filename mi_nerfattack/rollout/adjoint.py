@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from mi_nerfattack.ranges import Count, checked
 from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.loop import ClosedLoop, Step, Trajectory
 from mi_nerfattack.rollout.sweep import Gradient, Options, backward, differentiable
@@ -101,6 +102,7 @@ class KeptBackgrounds(AbstractAdjoint):
 
 
 @dataclass(frozen=True)
+@checked("Checkpointed")
 class Checkpointed(AbstractAdjoint):
     """Keeps the policy's memory once a segment; drives each segment again.
 
@@ -113,11 +115,7 @@ class Checkpointed(AbstractAdjoint):
         segment: control periods, at least 1.
     """
 
-    segment: int = 16
-
-    def __post_init__(self) -> None:
-        if self.segment < 1:
-            raise ValueError(f"Checkpointed.segment: {self.segment}; at least 1")
+    segment: Count = 16
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
         """See :meth:`AbstractAdjoint.keep`."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Name, Whole, checked
 from mi_nerfattack.vehicle.route.route import Route
 
 #: In the order of documents and plots; others follow, by name. `metrics.json` has the
@@ -27,6 +28,7 @@ CASES = ("unperturbed", "random", "gradient", "clean", "random_objects")
 
 
 @dataclass(frozen=True, eq=False)
+@checked("Drive")
 class Drive:
     """One closed-loop drive of T >= 1 steps; its arrays are read-only float64 copies.
 
@@ -47,11 +49,11 @@ class Drive:
             not finite.
     """
 
-    environment: str
-    route: str
+    environment: Name
+    route: Name
     case: str
-    run: int
-    seed: int
+    run: Whole
+    seed: Whole
     states: np.ndarray
     controls: np.ndarray
     cross_track_m: np.ndarray
@@ -59,20 +61,9 @@ class Drive:
 
     def __post_init__(self) -> None:
         if self.case not in CASES:
-            raise InputError(
-                f"Drive.case: {self.case!r}; must be one of {', '.join(CASES)}"
-            )
-        for name in ("environment", "route"):
-            value = getattr(self, name)
-            if not isinstance(value, str) or not value:
-                raise InputError(f"Drive.{name}: {value!r}; a non-empty name is needed")
+            raise InputError(f"Drive.case: {self.case!r}; one of {', '.join(CASES)}")
         for name in ("run", "seed"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer):
-                raise InputError(f"Drive.{name}: {value!r}; an integer is needed")
-            if value < 0:
-                raise InputError(f"Drive.{name}: {value}; must not be negative")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, int(getattr(self, name)))
         steps = np.shape(self.controls)[0] if np.ndim(self.controls) else 0
         if steps < 1:
             raise InputError("Drive.controls: no step; a drive has at least one")

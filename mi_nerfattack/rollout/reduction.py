@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import SomeShare, checked
 
 
 class AbstractReduction(ABC):
@@ -33,6 +33,7 @@ class Mean(AbstractReduction):
 
 
 @dataclass(frozen=True)
+@checked("CVaR")
 class CVaR(AbstractReduction):
     """Conditional value at risk: the mean of the worst fraction f of the drives.
 
@@ -47,11 +48,7 @@ class CVaR(AbstractReduction):
         fraction: f, in (0, 1].
     """
 
-    fraction: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.fraction <= 1:
-            raise InputError(f"CVaR.fraction: {self.fraction!r}; above 0, at most 1")
+    fraction: SomeShare
 
     def reduce(self, costs: Any) -> Any:
         """See :meth:`AbstractReduction.reduce`."""

@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Acute, Positive, checked
 
 
@@ -41,20 +40,6 @@ def soft_limit(value: Any, limit: float) -> Any:
     small = dr.select(inside, ratio, 1 / dr.select(inside, 1, ratio))
     scale = 1 / dr.sqrt(dr.sqrt(dr.sqrt(1 + dr.square(dr.square(dr.square(small))))))
     return limit * scale * dr.select(inside, ratio, dr.sign(ratio))
-
-
-def require_steer(owner: str, max_steer: float) -> None:
-    """Raise `InputError` unless a steering limit, radians, is between 0 and pi/2."""
-    require_positive(owner, max_steer=max_steer)
-    if max_steer >= dr.pi / 2:
-        raise InputError(f"{owner}.max_steer: {max_steer!r} rad; it must be below pi/2")
-
-
-def require_positive(owner: str, **values: float) -> None:
-    """Raise `InputError` unless every value is finite and greater than zero."""
-    for name, value in values.items():
-        if not 0 < value < float("inf"):
-            raise InputError(f"{owner}.{name}: {value!r} is not a positive number")
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT, set_daylight
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.field_sensor import FieldSensor
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -325,6 +325,6 @@ def test_bundled_places():
     assert room.car.control_unit == "rad"
     for place in (crossing, room):
         assert place.scene.is_file()
-        assert Route.all_from_file(place.routes)
+        assert load_routes(place.routes)
     with pytest.raises(InputError, match="place: 'moon'; one of intersection, room"):
         bundled_place("moon")

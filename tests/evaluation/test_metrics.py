@@ -63,7 +63,7 @@ def make_document(drives=None):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": ""}, "environment: ''; a non-empty name"),
+        ({"environment": ""}, "environment: ''; must be a name, not empty"),
         ({"case": "bayes"}, "case: 'bayes'"),
         ({"route": ""}, "route"),
         ({"run": -1}, "run: -1"),

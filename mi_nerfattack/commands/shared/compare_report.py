@@ -41,8 +41,8 @@ class CompareArguments:
 
         Called before a fit starts, so that a mistyped path costs no fit.
         """
-        from mi_nerfattack.evaluation.field_and_scene import read_routes
         from mi_nerfattack.render.pathtrace.load import load_scene
+        from mi_nerfattack.vehicle.route.route import load_routes
 
         if (self.compare is None) != (self.routes is None):
             raise InputError(
@@ -52,7 +52,7 @@ class CompareArguments:
         if self.compare is None or self.routes is None:
             return
         self.options()
-        read_routes(self.routes)
+        load_routes(self.routes)
         load_scene(self.compare)
 
     def options(self) -> CompareOptions:

@@ -19,7 +19,7 @@ from mi_nerfattack.deploy.carla.conventions import (
 from mi_nerfattack.deploy.carla.session import CarlaSession
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, require_control
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.vehicle.dynamics import require_positive
+from mi_nerfattack.ranges import Positive, checked
 
 _KMH = 3.6  # km/h in one m/s
 _CRAWL = 0.5  # m/s; a slower car is steered as one of this speed
@@ -176,6 +176,8 @@ class KinematicDriver(AbstractCarlaDriver):
         self._actor.set_transform(self._session.transform(pose))
 
 
+@dataclass(eq=False)
+@checked("PhysicalDriver")
 class PhysicalDriver(AbstractCarlaDriver):
     """Steers CARLA's own car to a heading rate, and keeps its speed by its pedals.
 
@@ -188,22 +190,14 @@ class PhysicalDriver(AbstractCarlaDriver):
         integral_gain: throttle per metre of missing way.
     """
 
+    max_heading_rate: Positive = 1.5
+    gain: Positive = 0.5
+    integral_gain: Positive = 0.4
+
     control_unit = "rad/s"
 
-    def __init__(
-        self,
-        max_heading_rate: float = 1.5,
-        gain: float = 0.5,
-        integral_gain: float = 0.4,
-    ) -> None:
-        require_positive(
-            "PhysicalDriver",
-            max_heading_rate=max_heading_rate,
-            gain=gain,
-            integral_gain=integral_gain,
-        )
-        self.max_control = max_heading_rate
-        self.gain, self.integral_gain = gain, integral_gain
+    def __post_init__(self) -> None:
+        self.max_control = self.max_heading_rate
 
     def begin(
         self,

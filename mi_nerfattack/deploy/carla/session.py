@@ -9,10 +9,13 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from mi_nerfattack.deploy.carla.conventions import CarlaPose
 from mi_nerfattack.errors import InputError, NerfAttackError
+from mi_nerfattack.ranges import Name, Seconds, checked
 from mi_nerfattack.system.interrupts import held_interrupts
 
 _SUBSTEP = 0.01  # seconds of the physics
@@ -21,6 +24,7 @@ _SPAWN_ADVICE = "take another place, or destroy what stands there"
 
 
 @dataclass(frozen=True)
+@checked("server")
 class CarlaServer:
     """Where a server runs, and what it shall show.
 
@@ -36,25 +40,12 @@ class CarlaServer:
         InputError: a port or a time that is impossible.
     """
 
-    host: str = "127.0.0.1"
-    port: int = 2000
+    host: Name = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65533)] = 2000
     town: str | None = None
     weather: str | None = "ClearNoon"
-    timeout_s: float = 10.0
-    load_timeout_s: float = 120.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not self.host or not 0 < self.port < 65534:
-            raise InputError(
-                f"server: {self.host!r}, port {self.port}; HOST:PORT with a port "
-                "from 1 to 65533"
-            )
-        for name in ("timeout_s", "load_timeout_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(
-                    f"server.{name}: {getattr(self, name)}; a positive time, seconds"
-                )
+    timeout_s: Seconds = 10.0
+    load_timeout_s: Seconds = 120.0
 
     @classmethod
     def parse(cls, text: str, **more: Any) -> CarlaServer:

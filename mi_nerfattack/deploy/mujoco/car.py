@@ -23,6 +23,7 @@ import numpy as np
 from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.mujoco.module import mujoco
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Positive, Seconds, checked
 
 BODY, COLUMN, AXLE = "car", "column", "rear_axle"
 STEER, DRIVE = "steer", "drive"
@@ -38,6 +39,7 @@ _SPARE_STEER = 0.05  # rad, beyond the largest steering angle
 
 
 @dataclass(frozen=True)
+@checked("handling")
 class Handling:
     """How a car answers, besides its dimensions.
 
@@ -49,17 +51,11 @@ class Handling:
         friction: coefficient between tyre and road.
     """
 
-    steer_time_constant: float = 0.1
-    steer_rate: float = 1.5
-    motor_time_constant: float = 0.1
-    max_acceleration: float = 4.0
-    friction: float = 0.9
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name, value in vars(self).items():
-            if not 0 < value < float("inf"):
-                raise InputError(f"handling.{name}: {value!r}; a positive number")
+    steer_time_constant: Seconds = 0.1
+    steer_rate: Positive = 1.5
+    motor_time_constant: Seconds = 0.1
+    max_acceleration: Positive = 4.0
+    friction: Positive = 0.9
 
 
 def add_ground(spec: mujoco.MjSpec) -> None:

@@ -14,6 +14,7 @@ from mi_nerfattack.deploy.mujoco.car import Handling
 from mi_nerfattack.deploy.mujoco.module import mujoco
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose, require_control
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Positive, checked
 
 _SETTLE_S = 2.0
 _SPEED_GAIN = 2.0  # 1/s
@@ -21,6 +22,7 @@ _SPEED_INTEGRAL_GAIN = 1.0  # 1/s^2
 
 
 @dataclass(frozen=True)
+@checked()
 class AbstractSteering(ABC):
     """What a control means.
 
@@ -28,12 +30,7 @@ class AbstractSteering(ABC):
         max_control: largest control that has an effect.
     """
 
-    max_control: float
-
-    def __post_init__(self) -> None:
-        """Check the range."""
-        if not 0 < self.max_control < float("inf"):
-            raise InputError(f"max_control: {self.max_control!r}; a positive number")
+    max_control: Positive
 
     @property
     @abstractmethod

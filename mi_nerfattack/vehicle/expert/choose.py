@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.ranges import ControlUnit, NonNegative, Positive, Seconds, checked
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
 from mi_nerfattack.vehicle.expert.lane_follower import LaneFollower, SteeringFollower
 from mi_nerfattack.vehicle.expert.pid import PIDExpert
@@ -27,8 +28,20 @@ LOOK_AHEAD_S = 0.55
 WINDOW_S = 0.2
 
 
+@dataclass(frozen=True)
+@checked("expert")
+class _Vehicle:
+    """What an expert is told of its vehicle; see `expert_for`."""
+
+    control_unit: ControlUnit
+    period: Seconds
+    max_control: Positive
+    wheelbase: Positive
+    lag: NonNegative
+
+
 def expert_for(
-    control_unit: str,
+    control_unit: ControlUnit,
     route: Route,
     period: float,
     max_control: float = 1.5,
@@ -57,15 +70,9 @@ def expert_for(
     Raises:
         InputError: unknown unit, or a number out of range.
     """
-    if control_unit not in ("rad/s", "rad"):
-        raise InputError(f"expert: control unit {control_unit!r}; 'rad/s' or 'rad'")
-    require_positive(
-        "expert", period=period, max_control=max_control, wheelbase=wheelbase
-    )
-    if control_unit == "rad":
-        require_steer("expert", max_control)
-    if not 0 <= lag < math.inf:
-        raise InputError(f"expert.lag: {lag!r}; at least 0 seconds")
+    _Vehicle(control_unit, period, max_control, wheelbase, lag)
+    if control_unit == "rad" and max_control >= math.pi / 2:
+        raise InputError(f"expert.max_control: {max_control!r} rad; below pi/2")
     speed = float(route.speed_ms)
     look_ahead = speed * LOOK_AHEAD_S
     preview, window = speed * (period / 2 + lag), speed * WINDOW_S

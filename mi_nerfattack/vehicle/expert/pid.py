@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.vehicle.dynamics import require_positive, require_steer
+from mi_nerfattack.ranges import Acute, Positive, Seconds, checked
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
 
+@dataclass(eq=False)
+@checked("PIDExpert")
 class PIDExpert(AbstractExpert):
     """Steering angle `atan(l kappa) - (K_p e + K_i int e dt + K_d de/dt)`.
 
@@ -34,34 +37,23 @@ class PIDExpert(AbstractExpert):
         window_m: arc length over which the polyline's curvature is averaged, metres.
     """
 
+    route: Route
+    period: Seconds
+    wheelbase: Positive
+    max_control: Acute
+    look_ahead_m: Positive
+    preview_m: float = 0.0
+    integral_time: Seconds = 5.0
+    window_m: Positive = 0.2
+
     control_unit: ClassVar[str] = "rad"
 
-    def __init__(
-        self,
-        route: Route,
-        period: float,
-        wheelbase: float,
-        max_control: float,
-        look_ahead_m: float,
-        preview_m: float = 0.0,
-        integral_time: float = 5.0,
-        window_m: float = 0.2,
-    ) -> None:
-        require_positive(
-            "PIDExpert",
-            period=period,
-            wheelbase=wheelbase,
-            look_ahead_m=look_ahead_m,
-            integral_time=integral_time,
-            window_m=window_m,
+    def __post_init__(self) -> None:
+        self.proportional = self.wheelbase / self.look_ahead_m**2
+        self.derivative = (
+            2 * self.proportional * self.look_ahead_m / self.route.speed_ms
         )
-        require_steer("PIDExpert", max_control)
-        self.route, self.period, self.wheelbase = route, period, wheelbase
-        self.max_control, self.look_ahead_m = max_control, look_ahead_m
-        self.preview_m, self.window_m = preview_m, window_m
-        self.proportional = wheelbase / look_ahead_m**2
-        self.derivative = 2 * wheelbase / (look_ahead_m * route.speed_ms)
-        self.integral = self.proportional / integral_time
+        self.integral = self.proportional / self.integral_time
         self._sum: np.ndarray | None = None
 
     def reset(self) -> None:

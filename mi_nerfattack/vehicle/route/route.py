@@ -12,7 +12,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.vehicle.route.files import read_entry, read_table
+from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.vehicle.route.polyline import (
     Measures,
     Operations,
@@ -24,11 +24,13 @@ from mi_nerfattack.vehicle.route.polyline import (
     square_distance,
 )
 
+_NEEDED = ("goal", "points_m", "lane_width_m", "speed_ms")
 _NUMPY = Operations(np.where, np.sqrt, np.sin, np.cos, np.arctan2, lambda x: x)
 _DRJIT = Operations(dr.select, dr.sqrt, dr.sin, dr.cos, dr.atan2, dr.detach)
 
 
 @dataclass(frozen=True, eq=False)
+@checked("route {self.name!r}")
 class Route:
     """Polyline of the lane centre in the direction of travel.
 
@@ -48,10 +50,10 @@ class Route:
     """
 
     name: str
-    goal: int
+    goal: Whole
     points: np.ndarray
-    lane_width_m: float = 3.5
-    speed_ms: float = 5.0
+    lane_width_m: Positive = 3.5
+    speed_ms: Positive = 5.0
     closed: bool = False
 
     def __post_init__(self) -> None:
@@ -62,17 +64,6 @@ class Route:
         points = checked_points(f"route {self.name!r}", self.points, self.closed)
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
-        if isinstance(self.goal, bool) or not isinstance(self.goal, int):
-            raise InputError(f"route {self.name!r}: goal {self.goal!r}; an integer")
-        if self.goal < 0:
-            raise InputError(f"route {self.name!r}: goal {self.goal}; at least 0")
-        for key in ("lane_width_m", "speed_ms"):
-            value = getattr(self, key)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not 0 < value < float("inf"):
-                raise InputError(
-                    f"route {self.name!r}: {key} {value!r}; a positive number"
-                )
 
     @classmethod
     def from_file(cls, path: str | Path, name: str) -> Route:
@@ -86,23 +77,19 @@ class Route:
         Raises:
             InputError: unreadable file, missing route or key, unusable value.
         """
-        entry = read_entry(path, name)
+        table = _read_table(path)
+        if name not in table:
+            known = ", ".join(map(repr, table))
+            raise InputError(f"{path}: no route {name!r}; it has {known}")
+        entry = table[name]
+        if not isinstance(entry, dict) or not set(entry) >= set(_NEEDED):
+            raise InputError(f"{path}: route {name!r} needs {', '.join(_NEEDED)}")
+        goal, points, lane_width_m, speed_ms = (entry[key] for key in _NEEDED)
+        closed = entry.get("closed", False)
         try:
-            return cls(
-                name,
-                entry["goal"],
-                entry["points_m"],
-                entry["lane_width_m"],
-                entry["speed_ms"],
-                entry["closed"],
-            )
+            return cls(name, goal, points, lane_width_m, speed_ms, closed)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-
-    @classmethod
-    def all_from_file(cls, path: str | Path) -> list[Route]:
-        """Read all routes of a file, in its order; raises as `from_file`."""
-        return [cls.from_file(path, name) for name in read_table(path)]
 
     @cached_property
     def segments(self) -> np.ndarray:
@@ -316,8 +303,12 @@ def smooth_absolute(error: Any, width: float = 0.05) -> Any:
 
 
 def load_routes(path: str | Path) -> list[Route]:
-    """Read all routes of a file."""
+    """Read all routes of a file, in its order; raises as `Route.from_file`."""
+    return [Route.from_file(path, name) for name in _read_table(path)]
+
+
+def _read_table(path: str | Path) -> dict[str, Any]:
     table = files.read_json(path)
     if not isinstance(table, dict) or not table:
         raise InputError(f"{path}: needs an object with one key per route")
-    return [Route.from_file(path, name) for name in table]
+    return table

@@ -7,7 +7,7 @@ import pytest
 
 from bench.driving import experts
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.vehicle import Route
+from mi_nerfattack.vehicle import Route, load_routes
 from mi_nerfattack.vehicle.expert import (
     LaneFollower,
     PIDExpert,
@@ -46,7 +46,7 @@ def test_expert_keeps_the_lane_and_recovers(index, cases):
     case, (environment, names) = cases[index], ENVIRONMENTS[index]
     period = case.place.period
     assert case.environment == environment
-    routes = Route.all_from_file(case.place.routes)
+    routes = load_routes(case.place.routes)
     assert [route.name for route in routes] == names
     for route in routes:
         expert = case.expert(route, case.lag_s)
@@ -89,7 +89,7 @@ def test_choice_of_the_expert():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"control_unit": "deg"}, "'deg'; 'rad/s' or 'rad'"),
+        ({"control_unit": "deg"}, "'deg'; must be 'rad/s' or 'rad'"),
         ({"period": 0.0}, "period: 0.0"),
         ({"max_control": -1.0}, "max_control: -1.0"),
         ({"control_unit": "rad", "max_control": 1.6}, "below pi/2"),

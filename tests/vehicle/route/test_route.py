@@ -15,6 +15,7 @@ from mi_nerfattack.vehicle import (
     ExplicitEuler,
     ImplicitMidpoint,
     Route,
+    load_routes,
     smooth_absolute,
 )
 from mi_nerfattack.vehicle.expert import LaneFollower
@@ -96,7 +97,7 @@ def test_route_file(tmp_path):
     assert (route.goal, route.lane_width_m, route.length) == (1, 3.5, 1.0)
     assert not route.closed
     loop = {"points_m": [[0, 0], [1, 0], [0, 1]], "closed": True}
-    (route,) = Route.all_from_file(write_routes(tmp_path, **loop))
+    (route,) = load_routes(write_routes(tmp_path, **loop))
     assert route.closed and route.length == pytest.approx(2 + 2**0.5)
     with pytest.raises(InputError, match="no route 'left'; it has 'right'"):
         Route.from_file(tmp_path / "routes.json", "left")
@@ -112,7 +113,7 @@ def test_route_file(tmp_path):
         ({"points_m": [[0, 0], [1, 1], [1, 1]]}, "points 1 and 2"),
         ({"points_m": [[0, 0], [1, None]]}, "finite"),
         ({"points_m": [[0, 0], [1, 1e10]]}, "point 1 .* at most 1e.09 m"),
-        ({"lane_width_m": -1}, "lane_width_m -1"),
+        ({"lane_width_m": -1}, "lane_width_m: -1"),
         ({"speed_ms": "5"}, "speed_ms"),
         ({"goal": 1.5}, "goal"),
         ({"goal": -1}, "goal"),
