@@ -4,33 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
+
 INITIAL = np.array([[0.0, 0.35, 0.02]])
 OFFSET = np.array([[0.05, -0.1, 0.08, 0.1, -0.2, 0.15]])
-ADJOINTS = ("replay", "kept_backgrounds", "checkpointed")
-
-
-def make_adjoint(name):
-    from helpers.tape import FullTape
-
-    from mi_nerfattack.rollout import adjoint
-
-    if name == "tape":
-        return FullTape()
-    if name == "checkpointed":
-        return adjoint.Checkpointed(3)
-    return adjoint.Replay() if name == "replay" else adjoint.KeptBackgrounds()
+ADJOINTS = {
+    "replay": Replay(),
+    "kept": KeptBackgrounds(),
+    "checkpointed": Checkpointed(3),
+}
 
 
 def make_rollout(toy, loop, horizon, attached=False, adjoint="replay"):
-    from mi_nerfattack.rollout.function import Rollout
-    from mi_nerfattack.rollout.objective import StageSum
-
+    objective = StageSum(toy.square_error)
     return Rollout(
-        loop,
-        StageSum(toy.square_error),
-        horizon,
-        adjoint=make_adjoint(adjoint),
-        attached=attached,
+        loop, objective, horizon, adjoint=ADJOINTS[adjoint], attached=attached
     )
 
 
