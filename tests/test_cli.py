@@ -37,8 +37,11 @@ class Try:
             raise InputError("fields/x.safetensors: truncated; copy it again")
         if self.what == "interrupt":
             raise KeyboardInterrupt
-        if self.what == "pipe":
-            raise BrokenPipeError
+        if self.what == "recorded":
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as err:
+                raise RuntimeError("dr.while_loop(): an exception") from err
         if self.what == "rich":
             try:
                 raise BrokenPipeError
@@ -100,12 +103,10 @@ def test_debug_shows_the_traceback(run, place):
     assert err.splitlines()[-1].startswith("mi-nerfattack: error: ")
 
 
-def test_interruption_is_code_130(run):
-    assert run("try", "--what", "interrupt") == (
-        130,
-        "",
-        "mi-nerfattack: interrupted\n",
-    )
+@pytest.mark.parametrize("what", ["interrupt", "recorded"])
+def test_interruption_is_code_130(run, what):
+    """Also where Dr.Jit, which was recording a loop, tells it as its own."""
+    assert run("try", "--what", what) == (130, "", "mi-nerfattack: interrupted\n")
 
 
 def test_sigterm_is_an_interruption_and_the_handler_is_put_back(run):

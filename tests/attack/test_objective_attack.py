@@ -8,6 +8,7 @@ from helpers import toy_loop as toy
 
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,
+    CrossTrackDeviation,
     DepartureTime,
     HeadingDeviation,
     TargetDistance,
@@ -37,6 +38,7 @@ def rightwards(state):
 
 
 CASES = {
+    "cross_track": (StageSum(CrossTrackDeviation(toy.ROUTE)), Mean()),
     "absolute": (StageSum(AbsoluteDeviation(toy.ROUTE)), Mean()),
     "end": (Terminal(AbsoluteDeviation(toy.ROUTE)), Worst()),
     "heading": (StageSum(HeadingDeviation(toy.ROUTE)), Mean()),

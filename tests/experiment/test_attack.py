@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.attack_folder import SCENARIO, run
+from helpers.attack_jobs import run
 
+from mi_nerfattack import cli
+from mi_nerfattack.deploy import paste_layer
+from mi_nerfattack.evaluation.metrics import validate
+from mi_nerfattack.fields import load_grid
+from mi_nerfattack.io import files
+from mi_nerfattack.io.exr import read_layers
+from mi_nerfattack.render.rays import March
+from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
-    from mi_nerfattack.evaluation.metrics import validate
-    from mi_nerfattack.fields import load_grid
-    from mi_nerfattack.io.exr import read_layers
-
     output = tmp_path / "run"
     result = run(
         "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
@@ -50,7 +54,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
             output / "frames" / f"{environment}_gradient_0000.exr"
         )
         assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
-        assert metadata["scenario"] == "toy"
+        assert metadata["scenario"] == "kill"
     plots = ("overhead", "errors", "convergence", "strip")
     for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000
@@ -65,13 +69,11 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_attack_resumes(scenario_folder, tmp_path, number):
-    output = tmp_path / "run"
-    text = SCENARIO.replace("iterations = 3", "iterations = 10")
-    text = text.replace("[deployment]", "[baseline]\ntextures = 1\n[deployment]")
-    path = scenario_folder / f"long_{number}.toml"
-    path.write_text(text)
+def test_interrupted_attack_resumes(scenario_folder, tmp_path):
+    output, other = tmp_path / "run", scenario_folder / "scenario.toml"
+    text = other.read_text().replace("iterations = 3", "iterations = 10")
+    path = scenario_folder / "long.toml"
+    path.write_text(text + "[baseline]\ntextures = 1\n")
     process = subprocess.Popen(
         [sys.executable, "-m", "mi_nerfattack.cli", "attack", path, "-o", output],
         cwd=tmp_path,
@@ -83,7 +85,7 @@ def test_interrupted_attack_resumes(scenario_folder, tmp_path, number):
     deadline = time.monotonic() + 300
     while not checkpoint.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.kill(process.pid, number)
+    process.send_signal(signal.SIGTERM)
     _, stderr = process.communicate(timeout=300)
     assert process.returncode == 130, stderr
     assert "Traceback" not in stderr and "interrupted" in stderr
@@ -91,7 +93,6 @@ def test_interrupted_attack_resumes(scenario_folder, tmp_path, number):
     assert not (output / "metrics.json").exists()
     # another scenario may not continue it, and changes nothing
     kept = (output / "scenario.toml").read_text()
-    other = scenario_folder / "scenario.toml"
     refused = run("attack", other, "-o", output, "--resume", cwd=tmp_path, check=2)
     assert "checkpoint.safetensors" in refused.stderr
     assert (output / "scenario.toml").read_text() == kept
@@ -101,49 +102,6 @@ def test_interrupted_attack_resumes(scenario_folder, tmp_path, number):
     history = json.loads((output / "attack.json").read_text())
     assert [record["iteration"] for record in history] == list(range(10))
     assert (output / "metrics.json").exists()
-
-
-def test_attack_raises_its_objective(scenario_folder):
-    attack = make_attack(scenario_folder)
-    for _ in range(8):
-        attack.step()
-    last = attack.measure()
-    first = attack.history[0]
-    assert last.objective < first.objective - 0.01 * abs(first.objective)
-    assert attack.best_mean_m >= last.cross_track_mean_m
-
-
-def make_attack(scenario_folder):
-    from mi_nerfattack.policy.pilotnet import PilotNet
-    from mi_nerfattack.policy.torch_policy import TorchPolicy
-    from mi_nerfattack.scenario.scenario import load_scenario
-    from mi_nerfattack.scenario.world import build_attack, build_world
-
-    scenario, _ = load_scenario(scenario_folder / "scenario.toml")
-    policy = TorchPolicy(PilotNet.load(scenario_folder / "policy.safetensors"))
-    return build_attack(build_world(scenario, policy))
-
-
-def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_thread):
-    from mi_nerfattack.experiment.checkpoint import CheckpointFile
-    from mi_nerfattack.experiment.effort import Effort
-
-    whole = make_attack(scenario_folder)
-    for _ in range(4):
-        whole.step()
-    half = make_attack(scenario_folder)
-    for _ in range(2):
-        half.step()
-    path = tmp_path / "checkpoint.safetensors"
-    CheckpointFile(path, {}).save(half, Effort())
-    resumed, kept = make_attack(scenario_folder), CheckpointFile(path, {})
-    kept.read()
-    kept.restore(resumed)
-    for _ in range(2):
-        resumed.step()
-    assert resumed.history == whole.history
-    for name, value in whole.tensors().items():
-        assert np.array_equal(value, resumed.tensors()[name]), name
 
 
 @pytest.mark.parametrize(
@@ -162,16 +120,13 @@ def test_a_checkpoint_continues_bit_for_bit(scenario_folder, tmp_path, single_th
     ],
 )
 def test_bad_input_is_named(scenario_folder, tmp_path, capsys, change, words):
-    from mi_nerfattack import cli
-    from mi_nerfattack.io import files
-
     raw = (scenario_folder / "object.safetensors").read_bytes()
     (scenario_folder / "truncated.safetensors").write_bytes(raw[: len(raw) // 2])
     tensors, metadata = files.read_safetensors(scenario_folder / "object.safetensors")
     tensors["texture"] = np.full_like(tensors["texture"], np.nan)
     files.write_safetensors(scenario_folder / "nan.safetensors", tensors, metadata)
     path = scenario_folder / "bad.toml"
-    path.write_text(SCENARIO.replace(*change))
+    path.write_text((scenario_folder / "scenario.toml").read_text().replace(*change))
     assert cli.main(["attack", str(path), "-o", str(tmp_path / "run")]) == 2
     message = capsys.readouterr().err
     for word in words:
@@ -180,27 +135,7 @@ def test_bad_input_is_named(scenario_folder, tmp_path, capsys, change, words):
     assert not (tmp_path / "run").exists()
 
 
-def test_an_interrupt_inside_a_recorded_loop_is_one(monkeypatch, capsys):
-    from mi_nerfattack import cli
-
-    def interrupted(*arguments):
-        del arguments
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt as err:
-            raise RuntimeError("dr.while_loop(): encountered an exception") from err
-
-    monkeypatch.setattr(cli, "_run", interrupted)
-    assert cli.main(["doctor"]) == 130
-    assert "interrupted" in capsys.readouterr().err
-
-
 def test_pasting_follows_depth_and_opacity():
-    import mitsuba as mi
-
-    from mi_nerfattack.deploy import paste_layer
-    from mi_nerfattack.render.rays import March
-
     rgb = np.zeros((1, 4, 3), np.float32)
     depth = np.array([[5.0, 5.0, 1.0, np.inf]])
     opacity = np.array([1.0, 0.4, 1.0, 0.5], np.float32)
@@ -214,7 +149,5 @@ def test_pasting_follows_depth_and_opacity():
 
 
 def test_bundled_demo_scenario_is_valid():
-    from mi_nerfattack.scenario.scenario import load_scenario
-
     scenario, _ = load_scenario(bundled("demo.toml"))
     assert scenario.scene.route in ("straight", "right", "left")

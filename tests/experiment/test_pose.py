@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from helpers import toy_loop as toy
-from helpers.attack_folder import run
+from helpers.attack_jobs import run
 
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
@@ -65,7 +65,7 @@ def test_a_run_says_where_the_objects_stand(scenario_folder, tmp_path):
     text = (scenario_folder / "scenario.toml").read_text()
     scenario = scenario_folder / "both.toml"
     scenario.write_text(text.replace("[attack]", '[attack]\nparameters = "both"'))
-    run("attack", scenario, "-o", tmp_path / "run", cwd=tmp_path)
+    run("attack", scenario, "-o", tmp_path / "run", cwd=tmp_path, check=0)
     document = json.loads((tmp_path / "run/metrics.json").read_text())
     pose = document["object_poses"]["ball"]
     shift = np.array(pose["shift_m"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -49,7 +50,7 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
 
 
 @pytest.mark.usefixtures("no_results")
-def test_what_is_finished_is_not_repeated(folder, tmp_path):
+def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
     interrupt(folder, output, "surrogate: random", 3)  # in the second of two drives
     interrupt(folder, output, "deployment: gradient", 1, resume=True)
@@ -77,14 +78,13 @@ def test_what_is_finished_is_not_repeated(folder, tmp_path):
     assert all(path.stat().st_mtime_ns == time for path, time in written.items())
     # 2 + 2 random + attack + 2, twice; the drives that were cut short count too
     assert document["cost"]["renders"] >= 2 * (2 + 2 + 2) * 2 + 6 * 2 * 2
-    whole = job(folder, tmp_path / "whole").run()
-    assert_same_drives(document["drives"], whole["drives"])
+    assert_same_drives(document["drives"], whole[1]["drives"])
 
 
 @pytest.mark.usefixtures("no_results")
-def test_finished_run_is_resumed_without_a_drive(folder, tmp_path):
+def test_finished_run_is_resumed_without_a_drive(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
-    job(folder, output).run()
+    shutil.copytree(whole[0], output)
 
     def watch(stage, done, total, remark):
         seen.append(remark)
@@ -94,9 +94,8 @@ def test_finished_run_is_resumed_without_a_drive(folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_results")
-def test_interrupt_within_a_step_leaves_a_whole_state(folder, tmp_path):
-    whole, output = tmp_path / "whole", tmp_path / "run"
-    job(folder, whole).run()
+def test_interrupt_within_a_step_leaves_a_whole_state(folder, whole, tmp_path):
+    output = tmp_path / "run"
 
     def press():
         signal.raise_signal(signal.SIGINT)
@@ -106,12 +105,12 @@ def test_interrupt_within_a_step_leaves_a_whole_state(folder, tmp_path):
         job(folder, output, on_progress=progress).run()
     assert len(checkpoint_of(output)["history"]) == 4
     job(folder, output).run(resume=True)
-    assert_same_state(output, whole)
+    assert_same_state(output, whole[0])
 
 
 @pytest.mark.usefixtures("no_results")
 def test_error_within_an_update_keeps_the_checkpoint_before(
-    folder, tmp_path, monkeypatch
+    folder, whole, tmp_path, monkeypatch
 ):
     from mi_nerfattack.attack import gradient
 
@@ -124,15 +123,14 @@ def test_error_within_an_update_keeps_the_checkpoint_before(
         if len(calls) == 5:
             raise MemoryError
 
-    whole, output = tmp_path / "whole", tmp_path / "run"
-    job(folder, whole).run()
+    output = tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(gradient.Adam, "step", fail_after)
         with pytest.raises(MemoryError):
             job(folder, output).run()
     assert len(checkpoint_of(output)["history"]) == 3
     job(folder, output).run(resume=True)
-    assert_same_state(output, whole)
+    assert_same_state(output, whole[0])
 
 
 @pytest.mark.usefixtures("no_results")

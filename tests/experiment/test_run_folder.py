@@ -17,8 +17,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("left", ["nothing", "folder", "partial", "scenario", "drives"])
-def test_run_killed_early_starts_from_the_beginning(folder, tmp_path, left):
+@pytest.mark.parametrize("left", ["nothing", "partial", "scenario", "drives"])
+def test_run_killed_early_starts_from_the_beginning(folder, whole, tmp_path, left):
     output, notices = tmp_path / "run", []
     partial = output / ".scenario.toml.0123456789ab.tmp"
     if left != "nothing":
@@ -26,17 +26,14 @@ def test_run_killed_early_starts_from_the_beginning(folder, tmp_path, left):
     if left in ("partial", "scenario"):
         partial.write_text("half of")
     if left in ("scenario", "drives"):
-        whole = tmp_path / "whole"
-        job(folder, whole).run()
-        text = (whole / "scenario.toml").read_text()
-        (output / "scenario.toml").write_text(text)
+        shutil.copy(whole[0] / "scenario.toml", output)
     if left == "drives":
         interrupt(folder, tmp_path / "cut", "surrogate: random", 1)
         shutil.copytree(tmp_path / "cut" / "drives", output / "drives")
     job(folder, output, notices=notices).run(resume=True)
     assert (output / "metrics.json").exists() and not partial.exists()
     begins = any("starts from the beginning" in notice for notice in notices)
-    assert begins == (left in ("nothing", "folder", "partial"))
+    assert begins == (left in ("nothing", "partial"))
 
 
 @pytest.mark.usefixtures("no_results")
@@ -96,13 +93,7 @@ def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, d
 
 @pytest.mark.usefixtures("no_results")
 @pytest.mark.parametrize(
-    ("call", "number"),
-    [
-        ("open", errno.EROFS),
-        ("write", errno.ENOSPC),
-        ("fsync", errno.ENOSPC),
-        ("replace", errno.EROFS),
-    ],
+    ("call", "number"), [("open", errno.EROFS), ("write", errno.ENOSPC)]
 )
 def test_failed_checkpoint_leaves_the_one_before(
     folder, tmp_path, monkeypatch, call, number

@@ -1,8 +1,10 @@
-"""Tiny attacks that are interrupted and resumed: a scenario, jobs, their files."""
+"""Tiny attacks that are interrupted and resumed: scenarios, jobs, their files."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,46 +12,34 @@ from helpers import toy_loop as toy
 
 from mi_nerfattack.io import files
 
-CHANGES = {
-    "horizon = 2": "horizon = 2",
-    "iterations = 30": "iterations = 6",
-    "textures = 4": "textures = 2",
-    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
-}
 STAGES = ("unperturbed", "random", "gradient")
 
 
-@pytest.fixture(scope="module", name="folder")
-def make_folder(tmp_path_factory):
-    """A scenario of tiny fields."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+def write_scenario(folder, changes):
+    """Write the scenario of tiny fields, with old parts of its text made new ones."""
     from bench.kill.scenario import SCENARIO, make_scenario
 
-    path = tmp_path_factory.mktemp("scenario")
-    make_scenario(path)
+    make_scenario(folder)
     text = SCENARIO
-    for old, new in CHANGES.items():
+    for old, new in changes.items():
         assert old in text
         text = text.replace(old, new)
-    (path / "scenario.toml").write_text(text)
-    return path
+    (folder / "scenario.toml").write_text(text)
+    return folder
 
 
-@pytest.fixture(name="no_results")
-def leave_out_results(monkeypatch):
-    """Leave out plots and pages, which take seconds."""
-    from mi_nerfattack.experiment import results
-
-    def only_numbers(
-        output, world, drives, attack, textures, text, cost, ignored, *more
-    ):
-        document = {"cost": cost, "ignored_changes": ignored, "drives": drives}
-        files.write_json(output / "metrics.json", {"cost": cost})
-        return document
-
-    monkeypatch.setattr(results, "write_results", only_numbers)
+def run(*arguments, cwd, check):
+    """Run the command line in a process of its own."""
+    result = subprocess.run(
+        [sys.executable, "-m", "mi_nerfattack.cli", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert result.returncode == check, result.stderr
+    assert "Traceback" not in result.stderr
+    return result
 
 
 def job(folder, output, change=("", ""), on_progress=None, notices=None):

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.policy_servers import serving
+from helpers.policies import camera, policy_of, serving
 from torch import nn
 
 from mi_nerfattack.errors import InputError
@@ -18,19 +18,10 @@ from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.scenario.policy import (
     PolicySection,
     build_differentiable,
-    load_policy,
 )
 from mi_nerfattack.scenario.section import read_section
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def section(**keys):
-    return {"trust_code": True, **keys}
-
-
-def camera(n, rng):
-    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
 
 
 @pytest.fixture
@@ -47,8 +38,8 @@ def test_black_boxes_refuse_gradients_by_name(tmp_path, rng):
     (tmp_path / "mine.py").write_text(
         "def drive(image, goal, step): return goal + step"
     )
-    found = section(kind="callable", file="mine.py:drive", control_scale=0.5)
-    policy = load_policy(found, tmp_path)
+    found = {"kind": "callable", "file": "mine.py:drive", "trust_code": True}
+    policy = policy_of(tmp_path, **found, control_scale=0.5)
     image, memory = camera(2, rng), policy.initial_memory(2)
     for step in range(3):
         control, memory = policy.step(image, [0, 3], memory)
@@ -79,8 +70,9 @@ def test_black_boxes_see_the_frame_stack(tmp_path, rng):
         "frames": 2,
         "layout": "NHWC",
     }
-    found = section(kind="callable", file="mine.py:drive", preprocess=preprocess)
-    policy = load_policy(found, tmp_path)
+    policy = policy_of(
+        tmp_path, kind="callable", file="mine.py:drive", preprocess=preprocess
+    )
     memory = policy.initial_memory(1)
     expected = [0.0, -0.25, -0.25]
     for level, control in zip((0.25, 0.5, 0.75), expected, strict=True):
@@ -101,7 +93,7 @@ def test_black_boxes_see_the_frame_stack(tmp_path, rng):
 )
 def test_wrong_answers_of_functions(answer, message, tmp_path, rng):
     (tmp_path / "mine.py").write_text(f"def drive(*_): return {answer}")
-    policy = load_policy(section(kind="callable", file="mine.py:drive"), tmp_path)
+    policy = policy_of(tmp_path, kind="callable", file="mine.py:drive")
     with pytest.raises(InputError, match=f"mine.py:drive: {message}"):
         policy.control(camera(2, rng), 0)
 
@@ -202,7 +194,7 @@ def test_functions_may_write_into_their_image(tmp_path, rng):
         "    image *= 0; goal += 1\n"
         "    return image.mean((1, 2, 3)) + goal\n"
     )
-    policy = load_policy(section(kind="callable", file="mine.py:drive"), tmp_path)
+    policy = policy_of(tmp_path, kind="callable", file="mine.py:drive")
     for frames in (1, 2):
         policy.preprocess.frames = frames
         image = camera(2, rng)
@@ -239,7 +231,8 @@ def test_drjit_networks_are_torch_s_with_the_same_weights(tmp_path, rng):
     shapes = {f"layers.{name}": shape for name, shape in shapes.items()}
     tensors = {k: rng.normal(0, 0.3, s).astype("f4") for k, s in shapes.items()}
     files.write_safetensors(tmp_path / "w.safetensors", tensors)
-    found = section(
+    policy = policy_of(
+        tmp_path,
         kind="drjit",
         file="net.py:make",
         weights_file="w.safetensors",
@@ -248,7 +241,6 @@ def test_drjit_networks_are_torch_s_with_the_same_weights(tmp_path, rng):
         output=1,
         preprocess={"resize_px": (5, 4)},
     )
-    policy = load_policy(found, tmp_path)
     reference = nn.Sequential(nn.Linear(63, 8), nn.Tanh(), nn.Linear(8, 2)).double()
     names = ("0.weight", "0.bias", "2.weight", "2.bias")
     values = map(torch.from_numpy, tensors.values())
@@ -274,6 +266,6 @@ def test_drjit_networks_that_do_not_fit(tmp_path, rng):
     files.write_safetensors(tmp_path / "w.safetensors", {"a": np.zeros(2, "f4")})
     keys = {"kind": "drjit", "file": "net.py:make", "preprocess": {"resize_px": (5, 4)}}
     with pytest.raises(InputError, match=r"\['a'\]; the network has \['layers.0.b"):
-        load_policy(section(weights_file="w.safetensors", **keys), tmp_path)
+        policy_of(tmp_path, weights_file="w.safetensors", **keys)
     with pytest.raises(InputError, match="net.py:make: fails on an input of shape"):
-        load_policy(section(**keys), tmp_path).control(camera(1, rng), 0)
+        policy_of(tmp_path, **keys).control(camera(1, rng), 0)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import analytic_loop as analytic
+from helpers.rollouts import ADJOINTS, Wave, assert_close, expected_gradient, flat
 from torch import nn
 
 from mi_nerfattack.policy.black_box import CallablePolicy
@@ -17,33 +18,13 @@ from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.goals import NoGoal, OneHotGoal
 from mi_nerfattack.policy.preprocess import Normalise, Preprocess, Resize, to_yuv
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import simulate
-from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 HORIZON = 7
-ADJOINTS = {
-    "replay": Replay(),
-    "kept": KeptBackgrounds(),
-    "checkpointed": Checkpointed(3),
-}
-
-
-class Wave(AbstractObjective):
-    """A function of position and heading."""
-
-    def evaluate(self, states):
-        x, y, theta = (states.rows[i] for i in range(3))
-        return states.total(dr.sin(1.3 * y + 0.2 * x) + dr.square(theta) * dr.cos(x))
-
-
-def wave_in_torch(states):
-    x, y, theta = states[:, 1:, :3].unbind(2)
-    return (torch.sin(1.3 * y + 0.2 * x) + theta**2 * torch.cos(x)).sum(1)
 
 
 class Recurrent(nn.Module):
@@ -108,16 +89,6 @@ class Carried(nn.Module):
         return policy.control_scale * result[0][:, 0]
 
 
-def expected(loop, twin, initial, attached):
-    """Differentiate the twin by its texture and its initial states."""
-    texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)
-    start = torch.tensor(initial, requires_grad=True)
-    states, _ = twin.drive(start, [texture], HORIZON, attached)
-    value = wave_in_torch(states).mean()
-    value.backward()
-    return float(value.detach()), texture.grad.numpy(), start.grad.numpy()
-
-
 def make(name):
     policy = policies()[name]
     loop, twin = analytic.make_pair("ackermann", substeps=2, delay=1)
@@ -131,36 +102,30 @@ def make(name):
 @pytest.mark.parametrize("name", ["recurrent", "stacked"])
 def test_gradients_go_through_the_memory(name, attached, adjoint):
     loop, twin, initial = make(name)
-    value, by_texture, by_state = expected(loop, twin, initial, attached)
+    value, expected = expected_gradient(loop, twin, initial, HORIZON, attached)
     rollout = Rollout(loop, Wave(), HORIZON, adjoint=adjoint, attached=attached)
     evaluation = rollout.run(to_state(initial))
     assert evaluation.value == pytest.approx(value, rel=1e-12)
-    found = rollout.gradient(evaluation)
-    for a, b in (
-        (found.textures[0].numpy(), by_texture),
-        (np.array(found.initial).T, by_state),
-    ):
-        assert np.linalg.norm(a - b) <= 1e-9 * np.linalg.norm(b)
+    assert_close(flat(rollout.gradient(evaluation, offsets=True)), expected, 1e-9)
 
 
 @pytest.mark.parametrize("name", ["recurrent", "stacked"])
 def test_forward_mode_goes_through_the_memory(name, rng):
     loop, twin, initial = make(name)
-    _, by_texture, by_state = expected(loop, twin, initial, True)
-    tangents = rng.normal(size=by_texture.shape), rng.normal(size=by_state.shape)
+    _, expected = expected_gradient(loop, twin, initial, HORIZON, True)
+    by_texture, by_state, _ = expected
+    texture, start = (rng.normal(size=x.shape) for x in (by_texture, by_state))
     rollout = Rollout(loop, Wave(), HORIZON, attached=True)
     evaluation = rollout.run(to_state(initial))
-    textures = [analytic.tensor(tangents[0])]
-    found = rollout.tangent(evaluation, textures, to_state(tangents[1]))
-    right = (by_texture * tangents[0]).sum() + (by_state * tangents[1]).sum()
+    found = rollout.tangent(evaluation, [analytic.tensor(texture)], to_state(start))
+    right = (by_texture * texture).sum() + (by_state * start).sum()
     assert found == pytest.approx(right, rel=1e-9)
 
 
 def test_memory_matters_to_the_gradient(monkeypatch):
     """Guard the tests above: cut the memory's derivative, and they would fail."""
     loop, twin, initial = make("recurrent")
-    _, by_texture, _ = expected(loop, twin, initial, False)
-
+    _, (by_texture, *_) = expected_gradient(loop, twin, initial, HORIZON, False)
     whole = TorchPolicy.step_vjp
 
     def forgetful(self, image, goal, memory, cotangent, d_memory):

@@ -160,9 +160,53 @@ def test_the_check_is_made_once(rng):
     assert len(calls) == 2 + 3
 
 
-@pytest.mark.parametrize("wrap", [nn.Identity, OneImage])
-def test_a_second_output_is_not_dropped(wrap, rng):
+def test_a_second_output_of_one_image_is_not_dropped(rng):
     module = Wrap(lambda x: (x.mean((1, 2, 3)), x.mean((1, 2, 3))))
-    network = OneImage(module) if wrap is OneImage else module
     with pytest.raises(InputError, match="policy.recurrent.*policy.output"):
-        TorchPolicy(network, NoGoal()).step(images(rng), 0, ())
+        TorchPolicy(OneImage(module), NoGoal()).step(images(rng), 0, ())
+
+
+@pytest.mark.parametrize(
+    ("answer", "arguments", "message"),
+    [
+        (lambda x: x.mean(), {}, r"controls \(\) for 2 images"),
+        (lambda x: x.mean((2, 3)), {}, r"controls \(2, 3\).*policy.output"),
+        (lambda x: x.mean((2, 3)), {"output": 3}, r"output \(is 3\)"),
+        (lambda x: x[:1].mean((1, 2, 3)), {}, r"\(1,\) for 2 images"),
+        (lambda x: x.mean((1, 2, 3)) / 0, {}, "mine.py: control inf for image 0"),
+        (lambda x: x @ x, {}, r"mine.py: fails on an input of shape \(2, 3, 6, 8\)"),
+        (lambda x, h: x.mean((1, 2, 3)), {}, "mine.py: fails.*argument"),
+        (
+            lambda x, h: (x.mean((1, 2, 3)), h[:1]),
+            {"recurrent": [(-1, 4)]},
+            r"\[\(1, 4\)\] come out where \[\(2, 4\)\]",
+        ),
+        (
+            lambda x, h: x.mean((1, 2, 3)),
+            {"recurrent": [(-1, 4)]},
+            r"hidden states \[\] come out",
+        ),
+        (
+            lambda x: (x.mean((1, 2, 3)), x),
+            {},
+            r"come out where \[\] went in.*policy.recurrent",
+        ),
+    ],
+)
+def test_wrong_answers_are_refused(answer, arguments, message, rng):
+    with pytest.raises(InputError, match=message):
+        made = policy(answer, **arguments)
+        made.step(images(rng), 0, made.initial_memory(2))
+
+
+def test_column_scale_and_sign():
+    by_column = torch.tensor([1.0, 2.0, 3.0])
+    made = policy(lambda x: x.mean((2, 3)) * by_column, output=2, control_scale=-2.0)
+    image = mi.TensorXf(np.full((2, *SIZE, 3), 0.5, "f4"))
+    np.testing.assert_allclose(made.control(image, 0), -3.0)
+
+
+def test_a_module_that_detaches_the_image_is_refused(rng):
+    made = policy(lambda x: x.detach().mean((1, 2, 3)))
+    with pytest.raises(InputError, match="mine.py: its control has no derivative"):
+        made.step_vjp(images(rng, 1), 0, (), mi.Float(1), ())

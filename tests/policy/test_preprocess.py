@@ -172,11 +172,3 @@ def test_stages_follow_each_other(rng):
 def test_refusals(make, message):
     with pytest.raises(InputError, match=message):
         make()
-
-
-def test_a_kept_stack_holds_no_frame_that_has_dropped_out():
-    preprocess = Preprocess(frames=3, stride=2)
-    past = torch.zeros(1, 0, 0, 0, 0)
-    for _ in range(7):
-        _, past = preprocess.stack(torch.rand(1, 3, 4, 5), past)
-    assert past.untyped_storage().nbytes() == past.numel() * 4 == 4 * 60 * 4

@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import torch
 from helpers import analytic_loop as analytic
+from helpers.rollouts import (
+    ADJOINTS,
+    Wave,
+    assert_close,
+    expected_gradient,
+    flat,
+    wave_in_torch,
+)
 
-from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
+from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.objective import AbstractObjective, StageSum
+from mi_nerfattack.rollout.objective import StageSum
 from mi_nerfattack.rollout.reduction import Mean, Worst
 from mi_nerfattack.rollout.sweep import StepRecorder
 from mi_nerfattack.rollout.torch_rollout import torch_rollout
@@ -20,58 +28,9 @@ from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-ADJOINTS = {
-    "replay": Replay(),
-    "kept": KeptBackgrounds(),
-    "checkpointed": Checkpointed(3),
-}
 OFFSETS = np.array(
     [[0.1, -0.2, 0.3, 0.05, 0.1, -0.15], [0.0, 0.2, -0.1, 0.3, 0.0, 0.1]]
 )
-
-
-class Wave(AbstractObjective):
-    """A function of position, heading and time that no two states share."""
-
-    def evaluate(self, states):
-        x, y, theta = (states.rows[i] for i in range(3))
-        value = dr.sin(1.3 * y + 0.2 * x) + dr.square(theta) * dr.cos(x)
-        return states.total(value * (1 + states.time))
-
-
-def wave_in_torch(states, dt):
-    """The same, (n,) from states (n, T + 1, m)."""
-    x, y, theta = states[:, 1:, :3].unbind(2)
-    time = dt * torch.arange(1, states.shape[1], dtype=torch.float64)
-    value = torch.sin(1.3 * y + 0.2 * x) + theta**2 * torch.cos(x)
-    return (value * (1 + time)).sum(1)
-
-
-def expected_gradient(loop, twin, initial, horizon, attached, reduce=torch.mean):
-    """Differentiate the twin by textures, initial states and offsets."""
-    textures = [
-        torch.tensor(texture.numpy(), requires_grad=True)
-        for texture in loop.sensor.textures()
-    ]
-    start = torch.tensor(initial, requires_grad=True)
-    offsets = torch.tensor(loop.sensor.offsets(), requires_grad=True)
-    states, _ = twin.drive(start, textures, horizon, attached, offsets)
-    value = reduce(wave_in_torch(states, twin.dt))
-    value.backward()
-    grads = [texture.grad.numpy() for texture in textures]
-    return float(value.detach()), [*grads, start.grad.numpy(), offsets.grad.numpy()]
-
-
-def flat(gradient):
-    """Lay a gradient out as `expected_gradient` does."""
-    textures = [texture.numpy() for texture in gradient.textures]
-    return [*textures, np.array(gradient.initial).T, gradient.offsets]
-
-
-def assert_close(found, expected, tolerance=1e-8):
-    for a, b in zip(found, expected, strict=True):
-        scale = np.linalg.norm(b)
-        assert np.linalg.norm(a - b) <= tolerance * scale, (a, b)
 
 
 @pytest.mark.parametrize("name", ADJOINTS)

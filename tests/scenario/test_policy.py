@@ -13,14 +13,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.policy_servers import serving
+from helpers.policies import camera, policy_of, serving
 from safetensors.torch import save_file
 from torch import nn
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
-from mi_nerfattack.scenario.policy import PolicySection, PreprocessSection, load_policy
+from mi_nerfattack.scenario.policy import PolicySection, PreprocessSection
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -38,14 +38,6 @@ id = "hydrant"
 field = "bundled:hydrant/field.safetensors"
 position_m = [6.0, -6.2, 0.12]
 """
-
-
-def section(**keys):
-    return {"trust_code": True, **keys}
-
-
-def camera(n, rng):
-    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
 
 
 # --- the guide ------------------------------------------------------------------------
@@ -149,7 +141,7 @@ def test_the_guide_lists_every_key():
 )
 def test_keys_and_files_that_do_not_fit(keys, message, tmp_path):
     with pytest.raises(InputError, match=message):
-        load_policy(section(**keys), tmp_path)
+        policy_of(tmp_path, **keys)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +189,7 @@ def test_the_scenario_file_is_checked(lines, key, tmp_path):
 def test_python_files_that_do_not_fit(code, message, tmp_path):
     (tmp_path / "net.py").write_text(code)
     with pytest.raises(InputError, match=message):
-        load_policy(section(file="net.py:Net"), tmp_path)
+        policy_of(tmp_path, file="net.py:Net")
 
 
 MODULE = (
@@ -216,7 +208,7 @@ def test_weights_of_a_module(tmp_path, rng):
         expected = network(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))[0]
     for name in ("w.pt", "w.safetensors"):
         keys = {"file": "net.py:make", "weights_file": name}
-        policy = load_policy(section(**keys), tmp_path)
+        policy = policy_of(tmp_path, **keys)
         np.testing.assert_allclose(policy.control(image, 0), expected, atol=1e-6)
 
 
@@ -244,12 +236,12 @@ def test_weights_that_do_not_fit(state, message, tmp_path):
     torch.save(state, tmp_path / "w.pt")
     keys = {"file": "net.py:make", "weights_file": "w.pt"}
     with pytest.raises(InputError, match=f"(?s)w.pt: .*{message}"):
-        load_policy(section(**keys), tmp_path)
+        policy_of(tmp_path, **keys)
 
 
 def test_input_sizes_that_do_not_fit(tmp_path, rng):
     (tmp_path / "net.py").write_text(MODULE)
-    policy = load_policy(section(file="net.py:make"), tmp_path)
+    policy = policy_of(tmp_path, file="net.py:make")
     image = mi.TensorXf(rng.random((2, 10, 20, 3), dtype=np.float32))
     message = r"net.py:make: fails on an input of shape \(2, 3, 10, 20\).*preprocess"
     with pytest.raises(InputError, match=f"(?s){message}"):
@@ -262,7 +254,7 @@ def test_input_sizes_that_do_not_fit(tmp_path, rng):
 def test_pilotnet_stays_as_it_was(tmp_path, rng):
     network = PilotNet()
     network.save(tmp_path / "policy.safetensors")
-    policy = load_policy(section(file="policy.safetensors"), tmp_path)
+    policy = policy_of(tmp_path, file="policy.safetensors")
     image, weight = camera(2, rng), mi.Float(1, -1)
     one, other = (
         policy.vjp(image, 1, weight),

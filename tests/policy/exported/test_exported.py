@@ -9,21 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from helpers.policies import camera, policy_of
 from torch import nn
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.exported import load
-from mi_nerfattack.scenario.policy import load_policy
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def section(**keys):
-    return {"trust_code": True, **keys}
-
-
-def camera(n, rng):
-    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
 
 
 def small(batch_norm=True):
@@ -57,7 +49,7 @@ def write_script(network, path):
 def test_programs_have_the_module_s_derivatives(name, write, tmp_path, rng):
     network = small()
     write(network, tmp_path / name)
-    policy = load_policy(section(file=name), tmp_path)
+    policy = policy_of(tmp_path, file=name)
     assert not any(p.requires_grad for p in policy.module.parameters())
     image, weight = camera(3, rng), mi.Float(1, -2, 0.5)
     leaf = torch.from_numpy(image.numpy()).double().requires_grad_(True)
@@ -78,14 +70,14 @@ def test_programs_have_the_module_s_derivatives(name, write, tmp_path, rng):
 def test_programs_for_one_image_serve_several(tmp_path, rng):
     network = small()
     write_exported(network, tmp_path / "net.pt2", 1, free=False)
-    policy = load_policy(section(file="net.pt2"), tmp_path)
+    policy = policy_of(tmp_path, file="net.pt2")
     image = camera(3, rng)
     with torch.no_grad():
         expected = network(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))[:, 0]
     np.testing.assert_allclose(policy.control(image, 0), expected, atol=1e-5)
     write_exported(network, tmp_path / "two.pt2", 2, free=False)
     with pytest.raises(InputError, match="two.pt2: takes exactly 2 images"):
-        load_policy(section(file="two.pt2"), tmp_path)
+        policy_of(tmp_path, file="two.pt2")
 
 
 def test_one_image_at_a_time_keeps_hidden_states_apart(tmp_path, rng):
@@ -106,7 +98,7 @@ def test_one_image_at_a_time_keeps_hidden_states_apart(tmp_path, rng):
     image = camera(3, rng)
     results = []
     for extra in ({}, {"batch": 1}):
-        policy = load_policy(section(**keys, **extra), tmp_path)
+        policy = policy_of(tmp_path, **keys, **extra)
         memory = policy.initial_memory(3)
         for _ in range(2):
             control, memory = policy.step(image, 2, memory)
@@ -119,16 +111,16 @@ def test_one_image_at_a_time_keeps_hidden_states_apart(tmp_path, rng):
 def test_other_files_are_no_programs(name, tmp_path):
     torch.save({"a": torch.zeros(2)}, tmp_path / name)
     with pytest.raises(InputError, match=f"{name}: .*program"):
-        load_policy(section(file=name), tmp_path)
+        policy_of(tmp_path, file=name)
     (tmp_path / name).write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=f"{name}: is no"):
-        load_policy(section(file=name), tmp_path)
+        policy_of(tmp_path, file=name)
 
 
 @pytest.mark.parametrize("name", ["net.pt", "net.pt2", "net.py:Net"])
 def test_code_needs_the_word_of_trust(name, tmp_path):
     with pytest.raises(InputError, match=f"policy.file: {name}: .*trust_code = true"):
-        load_policy(section(file=name, trust_code=False), tmp_path)
+        policy_of(tmp_path, file=name, trust_code=False)
 
 
 @pytest.mark.parametrize("name", ["net.pt", "net.pt2"])
@@ -137,7 +129,7 @@ def test_a_small_file_of_a_huge_program(name, tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / name, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("weights", bytes(1 << 17))
     with pytest.raises(InputError, match=f"{name}: unpacks to 131072 bytes"):
-        load_policy(section(file=name), tmp_path)
+        policy_of(tmp_path, file=name)
 
 
 class Sizes(nn.Module):
@@ -156,7 +148,7 @@ def test_programs_with_free_sizes_are_read(tmp_path, rng):
         Sizes(), (torch.zeros(2, 3, 66, 200),), dynamic_shapes=shapes
     )
     torch.export.save(program, tmp_path / "net.pt2")
-    policy = load_policy(section(file="net.pt2"), tmp_path)
+    policy = policy_of(tmp_path, file="net.pt2")
     image = camera(3, rng)
     expected = Sizes()(torch.from_numpy(image.numpy()).permute(0, 3, 1, 2))
     np.testing.assert_allclose(policy.control(image, 0), expected, rtol=1e-5)
@@ -164,7 +156,7 @@ def test_programs_with_free_sizes_are_read(tmp_path, rng):
 
 def test_programs_of_another_size_are_told(tmp_path, rng):
     write_exported(small(), tmp_path / "net.pt2")
-    policy = load_policy(section(file="net.pt2"), tmp_path)
+    policy = policy_of(tmp_path, file="net.pt2")
     image = mi.TensorXf(rng.random((2, 30, 40, 3), dtype=np.float32))
     with pytest.raises(InputError, match=r"(?s)net.pt2: fails on .*policy.preprocess"):
         policy.control(image, 0)
@@ -180,6 +172,6 @@ def test_programs_exported_in_training_mode_are_refused(tmp_path, rng):
         trace = torch.jit.trace(norm, torch.zeros(2, 3, 66, 200), check_trace=False)
         torch.jit.save(trace, tmp_path / "norm.pt")
     for name in ("norm.pt2", "drop.pt2", "norm.pt"):
-        policy = load_policy(section(file=name), tmp_path)
+        policy = policy_of(tmp_path, file=name)
         with pytest.raises(InputError, match=f"{name}: .*export network.eval"):
             policy.control(camera(2, rng), 0)

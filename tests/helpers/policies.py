@@ -1,4 +1,4 @@
-"""HTTP servers that live as long as a test."""
+"""Policies of a scenario file, images for them, and servers that live a test long."""
 
 from __future__ import annotations
 
@@ -6,6 +6,21 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.scenario.policy import load_policy
+
+
+def policy_of(folder, **keys):
+    """Load the policy of a section whose code is trusted."""
+    return load_policy({"trust_code": True} | keys, folder)
+
+
+def camera(n, rng):
+    """Return random images of n vehicles."""
+    return mi.TensorXf(rng.random((n, 66, 200, 3), dtype=np.float32))
 
 
 @contextmanager
