@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -121,7 +120,6 @@ class PaintedSite(AbstractSite):
     objects: bool = True
     size_px: tuple[int, int] = (8, 4)
     opened: list[PaintedEnvironment] = field(default_factory=list, compare=False)
-    delay_s: float = 0.0
 
     @property
     def camera(self) -> Camera:
@@ -142,7 +140,6 @@ class PaintedSite(AbstractSite):
         return Grey()
 
     def open(self, conditions):
-        time.sleep(self.delay_s)
         self.opened.append(PaintedEnvironment(self.camera, conditions))
         self.opened[-1].name = self.name
         return self.opened[-1]
