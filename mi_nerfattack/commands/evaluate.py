@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
     from mi_nerfattack.scenario.policy import AbstractPolicySection
     from mi_nerfattack.system.workers import AbstractWorkers
+    from mi_nerfattack.training.record import TrainingRecord
     from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -116,7 +117,7 @@ class Evaluate:
         self,
         folder: Path,
         work: EvaluateWork,
-        record: dict[str, Any] | None,
+        record: TrainingRecord | None,
         found: Evaluation,
         wall_s: float,
     ) -> None:
@@ -204,7 +205,7 @@ def _check_different(option: str, names: tuple[str, ...]) -> None:
         raise InputError(f"{option}: {' '.join(names)!r}; at least one, each once")
 
 
-def _training_record(work: EvaluateWork) -> dict[str, Any] | None:
+def _training_record(work: EvaluateWork) -> TrainingRecord | None:
     """Read what training wrote beside the policy; None where it wrote nothing."""
     from mi_nerfattack.scenario.policy import PilotNetSection, ProgramSection
     from mi_nerfattack.training.record import read_record

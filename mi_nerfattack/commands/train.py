@@ -128,8 +128,8 @@ class Train:
                 more,
             )
         command = command_line("train", self)
-        record = training_record(settings, sites, self.data, result.shards, command)
-        write_trained(self.output, result, record)
+        record = training_record(settings, sites, self.data, result, command)
+        write_trained(self.output, result.module, record)
         Console().print(card_table(result.card))
         print(f"{self.output}: written; program and validation are beside it")
         return 0

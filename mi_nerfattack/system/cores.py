@@ -1,8 +1,9 @@
-"""How many processor cores there are to work on."""
+"""The machine that this process works on."""
 
 from __future__ import annotations
 
 import os
+import platform
 import sys
 
 
@@ -11,3 +12,8 @@ def cores() -> int:
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def machine() -> str:
+    """Name the machine in records: cores, system and architecture."""
+    return f"{cores()} cores, {platform.system()} {platform.machine()}"

@@ -2,99 +2,115 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
 
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record
 from mi_nerfattack.policy.exported.program import SUFFIX, export_program
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.system.cores import machine
 from mi_nerfattack.training.dataset import FramesFile
 from mi_nerfattack.training.imitate import Imitated
 from mi_nerfattack.training.settings import ImitationSettings
+from mi_nerfattack.training.validation import Epoch
+
+
+class TrainingRecord(Record):
+    """How a policy was trained, and how it drove; the JSON beside it.
+
+    Attributes:
+        environments: of the last validation, {ENVIRONMENT: {ROUTE: {CASE: figures}}}.
+        training: epochs of the first training and of each round's.
+        best_round: whose weights the policy has.
+        command: that was given.
+        seed: of the training.
+        settings: `ImitationSettings`, without those that others override.
+        augmentation: of the images.
+        data: frames by collection.
+        sites: where the frames come from.
+        checksums: SHA-256 of the sites' files.
+        machine: that it was trained on; None where it was not written down.
+    """
+
+    schema_version: Literal[2] = Field(default=2, alias="schema")
+    environments: dict[str, Any]
+    training: list[list[Epoch]]
+    best_round: int
+    command: str
+    seed: int
+    settings: dict[str, Any]
+    augmentation: dict[str, float]
+    data: dict[str, int]
+    sites: dict[str, Any]
+    checksums: dict[str, str]
+    machine: str | None = None
 
 
 def training_record(
     settings: ImitationSettings,
     sites: Sequence[AbstractSite],
     data: Path,
-    shards: Sequence[Path],
+    result: Imitated,
     command: str,
-) -> dict[str, Any]:
-    """Describe a training: what its page shows.
+) -> TrainingRecord:
+    """Describe a training.
 
     Args:
         settings: of the training.
         sites: where its frames come from.
         data: folder of the frames.
-        shards: that were trained and validated on.
+        result: of the training.
         command: that was given.
-
-    Returns:
-        `command`, `seed`, `settings`, `augmentation`, `data` (frames by collection),
-        `sites` and `checksums` (SHA-256 of the sites' files), as JSON.
     """
-    described = [site.describe() for site in sites]
-    record = {
-        "command": command,
-        "seed": settings.seed,
-        "settings": _settings(settings),
-        "augmentation": asdict(settings.training.augmentation),
-        "data": count_frames(data, shards),
-        "sites": {
-            site.name: {key: value for key, value in about.items() if key != "files"}
-            for site, about in zip(sites, described, strict=True)
-        },
-        "checksums": {
-            name: digest
-            for about in described
-            for name, digest in about.get("files", {}).items()
-        },
-    }
-    return json.loads(json.dumps(record, default=str))
+    described = {site.name: site.describe() for site in sites}
+    sums = [about.pop("files", {}) for about in described.values()]
+    return TrainingRecord(
+        environments=result.card,
+        training=result.history,
+        best_round=result.best_round,
+        command=command,
+        seed=settings.seed,
+        settings=_settings(settings),
+        augmentation=asdict(settings.training.augmentation),
+        data=count_frames(data, result.shards),
+        sites=described,
+        checksums={name: digest for each in sums for name, digest in each.items()},
+        machine=machine(),
+    )
 
 
-def write_trained(path: Path, result: Imitated, record: Mapping[str, Any]) -> None:
+def write_trained(path: Path, module: PilotNet, record: TrainingRecord) -> None:
     """Write a policy, and beside it its program and its record.
 
     Args:
         path: of the weights (.safetensors).
-        result: of the training.
-        record: see `training_record`.
+        module: the policy.
+        record: of its training.
     """
-    result.module.save(path)
-    export_program(result.module, path.with_suffix(SUFFIX))
-    document = {
-        "schema": 2,
-        "environments": result.card,
-        "training": result.history,
-        "best_round": result.best_round,
-        **record,
-    }
+    module.save(path)
+    export_program(module, path.with_suffix(SUFFIX))
+    document = record.model_dump(mode="json", by_alias=True)
     files.write_json(path.with_suffix(".json"), document)
 
 
-def read_record(path: Path) -> dict[str, Any] | None:
+def read_record(path: Path) -> TrainingRecord | None:
     """Read what training writes beside a policy; None for JSON of something else.
 
     Raises:
         InputError: unreadable, or no JSON.
     """
     found = files.read_json(path)
-    ours = (
-        isinstance(found, dict)
-        and type(found.get("schema")) is int
-        and isinstance(found.get("training"), list)
-        and all(_is_history(rows) for rows in found["training"])
-    )
-    return found if ours else None
-
-
-def _is_history(rows: Any) -> bool:
-    return isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    try:
+        return TrainingRecord.model_validate(found)
+    except ValidationError:
+        return None
 
 
 def _settings(settings: ImitationSettings) -> dict[str, Any]:
@@ -120,6 +136,6 @@ def count_frames(data: Path, shards: Sequence[Path]) -> dict[str, int]:
     counts: Counter[str] = Counter()
     for shard in sorted(shards):
         own = shard.is_relative_to(data)
-        place = shard.parent.relative_to(data).as_posix() if own else ""
-        counts[place or f"earlier/{shard.parent.name}"] += len(FramesFile(shard))
+        name = shard.parent.relative_to(data).as_posix() if own else ""
+        counts[name or f"earlier/{shard.parent.name}"] += len(FramesFile(shard))
     return dict(counts)

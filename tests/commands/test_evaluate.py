@@ -25,8 +25,9 @@ from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.report.pages.policy import policy_name, summary, training_facts
 from mi_nerfattack.scenario.policy import HttpSection, ProgramSection
 from mi_nerfattack.system.workers import InThisProcess, Processes
-from mi_nerfattack.training.imitate import ImitationSettings
-from mi_nerfattack.training.record import read_record, training_record
+from mi_nerfattack.training.imitate import Imitated, ImitationSettings
+from mi_nerfattack.training.record import read_record, training_record, write_trained
+from mi_nerfattack.training.validation import Epoch
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -180,43 +181,33 @@ def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
     assert document["training"] is None
 
 
-def test_a_training_s_record_is_shown_as_far_as_it_goes():
-    former = {
-        "schema": 1,
-        "settings": {"runs": 2},
-        "training": [[{"held_out_loss": 1}]],
-    }
-    facts = training_facts(former)
-    assert facts["settings"] is None  # those are of the validation
-    assert facts["rounds"] == [
-        {"epochs": 1, "held_out_loss": 1, "closed_loop_error_m": None}
-    ]
-    facts = training_facts(
-        {"schema": 2, "settings": {"frames": {"mitsuba": 9}, "seed": 3}, "training": []}
-    )
-    assert facts["data"] == {"mitsuba": 9} and facts["seed"] == 3
-    assert facts["checksums"] is None
-
-
 def test_a_training_writes_down_its_data_and_settings(tmp_path):
     folder = files.make_folder(tmp_path / "round_0" / "painted")
     frames = np.zeros((12, 2, 2, 3), np.uint8)
     shard = write_shard(folder / "shard_0000", frames, [0] * 12, [0.0] * 12)
     settings = ImitationSettings({"painted": 12}, seed=5)
-    record = training_record(settings, [PaintedSite()], tmp_path, [shard], "train it")
-    assert record["data"] == {"round_0/painted": 12}
-    nothing = training_record(settings, [], tmp_path / "empty", [shard], "")
-    assert nothing["data"] == {"earlier/painted": 12}
-    facts = training_facts({"schema": 2, **record})
+    row = Epoch(train_loss=2.0, held_out_loss=1.0, held_out_error=0.1, measured=True)
+    rows = [[row, {**row, "held_out_loss": 0.5}]]
+    result = Imitated(PilotNet(2).eval(), rows, 0, {}, [shard])
+    record = training_record(settings, [PaintedSite()], tmp_path, result, "train it")
+    write_trained(tmp_path / "net.safetensors", result.module, record)
+    found = read_record(tmp_path / "net.json")
+    assert found is not None
+    assert found.model_dump() == record.model_dump(mode="json")
+    nothing = training_record(settings, [], tmp_path / "empty", result, "")
+    assert nothing.data == {"earlier/painted": 12}
+    facts = training_facts(record)
     assert facts["command"] == "train it" and facts["seed"] == 5
     assert facts["augmentation"]["exposure_ev"] > 0
-    assert facts["data"] == record["data"]
+    assert facts["data"] == {"round_0/painted": 12}
     # those of the collections and trainings are others: theirs are overridden
     assert "frames" not in facts["settings"]["collecting"]
     assert "seed" not in facts["settings"]["collecting"]
     assert "seed" not in facts["settings"]["training"]
     kinds = [item["kind"] for item in facts["settings"]["cloning"]["sources"]]
     assert kinds == ["scattered", "expert"]
+    (first,) = facts["rounds"]
+    assert first == {"epochs": 2, "held_out_loss": 0.5, "closed_loop_error_m": None}
 
 
 def test_commands_are_written_anew_without_the_machine_s_folders():

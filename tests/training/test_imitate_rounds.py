@@ -16,7 +16,7 @@ from mi_nerfattack.system.workers import InThisProcess
 from mi_nerfattack.training import imitate as module
 from mi_nerfattack.training.dataset import FrameDataset
 from mi_nerfattack.training.imitate import imitate
-from mi_nerfattack.training.record import training_record
+from mi_nerfattack.training.record import count_frames
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.train import TrainSettings, fit_policy
 
@@ -99,9 +99,8 @@ def test_frames_of_rounds_that_are_left_out_are_not_recorded(tmp_path):
     imitate([SITE], ROUTES, SETTINGS, tmp_path / "data", HERE)
     fewer = dataclasses.replace(SETTINGS, dagger_rounds=1)
     result = imitate([SITE], ROUTES, fewer, tmp_path / "data", HERE)
-    record = training_record(fewer, [SITE], tmp_path / "data", result.shards, "train")
-    assert record["data"] == {"round_0/mitsuba": 48, "round_1/mitsuba": 24}
-    elsewhere = training_record(fewer, [SITE], tmp_path, result.shards[:1], "train")
-    assert elsewhere["data"] == {"data/round_0/mitsuba": 4}
-    other = training_record(fewer, [SITE], tmp_path / "b", result.shards[:1], "train")
-    assert other["data"] == {"earlier/mitsuba": 4}
+    every, first = result.shards, result.shards[:1]
+    data = tmp_path / "data"
+    assert count_frames(data, every) == {"round_0/mitsuba": 48, "round_1/mitsuba": 24}
+    assert count_frames(tmp_path, first) == {"data/round_0/mitsuba": 4}
+    assert count_frames(tmp_path / "b", first) == {"earlier/mitsuba": 4}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,22 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.plots.policy import plot_errors
 from mi_nerfattack.rollout.drive import Drive
-from mi_nerfattack.system.cores import cores
+from mi_nerfattack.system.cores import machine
+from mi_nerfattack.training.record import TrainingRecord
+from mi_nerfattack.training.validation import ERROR, Epoch
 
 SCHEMA = 1
 #: Written where the training says nothing about something.
 NOT_RECORDED = "not recorded"
-_FORMER_SCHEMA = 1  # of a training's JSON: its settings are those of the validation
+#: Labels of what a page shows of a training before its settings.
+_SHOWN = {
+    "command": "command",
+    "data": "frames",
+    "augmentation": "augmentation",
+    "seed": "seed",
+    "checksums": "checksums",
+    "machine": "machine",
+}
 
 #: Drives by environment, route and case.
 Drives = Mapping[tuple[str, str, str], Sequence[Drive]]
@@ -25,7 +34,7 @@ Drives = Mapping[tuple[str, str, str], Sequence[Drive]]
 def write_policy_page(
     folder: Path,
     about: Mapping[str, Any],
-    record: Mapping[str, Any] | None,
+    record: TrainingRecord | None,
     card: Mapping[str, Any],
     drives: Drives,
 ) -> Path:
@@ -43,11 +52,10 @@ def write_policy_page(
         The Markdown file.
     """
     name = policy_name(str(about["policy"]))
-    machine = f"{cores()} cores, {platform.system()} {platform.machine()}"
     document = {
         "schema": SCHEMA,
         **about,
-        "machine": machine,
+        "machine": machine(),
         "environments": card,
         "training": None if record is None else training_facts(record),
     }
@@ -75,7 +83,7 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
     cells = list(_cells(document["environments"]))
     runs = [(*keys, run) for *keys, figures in cells for run in figures["per_run"]]
     stayed = [item for item in runs if not item[-1]["departed"]]
-    under = document["environments_under"].values()
+    under, training = document["environments_under"].values(), document["training"]
     exposures = sorted({item["exposure_ev"] for item in under})
     return render(
         "policy.md.j2",
@@ -87,8 +95,8 @@ def page_text(name: str, document: Mapping[str, Any]) -> str:
         stayed=sorted(stayed, key=lambda item: -item[-1]["cross_track_max_m"]),
         skies=sorted({item["sky"] for item in under}),
         stops=[f"{value:+g} EV" if value else "0 EV" for value in exposures],
-        training=document["training"],
-        training_rows=_training_rows(document["training"] or {}),
+        training=training,
+        training_rows=[] if training is None else _training_rows(training),
         command=document["command"],
         measuring_rows=_measuring_rows(document),
         NOT_RECORDED=NOT_RECORDED,
@@ -107,45 +115,26 @@ def summary(card: Mapping[str, Any]) -> str:
     )
 
 
-def training_facts(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Pick from a training's JSON what a page shows; None where it says nothing.
-
-    Args:
-        record: the JSON beside the policy, of any schema.
-    """
-    recorded = record.get("schema", 0) > _FORMER_SCHEMA
-    settings = record.get("settings") if recorded else None
-    settings = settings if isinstance(settings, dict) else {}
-    facts = {
-        name: record.get(name, settings.get(name))
-        for name in ("command", "seed", "data", "augmentation", "checksums", "machine")
-    }
-    facts["data"] = facts["data"] or settings.get("frames")
-    facts["settings"] = settings or None
-    facts["rounds"] = [_round(rows) for rows in record.get("training") or [] if rows]
-    return facts
+def training_facts(record: TrainingRecord) -> dict[str, Any]:
+    """Pick what a page shows from what training wrote beside the policy."""
+    shown = record.model_dump(mode="json", include={*_SHOWN, "settings"})
+    return {**shown, "rounds": [_round(rows) for rows in record.training]}
 
 
-def _round(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _round(rows: Sequence[Epoch]) -> dict[str, Any]:
     """Summarise the epochs of one training."""
-    losses = [row["held_out_loss"] for row in rows if "held_out_loss" in row]
-    errors = [
-        row["closed_loop_error_m"] for row in rows if "closed_loop_error_m" in row
-    ]
+    errors = [row[ERROR] for row in rows if ERROR in row]
     return {
         "epochs": len(rows),
-        "held_out_loss": min(losses, default=None),
+        "held_out_loss": min(row["held_out_loss"] for row in rows),
         "closed_loop_error_m": min(errors, default=None),
     }
 
 
 def _training_rows(facts: Mapping[str, Any]) -> list[list[str]]:
     """Return names and values of what a training was given."""
-    labels = {"data": "frames"}
-    names = ("command", "data", "augmentation", "seed", "checksums", "machine")
-    shown = {labels.get(name, name): facts.get(name) for name in names}
-    rest = facts.get("settings") or {"settings": None}
-    shown |= {name: value for name, value in rest.items() if name not in shown}
+    shown = {label: facts[name] for name, label in _SHOWN.items()}
+    shown |= {k: v for k, v in facts["settings"].items() if k not in shown}
     return [row for name, value in shown.items() for row in _flat(name, value)]
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.policy import page_text
+from mi_nerfattack.report.pages.policy import page_text, training_facts
 from mi_nerfattack.scenes import bundled
+from mi_nerfattack.training.record import read_record
 
 CARD = files.read_json(bundled("policy/pilotnet.card.json"))
 
@@ -14,6 +15,8 @@ CARD = files.read_json(bundled("policy/pilotnet.card.json"))
 def test_the_bundled_page_is_that_of_its_card():
     path = bundled("policy/pilotnet.md")
     assert page_text("pilotnet", CARD) == files.read_text(path)
+    record = read_record(bundled("policy/pilotnet.json"))
+    assert record is not None and training_facts(record) == CARD["training"]
 
 
 def test_names_neither_end_a_cell_nor_begin_an_element():
