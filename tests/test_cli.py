@@ -70,17 +70,6 @@ def run(monkeypatch, capsys):
     return call
 
 
-def start(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        **options,
-    )
-
-
 def test_success_and_negative_answer(run):
     assert run("try")[0] == 0
     assert run("try", "--what", "fail")[0] == 1
@@ -224,10 +213,10 @@ def test_ctrl_c_in_a_real_process():
 
 
 def test_doctor_as_json_and_as_table(run):
-    done = start("doctor", "--json")
-    report = json.loads(done.stdout)
+    code, out, _ = run("doctor", "--json")
+    report = json.loads(out)
     found = {item["name"]: item for item in report["findings"]}
-    assert done.returncode == (0 if report["can_run"] else 1)
+    assert code == (0 if report["can_run"] else 1)
     assert {"python", "LLVM", "variants", "GPU", "cores", "memory", "disk"} <= set(
         found
     )
@@ -235,14 +224,15 @@ def test_doctor_as_json_and_as_table(run):
     assert found["default variant"]["state"] == "ok"
     for item in found.values():
         assert item["state"] == "ok" or item["remedy"], item
-    code, table, _ = run("doctor")
-    assert code == done.returncode
+    again, table, _ = run("doctor")
+    assert again == code
     assert re.search(r"LLVM +\d+\.\d+", table)
 
 
 def test_doctor_without_llvm_tells_what_to_do():
     environment = os.environ | {llvm.VARIABLE: "/nowhere/libLLVM.so"}
-    done = start("doctor", "--json", env=environment)
+    command = [*COMMAND, "doctor", "--json"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 1
     found = {item["name"]: item for item in json.loads(done.stdout)["findings"]}
     assert found["LLVM"]["state"] == "missing"

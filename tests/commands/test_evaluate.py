@@ -69,6 +69,11 @@ def place(tmp_path, monkeypatch) -> list[str]:
     return ["evaluate", "still.py:drive", "--environments", "mitsuba", *options]
 
 
+def with_policy(name: str, place: list[str]) -> list[str]:
+    """Name a policy that needs no word about how it is called."""
+    return ["evaluate", name, *(word for word in place[2:] if word not in CALLABLE)]
+
+
 def test_the_command_prints_a_card_as_json(place, capsys):
     assert cli.main([*place, "--json", "-o", "card.json"]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -136,8 +141,7 @@ def test_drives_without_objects_are_announced(place, capsys):
 def test_a_damaged_record_is_found_before_the_first_drive(place, capsys):
     PilotNet(1, 0.6, "rad/s").save("net.safetensors")
     Path("net.json").write_text("{")
-    place = [word for word in place if word not in CALLABLE]
-    place[1] = "net.safetensors"
+    place = with_policy("net.safetensors", place)
     assert cli.main([*place, "--page", "out"]) == 2
     assert "net.json" in capsys.readouterr().err
     assert not Path("runs").exists()
@@ -332,8 +336,7 @@ def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message
     )
     Path("noise.bin").write_bytes(b"noise")
     Path("noise.safetensors").write_bytes(b"noise")
-    place = [word for word in place if word not in CALLABLE]
-    place[1] = policy
+    place = with_policy(policy, place)
     place += ["--trust-code"] * policy.endswith((":Small", ":Bad"))
     assert cli.main(place) == 2
     errors = capsys.readouterr().err
@@ -360,8 +363,7 @@ def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
         '[policy]\nkind = "callable"\nfile = "still.py:drive"\ntrust_code = true\n'
         "[policy.preprocess]\nresize_px = [10, 5]\n"
     )
-    place = [word for word in place if word not in CALLABLE]
-    place[1] = "mine.toml"
+    place = with_policy("mine.toml", place)
     assert cli.main([*place, "--json", "--horizon", "2"]) == 0
     assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
     assert cli.main([*place, "--goals", "3"]) == 2
@@ -377,8 +379,7 @@ def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
         "    assert image.shape[1:] == (3, 20, 40), image.shape\n"
         "    return [0.0] * len(image)\n"
     )
-    place = [word for word in place if word not in CALLABLE]
-    place[1] = "mine.toml"
+    place = with_policy("mine.toml", place)
     assert cli.main([*place, "--horizon", "2"]) == 0
     Path("mine.toml").write_text(text + "width = 0\n")
     capsys.readouterr()

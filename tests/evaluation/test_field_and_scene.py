@@ -13,6 +13,7 @@ from helpers.small_fields import sigmoid_to_linear
 from helpers.sphere_views import sphere_views
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.cli import main
 from mi_nerfattack.commands.shared.compare_report import (
     CompareArguments,
     print_comparison,
@@ -77,18 +78,30 @@ def wall(at: float, density: float = 1e4) -> GridField:
     return field
 
 
-@pytest.fixture
-def place(tmp_path) -> tuple[Path, Path]:
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> tuple[Path, Path]:
     """Write the scene and its one route."""
-    scene, routes = tmp_path / "wall.xml", tmp_path / "routes.json"
+    folder = tmp_path_factory.mktemp("place")
+    scene, routes = folder / "wall.xml", folder / "routes.json"
     files.write_text(scene, SCENE)
     files.write_json(routes, {"ahead": ROUTE})
     return scene, routes
 
 
-def test_known_offset_in_depth_and_colour(place):
-    comparison = compare_with_scene(wall(WALL_X + 0.2), *place, OPTIONS)
-    (route,) = comparison.routes
+@pytest.fixture(scope="module")
+def offset(place) -> Comparison:
+    """Compare the scene with a wall 0.2 m behind its own."""
+    mi.set_variant("llvm_ad_rgb")
+    calls = []
+    comparison = compare_with_scene(
+        wall(WALL_X + 0.2), *place, OPTIONS, lambda *state: calls.append(state)
+    )
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    return comparison
+
+
+def test_known_offset_in_depth_and_colour(offset):
+    (route,) = offset.routes
     assert [at.arc_m for at in route.stations] == [0, 4, 8]
     shown = linear_to_srgb_numpy(sigmoid_to_linear(np.array([RAW])))[0]
     wanted = linear_to_srgb_numpy(np.array([GLOW]))[0]
@@ -124,21 +137,11 @@ def test_half_transparent_field_is_hazy(place):
     assert 0 < route.mean("wrong") <= 1
 
 
-def test_worst_frame_is_kept(place):
-    field = wall(WALL_X)
-    (route,) = compare_with_scene(field, *place, OPTIONS).routes
+def test_worst_frame_is_kept(offset):
+    (route,) = offset.routes
     (frame,) = route.worst
     assert frame.station.psnr_db == route.least("psnr_db")
     assert frame.image.shape == (16, 24, 3) and frame.depth.shape == (16, 24)
-
-
-def test_noise_of_a_flat_scene_is_nothing(place):
-    calls = []
-    comparison = compare_with_scene(
-        wall(WALL_X), *place, OPTIONS, lambda *state: calls.append(state)
-    )
-    assert calls == [(1, 3), (2, 3), (3, 3)]
-    assert comparison.routes[0].mean("ceiling_db") > 80
 
 
 def test_ceiling_is_the_noise_of_the_reference(tmp_path, place):
@@ -205,9 +208,8 @@ def test_depth_errors_of_known_rays():
     assert np.isnan(quantile([], 0.5))
 
 
-def test_document_is_strict_json(place):
-    comparison = compare_with_scene(wall(WALL_X + 0.2), *place, OPTIONS)
-    table = document(comparison)
+def test_document_is_strict_json(offset):
+    table = document(offset)
     text = json.dumps(table, allow_nan=False)
     route = json.loads(text)["routes"]["ahead"]
     assert route["frames"] == 3 and len(route["stations"]) == 3
@@ -250,9 +252,9 @@ def test_arguments_are_checked_first(place, tmp_path):
         CompareArguments(compare=scene).check()
     with pytest.raises(InputError, match="no.xml"):
         CompareArguments(tmp_path / "no.xml", routes).check()
-    files.write_json(routes, {})
+    files.write_json(tmp_path / "routes.json", {})
     with pytest.raises(InputError, match="routes.json"):
-        CompareArguments(scene, routes).check()
+        CompareArguments(scene, tmp_path / "routes.json").check()
     CompareArguments().check()
     assert CompareArguments().run(wall(1.0), tmp_path / "a") is None
 
@@ -281,8 +283,6 @@ def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
 
 
 def test_command_compares_a_field_file(place, tmp_path, capsys):
-    from mi_nerfattack.cli import main
-
     scene, routes = place
     path = tmp_path / "wall.safetensors"
     save_field(path, wall(WALL_X + 0.2))
@@ -294,9 +294,8 @@ def test_command_compares_a_field_file(place, tmp_path, capsys):
     line = capsys.readouterr().out.splitlines()[-1]
     assert json.loads(line)["compare"]["routes"]["ahead"]["frames"] == 5
     assert (tmp_path / "wall.compare" / "report.html").is_file()
-    for raw, kind in ((b"PK\3\4", "a zip archive"), (b"\x80\4\x95", "a pickle")):
-        path.write_bytes(raw + bytes(100))
-        assert main(["fit", str(path), *arguments, *small]) == 2
-        assert f"wall.safetensors: is {kind}" in capsys.readouterr().err
+    path.write_bytes(b"\x80\4\x95" + bytes(100))
+    assert main(["fit", str(path), *arguments, *small]) == 2
+    assert "wall.safetensors: is a pickle" in capsys.readouterr().err
     assert main(["fit", str(tmp_path)]) == 2
     assert "--output" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import math
 import os
 import pickle
@@ -125,27 +124,25 @@ def test_header_that_claims_more_than_the_file_holds_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-def test_pickle_is_refused_unread(tmp_path, protocol):
-    path = tmp_path / "tensors.safetensors"
-    path.write_bytes(pickle.dumps({"a": [1.0] * 100}, protocol))
+def test_pickle_and_zip_are_refused_unread(tmp_path, protocol):
+    raw, path = pickle.dumps({"a": [1.0] * 100}, protocol), tmp_path / "a.safetensors"
+    path.write_bytes(raw)
     with pytest.raises(InputError, match="pickle"):
         files.read_safetensors(path)
-
-
-def test_zip_is_refused(tmp_path):
-    path = tmp_path / "tensors.safetensors"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", b"\x80\x02.")
+        archive.writestr("archive/data.pkl", raw)
     with pytest.raises(InputError, match="zip"):
         files.read_safetensors(path)
 
 
 @pytest.mark.parametrize("read", READERS)
 def test_reader_names_a_path_that_cannot_be_read(tmp_path, read):
+    os.mkfifo(tmp_path / "fifo")  # which nobody writes to: opening it would block
     for path, reason in [
         (tmp_path / "missing", "does not exist"),
         (tmp_path, "is a folder"),
         (Path("/dev/null"), "not a regular file"),
+        (tmp_path / "fifo", "not a regular file"),
         (tmp_path / ("x" * 300), "too long"),
         (f"{tmp_path}/nul\0byte", "null byte"),
     ]:
@@ -154,16 +151,10 @@ def test_reader_names_a_path_that_cannot_be_read(tmp_path, read):
         assert str(tmp_path) in str(caught.value) or "/dev/null" in str(caught.value)
 
 
-def test_fifo_does_not_block(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    with pytest.raises(InputError, match="not a regular file"):
-        files.read_text(tmp_path / "fifo")
-
-
 def test_unreadable_file_is_named(tmp_path, monkeypatch):
     (tmp_path / "secret").write_text("x")
     # modes do not stop root, whom the tests may run as
-    monkeypatch.setattr("builtins.open", _fail(errno.EACCES))
+    monkeypatch.setattr("builtins.open", _fail(PermissionError(errno.EACCES, "")))
     with pytest.raises(InputError, match="secret: permission denied"):
         files.read_text(tmp_path / "secret")
 
@@ -234,7 +225,7 @@ def test_png_round_trip(tmp_path, image):
     np.testing.assert_array_equal(files.read_image(tmp_path / "image.png"), image)
 
 
-def test_grey_and_palette_images_become_rgb(tmp_path):
+def test_grey_palette_and_webp_images_become_rgb(tmp_path):
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
     files.write_image(tmp_path / "grey.png", grey)
     expected = np.repeat(grey[..., None], 3, axis=2)
@@ -242,6 +233,8 @@ def test_grey_and_palette_images_become_rgb(tmp_path):
     red = Image.new("RGB", (4, 3), (255, 0, 0)).convert("P")
     red.save(tmp_path / "palette.png")
     assert (files.read_image(tmp_path / "palette.png") == (255, 0, 0)).all()
+    red.convert("RGB").save(tmp_path / "image.webp", lossless=True)
+    assert (files.read_image(tmp_path / "image.webp") == (255, 0, 0)).all()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -255,18 +248,14 @@ def test_truncated_image_is_refused(tmp_path, rng, suffix):
             files.read_image(path)
 
 
-def test_sixteen_bit_image_is_refused(tmp_path):
-    Image.fromarray(np.full((3, 4), 60_000, np.uint16)).save(tmp_path / "deep.png")
-    with pytest.raises(InputError, match="8 bits"):
-        files.read_image(tmp_path / "deep.png")
-
-
 def test_sixteen_bit_png_round_trip(tmp_path):
     values = np.array([[0, 1, 255], [256, 40000, 65535]], np.uint16)
     Image.fromarray(values).save(tmp_path / "depth.png")
     found = files.read_image16(tmp_path / "depth.png")
     assert found.dtype == np.uint16
     np.testing.assert_array_equal(found, values)
+    with pytest.raises(InputError, match="8 bits"):
+        files.read_image(tmp_path / "depth.png")
 
 
 @pytest.mark.parametrize("name", ["grey.png", "photo.jpg"])
@@ -299,40 +288,29 @@ def test_image_writer_refuses(tmp_path, name, image):
     assert not list(tmp_path.iterdir())
 
 
-def _fail(code: int):
-    def raise_error(*args: object) -> None:
-        raise OSError(code, os.strerror(code))
+def _fail(error: BaseException):
+    def raise_error(*arguments: object) -> None:
+        raise error
 
     return raise_error
 
 
 @pytest.mark.parametrize("call", ["write", "fsync", "replace"])
 @pytest.mark.parametrize(
-    ("code", "reason"),
-    [(errno.ENOSPC, "no space"), (errno.EROFS, "read-only"), (errno.EIO, "check")],
+    ("error", "reason"),
+    [
+        (OSError(errno.ENOSPC, ""), "file.txt: .*no space"),
+        (OSError(errno.EROFS, ""), "file.txt: .*read-only"),
+        (OSError(errno.EIO, ""), "file.txt: .*check"),
+        (KeyboardInterrupt(), "^$"),
+    ],
 )
-def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch, call, code, reason):
+def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch, call, error, reason):
     path = tmp_path / "file.txt"
     files.write_text(path, "old")
     with monkeypatch.context() as patch:
-        patch.setattr(os, call, _fail(code))
-        with pytest.raises(InputError, match=reason) as caught:
-            files.write_text(path, "new")
-    assert str(path) in str(caught.value)
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "file.txt"
-    files.write_text(path, "old")
-
-    def interrupt(descriptor: int) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", interrupt)
-        with pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, call, _fail(error))
+        with pytest.raises((InputError, KeyboardInterrupt), match=reason):
             files.write_text(path, "new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -357,6 +335,8 @@ def test_writer_names_a_path_that_cannot_be_written(tmp_path):
             files.write_text(path, "x")
     with pytest.raises(InputError, match="not a folder"):
         files.make_folder(tmp_path / "file")
+    for _ in range(2):  # it may be there
+        assert files.make_folder(tmp_path / "a" / "b").is_dir()
 
 
 def test_written_file_has_the_umask_mode_and_keeps_a_link(tmp_path):
@@ -371,18 +351,6 @@ def test_written_file_has_the_umask_mode_and_keeps_a_link(tmp_path):
     assert link.is_symlink()
     assert target.read_text() == "x"
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
-
-
-def test_folder_is_made_with_its_parents(tmp_path):
-    assert files.make_folder(tmp_path / "a" / "b").is_dir()
-    assert files.make_folder(tmp_path / "a" / "b").is_dir()
-
-
-def test_webp_is_read(tmp_path):
-    buffer = io.BytesIO()
-    Image.new("RGB", (4, 3), (0, 0, 255)).save(buffer, "WEBP", lossless=True)
-    (tmp_path / "image.webp").write_bytes(buffer.getvalue())
-    assert (files.read_image(tmp_path / "image.webp") == (0, 0, 255)).all()
 
 
 def test_check_writable(tmp_path):

@@ -232,11 +232,16 @@ def test_split_keeps_blocks_together():
     assert set(np.unique(held // 50, return_counts=True)[1]) == {50}
 
 
+def tiny_shards(count, folder, rng):
+    shards = []
+    for number in range(count):
+        frames, *columns = coloured(3, rng)
+        shards.append(write_shard(folder / f"{number}", frames[:, :2, :2], *columns))
+    return shards
+
+
 def test_shards_are_held_out_by_themselves(tmp_path, rng):
-    shards = [tmp_path / f"{number}.safetensors" for number in range(60)]
-    for shard in shards:
-        frames, goals, controls = coloured(3, rng)
-        write_shard(shard, frames[:, :2, :2], goals, controls)
+    shards = tiny_shards(60, tmp_path, rng)
     train, held = divide_shards(shards, 0.25)
     # 60 draws: 15 are expected, with a standard deviation of 3.4
     assert 5 <= len(held) <= 25
@@ -248,10 +253,7 @@ def test_shards_are_held_out_by_themselves(tmp_path, rng):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.999])
 def test_the_first_shards_are_never_all_on_one_side(tmp_path, rng, fraction):
-    shards = [tmp_path / f"{name}.safetensors" for name in "abc"]
-    for shard in shards:
-        frames, goals, controls = coloured(3, rng)
-        write_shard(shard, frames[:, :2, :2], goals, controls)
+    shards = tiny_shards(3, tmp_path, rng)
     train, held = divide_shards(shards, fraction, least=1)
     assert (len(train), len(held)) == ((2, 1) if fraction == 0 else (1, 2))
 
@@ -329,16 +331,11 @@ def train(data, settings=SETTINGS, **arguments):
     return network, fit_policy(network, data, settings, **arguments)
 
 
-def test_training_learns(data):
-    settings = dataclasses.replace(SETTINGS, epochs=12)
-    network, history = train(data, settings)
-    assert len(history) == 12 and not network.training
+def test_training_learns_and_continues_after_an_interruption(data, tmp_path):
+    whole, history = train(data)
+    assert len(history) == 4 and not whole.training
     # Guessing zero is off by 0.5 on average.
     assert min(row["held_out_error"] for row in history) < 0.15
-
-
-def test_training_continues_after_an_interruption(data, tmp_path):
-    whole, history = train(data)
     path = tmp_path / "state.safetensors"
 
     def interrupt(progress):

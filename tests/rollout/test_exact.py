@@ -20,8 +20,7 @@ from helpers.rollouts import (
 
 from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.objective import StageSum
-from mi_nerfattack.rollout.reduction import Mean, Worst
+from mi_nerfattack.rollout.reduction import Worst
 from mi_nerfattack.rollout.sweep import StepRecorder
 from mi_nerfattack.rollout.torch_rollout import torch_rollout
 from mi_nerfattack.vehicle.state import to_state
@@ -225,14 +224,3 @@ def test_a_state_of_the_wrong_size_is_refused():
     loop, _ = analytic.make_pair("ackermann_rate")
     with pytest.raises(ValueError, match=r"3 rows; RateLimitedAckermann has 4"):
         Rollout(loop, Wave(), 2).run(to_state(analytic.random_poses(1)))
-
-
-def test_mean_of_stage_costs_with_weights():
-    loop, _ = analytic.make_pair()
-    initial = to_state(analytic.random_poses(3))
-    weights = np.array([0.0, 0.0, 2.0])
-    objective = StageSum(lambda state: state[1], weights)
-    evaluation = Rollout(loop, objective, 3, Mean()).run(initial)
-    expected = 2 * evaluation.trajectory.states_numpy()[:, 3, 1]
-    np.testing.assert_allclose(evaluation.costs, expected, rtol=1e-14)
-    assert evaluation.value == pytest.approx(expected.mean(), rel=1e-13)

@@ -9,6 +9,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
+from helpers.scenario_text import HEAD, write_named_files
 
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,
@@ -31,22 +32,6 @@ from mi_nerfattack.vehicle import Dubins, Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-HEAD = """\
-name = "test"
-[scene]
-field = "scene.safetensors"
-deployment = "deployment.xml"
-routes = "routes.json"
-route = "lane"
-[[objects]]
-id = "hydrant"
-field = "object.safetensors"
-position_m = [1.0, 2.0, 0.0]
-[policy]
-file = "policy.safetensors"
-[drive]
-horizon = 4
-"""
 ROUTE = Route("lane", 0, np.array([[0, 0], [10, 0], [20, 5]], np.float64))
 COST = """\
 from __future__ import annotations
@@ -89,14 +74,11 @@ def write(tmp_path):
     entry = {"goal": 0, "lane_width_m": 3.0, "speed_ms": 5.0}
     entry["points_m"] = [[0, 3], [20, 3]]
     (tmp_path / "targets.json").write_text(json.dumps({"verge": entry}))
-    for name in ("scene", "object", "policy"):
-        (tmp_path / f"{name}.safetensors").write_bytes(name.encode())
-    (tmp_path / "routes.json").write_text("{}")
-    (tmp_path / "deployment.xml").write_text("")
+    write_named_files(tmp_path)
 
     def inner(text):
         path = tmp_path / "scenario.toml"
-        path.write_text(HEAD + text)
+        path.write_text(HEAD + "[drive]\nhorizon = 4\n" + text)
         return path
 
     return inner

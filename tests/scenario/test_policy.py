@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.policies import camera, policy_of, serving
+from helpers.scenario_text import HEAD, write_named_files
 from safetensors.torch import save_file
 from torch import nn
 
@@ -26,19 +27,7 @@ from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 pytestmark = pytest.mark.usefixtures("variant")
 
 GUIDE = Path(__file__).parents[2] / "docs" / "policy.md"
-SCENARIO = """\
-name = "test"
-[scene]
-field = "bundled:intersection/field.safetensors"
-deployment = "bundled:intersection/scene.xml"
-routes = "bundled:intersection/routes.json"
-route = "right"
-[[objects]]
-id = "hydrant"
-field = "bundled:hydrant/field.safetensors"
-position_m = [6.0, -6.2, 0.12]
-"""
-
+SCENARIO = HEAD.partition("[policy]")[0]
 
 # --- the guide ------------------------------------------------------------------------
 
@@ -85,6 +74,7 @@ def test_examples_of_the_guide(blocks, toml, tmp_path, monkeypatch, served, rng)
         scope = {"__name__": "server"}
         exec((tmp_path / "server.py").read_text(), scope)
         toml = toml.replace("http://127.0.0.1:8000", served(scope["Handler"]))
+    write_named_files(tmp_path)
     path = tmp_path / "scenario.toml"
     path.write_text(SCENARIO + toml)
     scenario, _ = load_scenario(path)
@@ -265,6 +255,7 @@ def test_pilotnet_stays_as_it_was(tmp_path, rng):
 
 
 def test_digest_and_portable_text_know_the_files(tmp_path):
+    write_named_files(tmp_path)
     (tmp_path / "net.py").write_text(MODULE)
     (tmp_path / "w.pt").write_bytes(b"1")
     text = SCENARIO + '[policy]\nfile = "net.py:make"\nweights_file = "w.pt"\n'

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.scenario_text import write_named_files
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import differences
 from mi_nerfattack.scenario.named_file import resolve
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
+from mi_nerfattack.scenario.world import initial_states
+from mi_nerfattack.vehicle.route.route import Route
 
 MINIMAL = """\
 name = "test"
@@ -56,11 +59,8 @@ def test_defaults_and_text(write):
     assert [item.scale for item in scenario.objects] == [1.0, 2.0]
 
 
-def test_digest_tells_scenarios_apart(write):
-    folder = write(MINIMAL).parent
-    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
-        (folder / name).write_bytes(name.encode())
-    (folder / "routes.json").write_text("{}")
+def test_digest_tells_scenarios_apart(write, tmp_path):
+    write_named_files(tmp_path)
 
     def digest(text):
         return load_scenario(write(text))[0].digest()
@@ -69,7 +69,7 @@ def test_digest_tells_scenarios_apart(write):
     assert first == digest("# remark\n" + MINIMAL)
     assert first == digest(portable_text(*load_scenario(write(MINIMAL))))
     assert first != digest(MINIMAL.replace("= 3", "= 4"))
-    (folder / "policy.safetensors").write_bytes(b"another policy")
+    (tmp_path / "policy.safetensors").write_bytes(b"another policy")
     assert first != digest(MINIMAL)
 
 
@@ -185,9 +185,6 @@ def test_text_of_a_run_replays_anywhere(write, tmp_path):
 
 @pytest.mark.parametrize("rank", [1, 3])
 def test_initial_poses_scatter_by_the_covariance(write, rank):
-    from mi_nerfattack.scenario.world import initial_states
-    from mi_nerfattack.vehicle.route.route import Route
-
     root = np.random.default_rng(0).normal(size=(3, rank)) * [[0.5], [0.2], [0.02]]
     wanted = root @ root.T
     text = f"[drive]\ncovariance = {wanted.tolist()}\n[attack]"
@@ -262,10 +259,7 @@ def test_module_of_a_vehicle_counts_with_its_source(write, tmp_path, monkeypatch
     source.write_text("speed = 1")
     monkeypatch.syspath_prepend(tmp_path)
     vehicle = '[vehicle]\nmodel = "custom"\ncontrol_limit = 1.0\nfunction = '
-    folder = write("").parent
-    for name in ("scene.safetensors", "object.safetensors", "policy.safetensors"):
-        (folder / name).write_bytes(name.encode())
-    (folder / "routes.json").write_text("{}")
+    write_named_files(tmp_path)
 
     def identity(reference):
         text = MINIMAL.replace("[attack]", f'{vehicle}"{reference}"\n[attack]')

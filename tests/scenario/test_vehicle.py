@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.scenario_text import HEAD, write_named_files
 from helpers.states import rows64, state64
 
 from mi_nerfattack.errors import InputError
@@ -139,20 +140,9 @@ def test_functions_that_are_refused(folder, monkeypatch, name, framework, words)
         custom(folder, name, framework)
 
 
-SCENARIO = """\
-name = "test"
-[scene]
-field = "a"
-deployment = "a"
-routes = "a"
-route = "right"
-[policy]
-file = "a.onnx"
-[[objects]]
-id = "one"
-field = "a"
-position_m = [1.0, 2.0, 0.0]
-[vehicle]
+HEAD_ONNX = HEAD.replace("policy.safetensors", "policy.onnx")  # of any vehicle
+SCENARIO = f"""\
+{HEAD_ONNX}[vehicle]
 model = "custom"
 function = "car.py:car"
 control_limit = 1.5
@@ -203,8 +193,8 @@ def test_stiff_steering_is_taken_with_enough_substeps(folder):
 
 
 def test_digest_and_text_follow_the_function(folder):
-    for name in ("a", "a.onnx"):
-        (folder / name).write_text("a")
+    write_named_files(folder)
+    (folder / "policy.onnx").write_text("policy")
     first = load(folder, SCENARIO).digest()
     text = portable_text(load(folder, SCENARIO), SCENARIO)
     assert str(folder / "car.py:car") in text

@@ -116,6 +116,12 @@ def test_positive_numbers(operator, rng):
     single(operator, rng.uniform(0.5, 2, (2, 3)).astype("f4"))
 
 
+HALF = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+FLOOR = {
+    "mode": "nearest",
+    "coordinate_transformation_mode": "asymmetric",
+    "nearest_mode": "floor",
+}
 CONSTANTS = [
     ("Pow", [np.float32(2.0)], {}),
     ("PRelu", [np.full((3, 1, 1), 0.3, "f4")], {}),
@@ -138,25 +144,7 @@ CONSTANTS = [
     ("ReduceSum", [integers()], {"noop_with_empty_axes": 1}),
     ("ReduceSum", [integers()], {"keepdims": 0}),
     ("Split", [integers(2, 5)], {"axis": 3, "extra": ["z"]}),
-    (
-        "Resize",
-        [None, None, integers(2, 3, 9, 4)],
-        {"mode": "linear", "coordinate_transformation_mode": "half_pixel"},
-    ),
-    (
-        "Resize",
-        [None, np.array([1, 1, 2, 3], "f4")],
-        {"mode": "linear", "coordinate_transformation_mode": "align_corners"},
-    ),
-    (
-        "Resize",
-        [None, np.array([1, 1, 2, 3], "f4")],
-        {
-            "mode": "nearest",
-            "coordinate_transformation_mode": "asymmetric",
-            "nearest_mode": "floor",
-        },
-    ),
+    ("Resize", [None, None, integers(2, 3, 9, 4)], HALF),
 ]
 
 
@@ -165,14 +153,6 @@ def test_constant_inputs(operator, constants, attributes, rng):
     count = 1 if operator in ("Squeeze", "Expand") else 2
     x = rng.normal(size=(count, 3, 5, 7)).astype("f4")
     single(operator, x, constants, **attributes)
-
-
-HALF = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-FLOOR = {
-    "mode": "nearest",
-    "coordinate_transformation_mode": "asymmetric",
-    "nearest_mode": "floor",
-}
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.3, 0.7, 1.7, 3.0])
@@ -201,28 +181,44 @@ def test_upsample_reads_at_asymmetric_places(mode, rng):
 
 
 @pytest.mark.parametrize(
-    ("constants", "opset", "attributes", "message"),
+    ("operator", "constants", "opset", "attributes", "message"),
     [
         (
+            "Resize",
             [None, None, integers(1, 1, 1, 4)],
             17,
             HALF | {"coordinate_transformation_mode": "pytorch_half_pixel"},
             "Resize: to a size of 1 by pytorch_half_pixel",
         ),
         (
+            "Resize",
             [None, None, integers(1, 1, 3, 4)],
             18,
             HALF | {"keep_aspect_ratio_policy": "not_larger"},
             "keep_aspect_ratio_policy = 'not_larger' is not supported",
         ),
-        ([np.ones(4, "f4")], 10, {}, "operator set 10.*with operator set 11"),
+        (
+            "Resize",
+            [None, np.array([1, 1, 2, 2], "f4")],
+            17,
+            {"mode": "cubic", "name": "up"},
+            "net.onnx: node up: Resize: mode 'cubic'",
+        ),
+        ("Resize", [np.ones(4, "f4")], 10, {}, "set 10.*with operator set 11"),
+        (
+            "MaxPool",
+            [],
+            17,
+            {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1},
+            r"ceil_mode with strides \[3, 3\]",
+        ),
     ],
 )
-def test_resizing_that_is_refused(constants, opset, attributes, message):
+def test_attributes_that_are_refused(operator, constants, opset, attributes, message):
     names = [f"c{i}" if c is not None else "" for i, c in enumerate(constants)]
     values = {n: c for n, c in zip(names, constants, strict=True) if n}
-    node = helper.make_node("Resize", ["x", *names], ["y"], **attributes)
-    shape = [1, 1, 5, 7]
+    node = helper.make_node(operator, ["x", *names], ["y"], **attributes)
+    shape = [1, 1, 5, 5]
     made = model([node], {"x": (FLOAT, shape)}, {"y": (FLOAT, None)}, values, opset)
     with pytest.raises(InputError, match=message):
         OnnxNetwork(made, "net.onnx")(torch.zeros(shape))
@@ -338,11 +334,3 @@ def test_constant_of_no_axes(rng):
     constants = {"empty": integers()}
     made = model(nodes, {"x": (FLOAT, [2])}, {"y": (FLOAT, None)}, constants)
     check(made, rng.normal(size=2).astype("f4"))
-
-
-def test_pools_that_reach_over_the_edge_are_refused():
-    keys = {"kernel_shape": [1, 1], "strides": [3, 3], "ceil_mode": 1}
-    node = helper.make_node("MaxPool", ["x"], ["y"], **keys)
-    made = model([node], {"x": (FLOAT, [1, 1, 5, 5])}, {"y": (FLOAT, None)})
-    with pytest.raises(InputError, match=r"ceil_mode with strides \[3, 3\]"):
-        OnnxNetwork(made, "net.onnx")(torch.zeros(1, 1, 5, 5))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.policy.goals import NoGoal, OneHotGoal
+from mi_nerfattack.policy.goals import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
@@ -95,17 +95,6 @@ def test_unsupported_operators_are_named(tmp_path):
     refused(made, tmp_path, r"net.onnx: operators Det, Hardmax.*Conv")
 
 
-def test_unsupported_attributes_are_named(rng):
-    made = model(
-        [helper.make_node("Resize", ["x", "", "s"], ["y"], mode="cubic", name="up")],
-        {"x": (FLOAT, [1, 1, 4, 4])},
-        {"y": (FLOAT, None)},
-        {"s": np.array([1, 1, 2, 2], "f4")},
-    )
-    with pytest.raises(InputError, match=r"net.onnx: node up: Resize: mode 'cubic'"):
-        OnnxNetwork(made, "net.onnx")(torch.rand(1, 1, 4, 4))
-
-
 def test_damaged_files_are_refused(tmp_path, rng):
     path = tmp_path / "net.onnx"
     path.write_bytes(b"no model at all")
@@ -134,20 +123,6 @@ def test_wrong_inputs_are_named(rng):
     with pytest.raises(InputError, match=r"\['any', 3, 8, 10\].*\[2, 3, 9, 10\]"):
         network(torch.rand(2, 3, 9, 10), goal)
     assert OnnxNetwork(driving_network(rng, 1), "net.onnx").batch == 1
-
-
-def test_a_policy_without_goal(rng, variant):
-    made = model(
-        [
-            helper.make_node("ReduceMean", ["x"], ["y"], axes=[1, 2, 3], keepdims=0),
-        ],
-        {"x": (FLOAT, ["n", 3, 4, 5])},
-        {"y": (FLOAT, ["n"])},
-    )
-    policy = TorchPolicy(OnnxNetwork(made, "net.onnx"), NoGoal())
-    image = mi.TensorXf(rng.random((2, 4, 5, 3), dtype=np.float32))
-    _, gradient = policy.vjp(image, 0, mi.Float(1, 2))
-    np.testing.assert_allclose(gradient.numpy()[1], 2 / 60, rtol=1e-6)
 
 
 def test_without_the_extra(tmp_path, monkeypatch):
