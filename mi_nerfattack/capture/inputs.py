@@ -229,12 +229,11 @@ def depth_points(
         reach_m: also yield the points this far before and behind the surface.
     """
     for index in indices:
-        origin, rotation = pose_arrays(images.camera_to_world[index])
-        camera = images.camera_of(index)
-        direction = generate_rays(camera, origin, rotation, 1)[1].numpy()
+        camera, pose = images.camera_of(index), images.camera_to_world[index]
+        direction = generate_rays(camera, *pose_arrays(pose), 1)[1].numpy()
         ray = direction.reshape(3, camera.height, camera.width).astype(np.float64)
         inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0.0)
-        eye = images.camera_to_world[index, :3, 3]
+        eye = pose[:3, 3]
         for unit, t in (*_between(ray, inverse, 1), *_between(ray, inverse, 2)):
             for offset in {0.0, -reach_m, reach_m}:
                 yield eye + ((t + offset) * unit).T

@@ -163,8 +163,7 @@ def render_asset(
 
 def _solid_depth(scene: Any, camera: Camera, pose: np.ndarray) -> np.ndarray:
     """Return the depth image of surfaces that are at least half opaque."""
-    origin, rotation = pose_arrays(pose)
-    o, d = generate_rays(camera, origin, rotation, 1)
+    o, d = generate_rays(camera, *pose_arrays(pose), 1)
     ray, active = mi.Ray3f(o, d), mi.Bool(True)
     depth = mi.Float(dr.inf)
     for _ in range(_MAX_LAYERS):

@@ -27,7 +27,6 @@ from mi_nerfattack.render.camera.intrinsics import Camera
 
 _LEAST = 3
 _LEAST_UP = 0.2  # length of the mean of unit vectors
-_MAX_SEED = 1 << 31  # of COLMAP's generator
 
 
 @dataclass(frozen=True)
@@ -217,22 +216,13 @@ def upright(found: Structure, scale: float) -> Structure:
             "photographs: their upward directions cancel, so that z cannot point up; "
             "turn the photographs upright first"
         )
-    turn = _turn_to_z(up / length)
+    turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
     centre = poses[:, :3, 3].mean(0)
     result = poses.copy()
     result[:, :3, :3] = turn @ poses[:, :3, :3]
     result[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ turn.T
     points = scale * (found.points - centre) @ turn.T
     return Structure(found.names, result, found.camera, points, found.error_px)
-
-
-def _turn_to_z(up: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation (3, 3) of a unit vector to +z."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
-        return np.diag([1.0, 1.0, 1.0] if up[2] > 0 else [1.0, -1.0, -1.0])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[2])).as_matrix()
 
 
 def _write(

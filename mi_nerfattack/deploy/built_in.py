@@ -14,7 +14,9 @@ from mi_nerfattack.capture.mesh.atlas import Atlas, lay_out
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.mesh.surface import (
     check_same_box,
+    face_normals,
     field_surface,
+    has_area,
     inside_out,
     seen_colours,
     voxel_m,
@@ -140,7 +142,7 @@ def _field_triangles(field: GridField) -> tuple[np.ndarray, np.ndarray]:
     """Return corners and normals, (m, 3, 3) each, of a field's surface."""
     surface = field_surface(field)
     corners, normals = surface.vertices[surface.faces], surface.normals[surface.faces]
-    kept = _has_area(corners)
+    kept = has_area(corners)
     return corners[kept], normals[kept]
 
 
@@ -152,7 +154,7 @@ def _solid_corners(mesh: TexturedMesh) -> np.ndarray:
             "leave out the mesh for the surface of the field"
         )
     corners = np.concatenate([part.vertices[part.faces] for part in mesh.parts])
-    return corners[_has_area(corners)]
+    return corners[has_area(corners)]
 
 
 def _outward(field: GridField, corners: np.ndarray) -> np.ndarray:
@@ -161,18 +163,8 @@ def _outward(field: GridField, corners: np.ndarray) -> np.ndarray:
     return np.where(turned[:, None, None], corners[:, ::-1], corners)
 
 
-def _has_area(corners: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(_cross(corners), axis=1) > 0
-
-
-def _cross(corners: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(corners, 1, 0)
-    return np.cross(b - a, c - a)
-
-
 def _flat_normals(corners: np.ndarray) -> np.ndarray:
-    normals = _cross(corners)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = face_normals(corners)
     return np.repeat(normals[:, None], 3, axis=1)
 
 

@@ -26,9 +26,6 @@ from mi_nerfattack.rollout.drive import Drive, departure_limits
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
-#: Called with steps done and steps wanted, of all drives.
-OnSteps = Callable[[int, int], None]
-
 #: Cases of a card, and that of the expert's drives, which is none of its own there.
 CLEAN, RANDOM_OBJECTS, EXPERT = "clean", "random_objects", "expert"
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
@@ -220,7 +217,7 @@ def evaluate(
     objects: Sequence[GridField],
     ground: Ground,
     settings: EvaluateSettings,
-    progress: OnSteps = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Drive every route in every environment, and return the card.
 
@@ -234,14 +231,14 @@ def evaluate(
         progress: called after each step of a drive.
 
     Returns:
-        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}}, see `card`.
+        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}}, see `make_card`.
 
     Raises:
         InputError: before the first drive, a lane that is too narrow for the car or a
             route too short for objects; then whatever a drive raises.
     """
     cases = settings.cases if objects else (CLEAN,)
-    departure_limits(routes, settings.car_width_m)
+    limits = departure_limits(routes, settings.car_width_m)
     if RANDOM_OBJECTS in cases:
         check_roadside(routes, settings, len(objects))
     jobs = [
@@ -252,7 +249,8 @@ def evaluate(
         for run in range(settings.runs)
     ]
     total = sum(settings.steps(route, env.period) for env, route, _, _ in jobs)
-    done, drives = 0, []
+    drives: dict[tuple[str, str, str], list[Drive]] = {}
+    done = 0
 
     def count(step: int) -> None:
         nonlocal done
@@ -261,23 +259,9 @@ def evaluate(
 
     for environment, route, case, run in jobs:
         arguments = (case, run, objects, ground, settings, count)
-        drives.append(evaluate_run(environment, policy, route, *arguments))
-    return card(drives, routes, settings.car_width_m)
-
-
-def card(
-    drives: Sequence[Drive], routes: Sequence[Route], car_width_m: float
-) -> dict[str, Any]:
-    """Summarise drives by environment, route and case.
-
-    Returns:
-        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}} of JSON types,
-        in the order of the drives; the figures are those of `card_figures`.
-    """
-    groups: dict[tuple[str, str, str], list[Drive]] = {}
-    for item in drives:
-        groups.setdefault((item.environment, item.route, item.case), []).append(item)
-    return make_card(groups, departure_limits(routes, car_width_m))
+        found = evaluate_run(environment, policy, route, *arguments)
+        drives.setdefault((environment.name, route.name, case), []).append(found)
+    return make_card(drives, limits)
 
 
 def make_card(
@@ -289,6 +273,10 @@ def make_card(
     Args:
         drives: by environment, route and case.
         limits: departure limit of each route, metres.
+
+    Returns:
+        {ENVIRONMENT: {ROUTE: {CASE: figures}}} of JSON types, in the order of the
+        drives; the figures are those of `card_figures`.
     """
     card: dict[str, Any] = {}
     for (label, route, case), group in drives.items():

@@ -173,12 +173,12 @@ def _write_frames(
         world.show(looks[case])
         for step in _steps(drive, EXR_FRAMES):
             state = drive.states[step]
+            pose = mount_matrix(state[None], world.surrogate.mount)[0]
             layers = (
                 _surrogate_layers(world, state, int(step))
                 if environment == "surrogate"
-                else _deployment_layers(world, state, int(step))
+                else world.deployment.layers(pose, int(step))
             )
-            pose = mount_matrix(state[None], world.surrogate.mount)[0]
             metadata = {
                 "scenario": world.scenario.name,
                 "environment": environment,
@@ -210,14 +210,6 @@ def _surrogate_layers(
     for name, layer in zip(_exr_names(names), seen.layers, strict=True):
         layers |= _march_layers(name, layer, shape)
     return layers
-
-
-def _deployment_layers(
-    world: World, state: np.ndarray, step: int
-) -> dict[str, np.ndarray]:
-    sensor = world.deployment
-    pose = mount_matrix(state[None], sensor.mount)[0]
-    return sensor.layers(pose, step)
 
 
 def _march_layers(

@@ -99,25 +99,14 @@ class AbstractField(ABC):
             Rec. 709.
         """
 
-    @abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Return the differentiable parameters by name (Dr.Jit arrays)."""
+        """Return the differentiable parameters by name (Dr.Jit arrays), if any."""
+        return {}
 
-    @abstractmethod
     def set_parameter(self, name: str, value: Any) -> None:
         """Replace a parameter; shape and type must be those of the present one."""
-
-    @abstractmethod
-    def tensors(self) -> dict[str, np.ndarray]:
-        """Return what a field file stores, as NumPy arrays."""
-
-    @abstractmethod
-    def metadata(self) -> dict[str, str]:
-        """Return what a field file's header stores, as strings."""
-
-    @abstractmethod
-    def density_bound(self) -> float:
-        """Return an upper bound of the density, 1/metre, for delta tracking."""
+        del value
+        raise KeyError(f"{name}: a {self.kind} has no parameters")
 
     @property
     def collects_points(self) -> bool:

@@ -9,7 +9,6 @@ from typing import TypeVar
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
@@ -20,7 +19,7 @@ T = TypeVar("T", int, float)
 FORMAT = "mi_nerfattack field 1"
 
 
-def save_field(path: str | Path, field: AbstractField) -> None:
+def save_field(path: str | Path, field: GridField | NGPField) -> None:
     """Write a field file atomically.
 
     Raises:

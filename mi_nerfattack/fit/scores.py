@@ -83,8 +83,7 @@ class FieldRenderer:
             camera: intrinsics.
             camera_to_world: (4, 4), OpenCV axes, metres.
         """
-        origin, rotation = pose_arrays(camera_to_world)
-        o, d = generate_rays(camera, origin, rotation, 1)
+        o, d = generate_rays(camera, *pose_arrays(camera_to_world), 1)
         with dr.suspend_grad():
             result = march(self._posed, Rays(o, d))
             behind = self._posed.background(d)

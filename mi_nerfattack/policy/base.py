@@ -84,11 +84,6 @@ class AbstractPolicy(ABC):
             f"{type(self).__name__}: has no forward derivative; implement step_jvp"
         )
 
-    def memory_bytes(self, memory: Memory) -> int:
-        """Return the size of a memory, bytes."""
-        assert not memory, "a policy with memory says how large it is"
-        return 0
-
     @abstractmethod
     def control(self, image: Any, goal: Any) -> Any:
         """Evaluate the policy.

@@ -61,10 +61,6 @@ class AbstractBlackBox(AbstractPolicy):
         """Return step 0 and an empty frame stack."""
         return 0, torch.zeros(count, 0, 0, 0, 0)
 
-    def memory_bytes(self, memory: Memory) -> int:
-        """Return the size of the frame stack, bytes."""
-        return memory[1].numel() * memory[1].element_size()
-
     def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
         """Pre-process the images on the CPU and ask."""
         images = to_torch(image)

@@ -88,10 +88,6 @@ class TorchPolicy(AbstractPolicy):
         )
         return (*(stack if self.preprocess.history else ()), *hidden)
 
-    def memory_bytes(self, memory: Memory) -> int:
-        """Return the size of all tensors, bytes."""
-        return sum(part.numel() * part.element_size() for part in memory)
-
     def step(self, image: Any, goal: Any, memory: Memory) -> tuple[Any, Memory]:
         """Evaluate the module without recording a graph."""
         self._check(image, goal, memory)

@@ -77,12 +77,7 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
     Returns:
         A row per route, environment and case; `steps departed` are beyond the limit.
     """
-    table = rich.table.Table(
-        title="Distance from the lane centre",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1),
-    )
+    table = _distances()
     table.add_column("route", overflow="fold", max_width=14)
     for name in ("environment", "case"):
         table.add_column(name, no_wrap=True)
@@ -107,12 +102,7 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
     Returns:
         A row per environment, route and case; `drives departed` left the lane.
     """
-    table = rich.table.Table(
-        title="Distance from the lane centre",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1),
-    )
+    table = _distances()
     table.add_column("environment", overflow="fold", min_width=11, max_width=18)
     table.add_column("route", overflow="fold", min_width=8, max_width=14)
     table.add_column("case", no_wrap=True)
@@ -128,6 +118,11 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
             labels = [""]
         table.add_section()
     return table
+
+
+def _distances() -> rich.table.Table:
+    title, box = "Distance from the lane centre", rich.box.SIMPLE_HEAD
+    return rich.table.Table(title=title, box=box, pad_edge=False, padding=(0, 1))
 
 
 def _card_cells(figures: Mapping[str, Any]) -> list[str]:

@@ -213,18 +213,8 @@ def object_footprints(world: World) -> list[np.ndarray]:
     outlines = []
     for posed in world.surrogate.objects:
         low, high = posed.field.lower, posed.field.upper
-        corners = np.array(
-            [
-                [x, y, 0.0]
-                for x, y in (
-                    (low[0], low[1]),
-                    (high[0], low[1]),
-                    (high[0], high[1]),
-                    (low[0], high[1]),
-                )
-            ]
-        )
-        pose = posed.placed
-        world_corners = pose.scale * corners @ pose.rotation.T
-        outlines.append((world_corners + pose.translation)[:, :2])
+        x, y = (low[0], high[0], high[0], low[0]), (low[1], low[1], high[1], high[1])
+        corners, pose = np.stack([x, y, np.zeros(4)], axis=1), posed.placed
+        in_world = pose.scale * corners @ pose.rotation.T + pose.translation
+        outlines.append(in_world[:, :2])
     return outlines

@@ -28,10 +28,10 @@ from mi_nerfattack.evaluation.evaluate import (
     RANDOM_OBJECTS,
     EvaluateSettings,
     ExpertPolicy,
-    card,
     drive,
     evaluate,
     evaluate_run,
+    make_card,
     random_start,
 )
 from mi_nerfattack.fields.io import load_grid
@@ -162,7 +162,8 @@ def test_the_card_counts_drives_that_left_the_lane():
         drive(surrogate(), Counting(), straight(), np.array([0, y, 0]), 3, 4, run=run)
         for run, y in enumerate([0.0, 0.8, -0.9])
     ]
-    figures = card(drives, [straight()], 1.8)["surrogate"]["straight"]["clean"]
+    found = make_card({("surrogate", "straight", "clean"): drives}, {"straight": 0.85})
+    figures = found["surrogate"]["straight"]["clean"]
     assert figures["n"] == 3
     assert figures["drives_departed"] == 1
     assert figures["cross_track_mean_m"] == pytest.approx(1.7 / 3)

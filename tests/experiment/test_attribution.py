@@ -56,20 +56,9 @@ def test_plot_without_a_gradient(tmp_path):
     plot_attribution(tmp_path / "attribution.png", data)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"costates": np.zeros((4, 2, 3))}, r"costates: shape \(4, 2, 3\)"),
-        ({"costates": np.zeros((5, 2, 2))}, r"expected \(5, 2, 3\)"),
-        ({"costates": np.zeros(5)}, "costates: shape"),
-        ({"along": np.zeros((5, 1))}, r"along: shape \(5, 1\); expected \(5, 2\)"),
-        ({"cross_track_m": np.zeros((5, 1))}, "cross_track_m"),
-        ({"along": np.full((5, 2), np.nan)}, "along: not finite"),
-    ],
-)
-def test_wrong_arrays_are_named(changes, words):
-    with pytest.raises(InputError, match=words):
-        attribution(**changes)
+def test_gradients_that_are_not_finite_are_named():
+    with pytest.raises(InputError, match="along: not finite"):
+        attribution(along=np.full((5, 2), np.nan))
 
 
 def shown(grid):
@@ -124,16 +113,6 @@ def test_picture(tmp_path, rng):
     with Image.open(path) as image:
         assert image.width == 1200 and image.height > 1000
     write_heat(path, {"still": side_views(grid, 0 * gradient, 24)})
-
-
-def test_wrong_gradients_are_named(tmp_path, rng):
-    grid = blob(rng)
-    with pytest.raises(InputError, match=r"gradient: shape \(2, 3\)"):
-        surface_heat(grid, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="finite"):
-        surface_heat(grid, np.full((grid.n_vertices, 3), np.nan))
-    with pytest.raises(InputError, match="at least one"):
-        write_heat(tmp_path / "none.png", {})
 
 
 def test_a_failure_is_taken_apart(tmp_path):

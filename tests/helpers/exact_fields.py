@@ -46,21 +46,6 @@ class GaussianField(AbstractField):
         ]
         return density & active, (0.5 + 0.4 * mi.Color3f(*rows)) & active
 
-    def parameters(self) -> dict[str, Any]:
-        return {}
-
-    def set_parameter(self, name: str, value: Any) -> None:
-        raise KeyError(name)
-
-    def tensors(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def metadata(self) -> dict[str, str]:
-        return {}
-
-    def density_bound(self) -> float:
-        return self.peak
-
     def depth_to(self, o: np.ndarray, d: np.ndarray, near: Any, t: Any) -> np.ndarray:
         """Return the optical depth (n, k) from near (n,) to t (n, k), with erf."""
         middle = -(o * d).sum(1)[:, None]

@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
@@ -102,24 +103,23 @@ class TexturedMesh:
     @property
     def area(self) -> float:
         """Sum of the areas of all triangles."""
-        total = 0.0
-        for part in self.parts:
-            a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-            normal = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            total += 0.5 * float(normal.sum())
-        return total
+        from trimesh.triangles import area
+
+        triangles = [part.vertices[part.faces] for part in self.parts]
+        return float(area(np.concatenate(triangles)).sum())
+
+    def placed(self, matrix: np.ndarray, offset: np.ndarray) -> TexturedMesh:
+        """Apply an affine map to all parts; see `MeshPart.placed`."""
+        parts = (part.placed(matrix, offset) for part in self.parts)
+        return replace(self, parts=tuple(parts))
 
     def transformed(self, scale: float, offset: np.ndarray) -> TexturedMesh:
         """Return the mesh with vertices `scale * (vertices + offset)`."""
-        matrix = scale * np.eye(3)
-        parts = (part.placed(matrix, scale * offset) for part in self.parts)
-        return replace(self, parts=tuple(parts))
+        return self.placed(scale * np.eye(3), scale * offset)
 
     def turned(self, angle_deg: float) -> TexturedMesh:
         """Return the mesh turned about z, counter-clockwise as seen from above."""
-        matrix = turn_matrix(angle_deg)
-        parts = (part.placed(matrix, np.zeros(3)) for part in self.parts)
-        return replace(self, parts=tuple(parts))
+        return self.placed(turn_matrix(angle_deg), np.zeros(3))
 
 
 def cube_mesh(
@@ -196,8 +196,7 @@ def turn_matrix(angle_deg: float) -> np.ndarray:
     """Return the rotation (3, 3) about z, counter-clockwise as seen from above."""
     if not np.isfinite(angle_deg):
         raise InputError(f"turn_deg: {angle_deg}; must be finite")
-    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    return Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
 
 
 def mitsuba_shapes(mesh: TexturedMesh) -> dict[str, Any]:

@@ -98,9 +98,8 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     voxel = voxel_m(field)
     check_same_box(field, mesh)
     corners = _divided(mesh, voxel)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    rows = np.concatenate([corners.reshape(-1, 3), normal.repeat(3, axis=0)], axis=1)
+    normal = face_normals(corners).repeat(3, axis=0)
+    rows = np.concatenate([corners.reshape(-1, 3), normal], axis=1)
     # corners at one place and in one plane are one vertex
     unit = np.repeat([1e-4 * voxel, 1e-4], 3)
     keys = np.round(rows / unit).astype(np.int64)
@@ -155,11 +154,10 @@ def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
     for part in mesh.parts:
         corners = part.vertices[part.faces]
         edges = corners - np.roll(corners, 1, axis=1)
-        solid = np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1) > 0
         longest = float(np.linalg.norm(edges, axis=2).max())
         rounds = int(np.ceil(np.log2(max(1.0, longest / edge_m)))) + 1
         divided = subdivide_to_size(
-            part.vertices, part.faces[solid], edge_m, max_iter=rounds
+            part.vertices, part.faces[has_area(corners)], edge_m, max_iter=rounds
         )
         found.append(divided[0][divided[1]])
         if sum(map(len, found)) > _MAX_TRIANGLES:
@@ -167,8 +165,23 @@ def _divided(mesh: TexturedMesh, edge_m: float) -> np.ndarray:
                 f"{mesh.name}: more than {_MAX_TRIANGLES} triangles; simplify it"
             )
     corners = np.concatenate(found)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return corners[np.linalg.norm(normal, axis=1) > 0]
+    return corners[has_area(corners)]
+
+
+def has_area(corners: np.ndarray) -> np.ndarray:
+    """Tell which triangles (m, 3, 3) have an area, (m,)."""
+    return np.linalg.norm(_cross(corners), axis=1) > 0
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (m, 3) across triangles (m, 3, 3) that have an area."""
+    across = _cross(corners)
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+def _cross(corners: np.ndarray) -> np.ndarray:
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return np.cross(b - a, c - a)
 
 
 def seen_colours(
@@ -281,6 +294,5 @@ def _turned_outward(
     vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
     """Order corners counter-clockwise as seen from where the normals point."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    outward = (np.cross(b - a, c - a) * normals[faces].mean(1)).sum()
+    outward = (_cross(vertices[faces]) * normals[faces].mean(1)).sum()
     return faces if outward > 0 else faces[:, ::-1]

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths
@@ -87,14 +88,9 @@ def body_from_carla(pose: CarlaPose) -> np.ndarray:
     Returns:
         body_to_world (4, 4), float64: x forward, y left, z up; metres.
     """
-    yaw, pitch, roll = np.radians([-pose.yaw, -pose.pitch, pose.roll])
-    (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
+    angles_deg = [-pose.yaw, -pose.pitch, pose.roll]
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
+    matrix[:3, :3] = Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix()
     matrix[:3, 3] = point_from_carla([pose.x, pose.y, pose.z])
     return matrix
 

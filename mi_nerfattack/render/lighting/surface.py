@@ -10,11 +10,9 @@ bounding box where the field begins at once: ``sigma (z - t_near) / a dt_near/do
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NoReturn
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
@@ -62,26 +60,6 @@ class Geometry(AbstractField):
         del direction
         with dr.suspend_grad(*self.source.arrays()):
             return self.source.density(point, active), mi.Color3f(0)
-
-    def parameters(self) -> dict[str, Any]:
-        """Return nothing: there is nothing to differentiate."""
-        return {}
-
-    def set_parameter(self, name: str, value: Any) -> NoReturn:
-        """Refuse; set it in the source."""
-        raise KeyError(f"{name}: a geometry has no parameters")
-
-    def tensors(self) -> dict[str, np.ndarray]:
-        """Return what the source's file stores."""
-        return self.source.tensors()
-
-    def metadata(self) -> dict[str, str]:
-        """Return what the source's header stores."""
-        return self.source.metadata()
-
-    def density_bound(self) -> float:
-        """Return the source's bound."""
-        return self.source.density_bound()
 
 
 def geometry(posed: PosedField) -> PosedField:

@@ -89,8 +89,7 @@ class ViewRenderer:
 
     def depth(self, camera_to_world: np.ndarray) -> np.ndarray:
         """Return the depth image alone; see `View.depth`."""
-        origin, rotation = pose_arrays(camera_to_world)
-        o, d = generate_rays(self.camera, origin, rotation, 1)
+        o, d = generate_rays(self.camera, *pose_arrays(camera_to_world), 1)
         t = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
         return t.numpy().reshape(self.camera.height, self.camera.width)
 

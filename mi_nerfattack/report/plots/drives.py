@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import environment_order
-from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, save
+from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, chart, save
 from mi_nerfattack.rollout.drive import CASES, Drive
 
 _STYLES: dict[str, dict[str, Any]] = {
@@ -58,15 +57,13 @@ def overhead(
         object_footprints: corners of each object on the ground, (n, 2), metres.
         limit: departure limit, metres.
     """
-    route = _checked_points("route_points", route_points)
-    objects = [_checked_points("object_footprints", o) for o in object_footprints]
     panels = _environments(drives)
-    low, high = _view(drives, objects, lane_width_m)
+    low, high = _view(drives, object_footprints, lane_width_m)
     with matplotlib.rc_context(RC):
         figure, axes = _map_panels(len(panels), low, high)
         for axis, (environment, group) in zip(axes, panels.items(), strict=True):
-            _draw_lane(axis, route, lane_width_m)
-            for footprint in objects:
+            _draw_lane(axis, route_points, lane_width_m)
+            for footprint in object_footprints:
                 axis.fill(*footprint.T, facecolor=_OBJECT, edgecolor="black", zorder=6)
             for drive in sorted(group, key=_drawing_order):
                 axis.plot(*drive.states[:, :2].T, **_STYLES[drive.case])
@@ -78,7 +75,7 @@ def overhead(
             axis.set_title(f"{drives[0].route}: {environment}", loc="left")
             axis.set_xlabel("x (m)")
             axis.set_ylabel("y (m)")
-        _legend_below(figure, _map_handles(drives, bool(objects), limit))
+        _legend_below(figure, _map_handles(drives, bool(object_footprints), limit))
         save(path, figure)
 
 
@@ -94,8 +91,7 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         limit: departure limit, metres.
     """
     panels = _environments(drives)
-    with matplotlib.rc_context(RC):
-        figure = Figure((WIDTH_PX / DPI, 3.3), DPI, layout="constrained")
+    with chart(path, 3.3) as figure:
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)
         for axis, (environment, group) in zip(grid[0], panels.items(), strict=True):
             _draw_band(axis, [d for d in group if d.case == "random"])
@@ -120,7 +116,6 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         label = f"departure limit {limit:.2f} m"
         handles.append(Line2D([], [], color=_LIMIT, linestyle=":", label=label))
         _legend_below(figure, handles)
-        save(path, figure)
 
 
 def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -132,12 +127,9 @@ def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> Non
             `cross_track_mean_m`; iterations count from 0.
     """
     names = {"objective": "objective", "cross_track_mean_m": "mean distance (m)"}
-    if not history or any(name not in entry for entry in history for name in names):
-        raise InputError(f"history: each iteration needs the keys {', '.join(names)}")
     iterations = np.arange(len(history))
     marker = "o" if len(history) < 60 else ""
-    with matplotlib.rc_context(RC):
-        figure = Figure((WIDTH_PX / DPI, 4.2), DPI, layout="constrained")
+    with chart(path, 4.2) as figure:
         for axis, (name, label) in zip(
             figure.subplots(2, 1, sharex=True), names.items(), strict=True
         ):
@@ -149,13 +141,9 @@ def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> Non
         figure.axes[0].set_title("Attack, per iteration", loc="left")
         figure.axes[-1].set_xlabel("iteration")
         figure.align_ylabels()
-        save(path, figure)
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
-    routes = sorted({drive.route for drive in drives})
-    if len(routes) != 1:
-        raise InputError(f"drives: routes {routes}; a plot shows exactly one route")
     names = sorted({drive.environment for drive in drives}, key=environment_order)
     return {name: [d for d in drives if d.environment == name] for name in names}
 
@@ -171,15 +159,6 @@ def _style(case: str, **changes: Any) -> dict[str, Any]:
 
 def _drawing_order(drive: Drive) -> float:
     return _STYLES[drive.case]["zorder"]
-
-
-def _checked_points(name: str, points: np.ndarray) -> np.ndarray:
-    array = np.asarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[0] < 2 or array.shape[1] != 2:
-        raise InputError(f"{name}: shape {array.shape}; must be (n, 2) with n >= 2")
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"{name}: holds a value that is not finite; give metres")
-    return array
 
 
 def _view(

@@ -16,7 +16,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera.intrinsics import (
@@ -84,30 +83,9 @@ class MagnitudeField(AbstractField):
         number = sum((features[4 * level + 1] for level in levels), start=features[1])
         return density, mi.Color3f(number) & active
 
-    def parameters(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
-
-    def set_parameter(self, name: str, value: Any) -> None:
-        """Refuse every name."""
-        del value
-        raise KeyError(f"{name}: a magnitude field has no parameters")
-
     def arrays(self) -> list[Any]:
         """Return what both grids read."""
         return [*self.grid.arrays(), self.values.packed]
-
-    def tensors(self) -> dict[str, np.ndarray]:
-        """Return nothing: the field is never stored."""
-        return {}
-
-    def metadata(self) -> dict[str, str]:
-        """Return nothing."""
-        return {}
-
-    def density_bound(self) -> float:
-        """Return the grid's."""
-        return self.grid.density_bound()
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,15 +116,8 @@ def surface_heat(grid: GridField, gradient: np.ndarray) -> np.ndarray:
 
     Returns:
         (n_vertices,), Euclidean norm over colours, per cubic metre.
-
-    Raises:
-        InputError: another shape, or not finite.
     """
     gradient = np.asarray(gradient, np.float64)
-    if gradient.shape != (grid.n_vertices, 3) or not np.isfinite(gradient).all():
-        raise InputError(
-            f"gradient: shape {gradient.shape}; expected finite {(grid.n_vertices, 3)}"
-        )
     level, resolution = _shown_level(grid)
     start = grid.encoding.level_offset(level)
     end = start + resolution**3
@@ -196,8 +167,6 @@ def write_heat(
         objects: views by name of the object.
         unit: of the objective, for the colour bar.
     """
-    if not objects:
-        raise InputError("objects: none; give at least one")
     heats = np.concatenate(
         [view.heat.ravel() for views in objects.values() for view in views]
     )

@@ -9,7 +9,6 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
 SCALE = 2
@@ -35,7 +34,7 @@ def first_person_strip(
             line break in a label starts another line.
         times_s: time of each column, seconds.
     """
-    height, width = _checked_size(rows, times_s)
+    height, width, _ = next(iter(rows.values()))[0].shape
     font = _font()
     label_px = 2 * GAP_PX + max(_text_width(font, label) for label in rows)
     header_px = FONT_PX + 2 * GAP_PX
@@ -59,23 +58,6 @@ def first_person_strip(
                 corner = (left + SCALE * width - 1, top + SCALE * height - 1)
                 draw.rectangle(((left, top), corner), fill=_ABSENT)
     files.write_image(path, np.asarray(sheet))
-
-
-def _checked_size(
-    rows: Mapping[str, Sequence[np.ndarray]], times_s: Sequence[float]
-) -> tuple[int, int]:
-    shapes = {frame.shape for frames in rows.values() for frame in frames}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 3 or next(iter(shapes))[2] != 3:
-        raise InputError(f"rows: frames of shapes {sorted(shapes)}; need one (H, W, 3)")
-    for label, frames in rows.items():
-        if len(frames) > len(times_s):
-            raise InputError(
-                f"rows.{label}: {len(frames)} frames for {len(times_s)} times"
-            )
-        if any(frame.dtype != np.uint8 for frame in frames):
-            raise InputError(f"rows.{label}: frames must be uint8 sRGB values")
-    height, width, _ = next(iter(shapes))
-    return height, width
 
 
 def _enlarged(frame: np.ndarray) -> Image.Image:

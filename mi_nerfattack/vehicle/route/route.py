@@ -213,38 +213,21 @@ class Route:
         return measure(_DRJIT, nearest, state[0], state[1], state[2])
 
     def arc_length(self, state: Any) -> Any:
-        """Arc length of the nearest point, differentiable in the position.
+        """Arc length (n,) of :meth:`project`, metres, of states (m, n).
 
-        Args:
-            state: Dr.Jit array (m, n), metres and radians.
-
-        Returns:
-            Row (n,), metres; its derivative is the route's direction, and zero where
-            a bend's vertex is nearest.
+        Its derivative is the route's direction, zero where a bend's vertex is nearest.
         """
         return self.project(state).arc_length
 
     def cross_track(self, state: Any) -> Any:
-        """Signed cross-track error, differentiable in the position.
+        """Signed distance (n,) of :meth:`project`, metres, positive on the left.
 
-        Args:
-            state: Dr.Jit array (m, n), metres and radians.
-
-        Returns:
-            Row (n,), metres, positive to the left; its derivative is the unit vector
-            from the route to the vehicle.
+        Its derivative is the unit vector from the route to the vehicle.
         """
         return self.project(state).cross_track
 
     def heading_error(self, state: Any) -> Any:
-        """Heading relative to the route at its nearest point.
-
-        Args:
-            state: Dr.Jit array (m, n), metres and radians.
-
-        Returns:
-            Row (n,), radians in [-pi, pi], differentiable in the heading.
-        """
+        """Heading (n,) of :meth:`project`, radians in [-pi, pi]."""
         return self.project(state).heading_error
 
 
