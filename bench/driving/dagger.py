@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from mi_nerfattack.deploy.place import bundled_place
-from mi_nerfattack.deploy.sites import PlaceSite, Weather, as_json
+from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import CLEAN, EvaluateSettings, evaluate_run
 from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.report.plots.charts import BLUE, ORANGE, chart
@@ -32,6 +33,8 @@ from mi_nerfattack.vehicle.route.route import load_routes
 OnStage = Callable[[str, int, int], None]
 
 ARMS = ("cloning", "DAgger")
+_FORMAT = "mi_nerfattack compared drive 1"
+_REMEDY = "choose another folder, or remove this one"
 _LAST = LossAlone(every=1 << 30)  # the weights of the last epoch count
 
 
@@ -111,7 +114,6 @@ def run(
         Settings, and of each arm the errors of every drive and of every seed.
     """
     folder = files.make_folder(folder)
-    _claim(folder, settings)
     weather = Weather(spp=settings.spp)
     site = PlaceSite(settings.environment, bundled_place(), weather)
     bench = _Bench(settings, site, folder, workers, show)
@@ -121,8 +123,8 @@ def run(
         policies = bench.cloning(seed), bench.dagger(seed)
         for arm, policy in zip(ARMS, policies, strict=True):
             drives = bench.drive(arm, seed, policy)
-            errors[arm].append([drive["mean_m"] for drive in drives])
-            departed[arm] += sum(drive["departed"] for drive in drives)
+            errors[arm].append([drive.mean_m for drive in drives])
+            departed[arm] += sum(drive.departed for drive in drives)
     return to_document(settings, errors, departed)
 
 
@@ -201,12 +203,12 @@ class _Bench:
             self._fit(module, shards, seed, epochs, path, rate)
         return path
 
-    def drive(self, arm: str, seed: int, policy: Path) -> list[dict[str, Any]]:
-        """Let a policy drive all routes; returns mean error and departure of each."""
+    def drive(self, arm: str, seed: int, policy: Path) -> list[_Driven]:
+        """Let a policy drive all routes."""
         folder = files.make_folder(self.folder / f"drives_{arm}_{seed}")
         work = _Drives(self.settings, self.site, policy, folder)
         pieces = range(len(self.routes) * self.settings.runs)
-        left = [index for index in pieces if not work.path(index).is_file()]
+        left = [index for index in pieces if work.unit(index).read_record() is None]
         done = len(pieces) - len(left)
 
         def count(units: int) -> None:
@@ -215,7 +217,8 @@ class _Bench:
             self.show(f"{arm} {seed} drives", done, len(pieces))
 
         self.workers.run(work, left, count)
-        return [files.read_json(work.path(index)) for index in pieces]
+        found = [work.unit(index).read_record() for index in pieces]
+        return [drive for drive in found if drive is not None]
 
     def _expert_frames(self, seed: int) -> list[Path]:
         return self._frames(f"expert_{seed}", self.settings.frames, CLONING, seed)
@@ -266,6 +269,14 @@ class _Bench:
         module.save(path)
 
 
+class _Driven(Record):
+    """Route, mean distance from the lane's centre, and whether it was left."""
+
+    route: str
+    mean_m: float
+    departed: bool
+
+
 @dataclass(frozen=True, eq=False)
 class _Drives(AbstractWork):
     """Drives of one policy; a piece is a drive, and so is a unit."""
@@ -275,9 +286,11 @@ class _Drives(AbstractWork):
     policy: Path
     folder: Path
 
-    def path(self, index: int) -> Path:
+    def unit(self, index: int) -> Unit[_Driven]:
         """Return the file of a drive's result."""
-        return self.folder / f"{index:03d}.json"
+        identity = {"format": _FORMAT, **flatten("settings", asdict(self.settings))}
+        path = self.folder / f"{index:03d}.safetensors"
+        return Unit(path, identity, _Driven, _REMEDY)
 
     def open(self) -> Any:
         """Load environment, policy and routes."""
@@ -294,12 +307,12 @@ class _Drives(AbstractWork):
         arguments = (environment, policy, route, CLEAN, drive_number, (), _no_ground)
         driven = evaluate_run(*arguments, rules)
         limit = departure_limit(route.lane_width_m, rules.car_width_m)
-        result = {
-            "route": route.name,
-            "mean_m": float(driven.distance_m.mean()),
-            "departed": bool(driven.departed(limit).any()),
-        }
-        files.write_json(self.path(index), result)
+        result = _Driven(
+            route=route.name,
+            mean_m=float(driven.distance_m.mean()),
+            departed=bool(driven.departed(limit).any()),
+        )
+        self.unit(index).write({}, result)
         report(1)
 
     def close(self, opened: Any) -> None:
@@ -339,14 +352,3 @@ def write_figure(path: Path, document: dict[str, Any]) -> None:
 def _no_ground(points: np.ndarray) -> np.ndarray:
     """Return no height: nothing is put beside the road."""
     return np.full(len(points), np.nan)
-
-
-def _claim(folder: Path, settings: Settings) -> None:
-    """Write the settings, or compare them with those that are there."""
-    path, about = folder / "settings.json", asdict(settings)
-    if path.is_file() and files.read_json(path) != as_json(about):
-        raise InputError(
-            f"{path}: results of other settings; choose another folder or "
-            f"remove {folder}"
-        )
-    files.write_json(path, about)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -237,8 +236,3 @@ def _checksums(paths: Sequence[Path]) -> dict[str, str]:
         # where folders, too, have equal names, one checksum follows the other
         sums[key] = sums.get(key, "") + files.sha256(path)
     return sums
-
-
-def as_json(value: Any) -> Any:
-    """Return a value as it comes back from a JSON file."""
-    return json.loads(json.dumps(value))
