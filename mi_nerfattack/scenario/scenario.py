@@ -15,7 +15,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tomlkit
 from pydantic import Field, ValidationError, model_validator
-from tomlkit.items import AoT, Item, Table
+from tomlkit.container import OutOfOrderTableProxy
+from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -232,21 +233,30 @@ def portable_text(scenario: Scenario, text: str) -> str:
 
 
 def _line_of(text: str, location: Location) -> int | None:
-    """Find the line of a key, or of the header of the table that lacks it; 1-based."""
+    """Find the line of a key, or of the table that lacks it; 1-based.
+
+    Of a table without a header, such as dotted keys make, it is that of its first key.
+    """
     document = tomlkit.parse(text)
     item: Any = document
+    holder: Any = None
+    key: Any = None
     for part in location:
         inner = item.get(part) if isinstance(part, str) else item[part]
         if inner is None:
             break
-        if not isinstance(inner, Table | AoT):
-            item[part] = _MARK  # a value, or an inline table
-            item = None
-            break
-        item = inner
-    if isinstance(item, AoT):
-        item = item[0]
-    if isinstance(item, Item):
+        holder, key, item = item, part, inner
+        if not isinstance(item, Table | AoT | OutOfOrderTableProxy):
+            break  # a value, or an inline table
+    if holder is None:
+        return None
+    while isinstance(item, AoT | OutOfOrderTableProxy) or (
+        isinstance(item, Table) and item.is_super_table()
+    ):
+        holder, key = item, 0 if isinstance(item, AoT) else next(iter(item))
+        item = holder[key]
+    if isinstance(item, Table):
         item.comment(_MARK)
-    before, found, _ = tomlkit.dumps(document).partition(_MARK)
-    return before.count("\n") + 1 if found else None
+    else:
+        holder[key] = _MARK
+    return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1

@@ -228,6 +228,9 @@ def test_every_form_of_toml_replays_anywhere(write, tmp_path, old, new):
         ('[policy]\nfile = "p', 'policy = { file = "a.onnx", batch = 2 }\n#', 19),
         ('name = "test"', 'attack.iterations = 0\nname = "test"', 1),
         ("[attack]", '[policy.preprocess]\nmean = [\n  0.5,\n  "a",\n]\n[attack]', 22),
+        ("iterations = 3", "iterations = 3\nmean.x = 1", 23),
+        ("iterations = 3", "iterations = 3\nmean.x = 1\nseed = 3\nmean.y = 1", 23),
+        ("[attack]\niterations = 3", "[mean.x]\ny = 1", 21),
     ],
 )
 def test_lines_of_every_form(write, old, new, line):
