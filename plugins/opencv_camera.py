@@ -191,8 +191,8 @@ class OpencvCamera(mi.Sensor):
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         """Return the box that holds nothing but the pinhole."""
-        place = [float(v[0]) for v in dr.detach(self.m_to_world.translation())]
-        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(place))
+        pinhole = [float(v[0]) for v in dr.detach(self.m_to_world.translation())]
+        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(pinhole))
 
     def _ray(
         self, ray: Any, x: mi.Float, y: mi.Float, time: Any, sample1: Any, active: Any
@@ -240,8 +240,8 @@ class OpencvCamera(mi.Sensor):
             )
             stretch = jacobian(x, y, *distortion)[3]
             density = dr.select(pixels < 1e-2, density * stretch, 0)
-        place = mi.Point2f(u * lens["fx"] + lens["cx"], v * lens["fy"] + lens["cy"])
-        return place - self._crop_offset, density
+        pixel = mi.Point2f(u * lens["fx"] + lens["cx"], v * lens["fy"] + lens["cy"])
+        return pixel - self._crop_offset, density
 
     def to_string(self) -> str:
         """Describe the checked parameters."""

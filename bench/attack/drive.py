@@ -16,7 +16,7 @@ import torch
 
 from bench.render.sides import FOV_DEG
 from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
-from mi_nerfattack.policy.preprocess import AbstractStage, Crop, Resize
+from mi_nerfattack.policy.preprocess import AbstractTransform, Crop, Resize
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.scenes import bundled
@@ -67,7 +67,7 @@ class Job:
         lateral[0] = 0.0
         return route().pose_at(np.full(self.poses, START_M), lateral)
 
-    def stages(self) -> list[AbstractStage]:
+    def transforms(self) -> list[AbstractTransform]:
         """Return the pre-processing: the middle part, resized."""
         height, width = IMAGE_SHAPE
         rows = min(self.height, round(self.width * height / width))

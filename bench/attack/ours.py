@@ -57,7 +57,7 @@ class OurAttack(AbstractAttack):
         item = PosedField(load_grid(bundled("hydrant/field.safetensors")), OBJECT_POSE)
         scene = PosedField(load_field(bundled("intersection/field.safetensors")))
         sensor = FieldSensor(scene, [item], job.camera, MOUNT, stop=STOP)
-        policy = TorchPolicy(network(), preprocess=Preprocess(job.stages()))
+        policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)
         self.loop = ClosedLoop(sensor, policy, path.goal, vehicle, RK4(), job.dt)

@@ -79,7 +79,7 @@ class TorchAttack(AbstractAttack):
         path = route()
         self.loop = TorchLoop(
             self.view,
-            Resized(network(), job.stages()),
+            Resized(network(), job.transforms()),
             path.goal,
             TorchVehicle(SPEED_MS, MAX_HEADING_RATE, job.dt),
             TorchRoute(path.points, ROUNDING_M),

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from bench.torch.fit import encode
 from bench.torch.ngp import TorchNGP
 from bench.torch.object import ObjectView, TorchObject
-from mi_nerfattack.policy.preprocess import AbstractStage
+from mi_nerfattack.policy.preprocess import AbstractTransform
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 
 
@@ -204,19 +204,19 @@ class Resized(torch.nn.Module):
 
     Args:
         policy: the network.
-        stages: from the camera's planes to the network's.
+        transforms: from the camera's planes to the network's.
     """
 
     def __init__(
-        self, policy: torch.nn.Module, stages: Sequence[AbstractStage]
+        self, policy: torch.nn.Module, transforms: Sequence[AbstractTransform]
     ) -> None:
         super().__init__()
-        self.policy, self.stages = policy, stages
+        self.policy, self.transforms = policy, transforms
 
     def forward(self, planes: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
         """Map planes (n, 3, height, width) and goals (n,) to controls (n,)."""
-        for stage in self.stages:
-            planes = stage.apply(planes)
+        for transform in self.transforms:
+            planes = transform.apply(planes)
         return self.policy(planes, goal)
 
 

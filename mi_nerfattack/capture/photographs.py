@@ -108,7 +108,7 @@ def estimate_poses(
         staged, work = Path(folder) / "images", Path(folder) / "work"
         staged.mkdir()
         work.mkdir()
-        _stage(root, names, staged, progress)
+        _copy_all(root, names, staged, progress)
         _check_in_place(root, names, staged, Path(output) / "images")
         found = reconstruct(
             staged,
@@ -164,7 +164,7 @@ def _check_in_place(
             )
 
 
-def _stage(
+def _copy_all(
     root: Path, names: Sequence[str], staged: Path, progress: StageCallback
 ) -> None:
     """Copy the photographs upright, and check that they have one size."""

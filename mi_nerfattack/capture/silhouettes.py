@@ -141,7 +141,7 @@ def _reduced(mask: np.ndarray) -> tuple[np.ndarray, int]:
 def _touches(
     mask: np.ndarray, row: np.ndarray, column: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
-    """Tell whether a mask is set within some pixels of places, or a bit further."""
+    """Tell whether a mask is set within some pixels of points, or a bit further."""
     level = np.ceil(np.log2(np.clip(pixels, 1, max(mask.shape)))).astype(int)
     result = np.zeros(len(row), bool)
     for each in np.unique(level):

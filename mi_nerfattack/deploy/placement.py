@@ -69,7 +69,7 @@ class Roadside:
     lateral_m: tuple[float, float] = (2.0, 5.0)
     clearance_m: float = 0.2
 
-    def place(
+    def draw(
         self,
         field: GridField,
         route: Route,

@@ -357,5 +357,5 @@ def _roadside(
         item = objects[(run + index) % len(objects)]
         texture = random_texture(item, "mixed", int(rng.integers(2**31)))
         item.set_parameter("texture", texture)
-        pose = settings.roadside.place(item, route, stretch, ground, rng)
+        pose = settings.roadside.draw(item, route, stretch, ground, rng)
         yield PosedField(item, pose)

@@ -102,7 +102,7 @@ def _digest(training: Training) -> str:
     if training.depth is not None:
         digest.update(np.ascontiguousarray(training.depth).data)
     digest.update(repr((images.camera, images.cameras, training.options)).encode())
-    place = training.field.metadata()
-    info = {key: place[key] for key in place if key not in training.field.info}
+    metadata = training.field.metadata()
+    info = {key: metadata[key] for key in metadata if key not in training.field.info}
     digest.update(repr((info, training.pixels)).encode())
     return digest.hexdigest()[:16]

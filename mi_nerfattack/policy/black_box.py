@@ -67,7 +67,7 @@ class AbstractBlackBox(AbstractPolicy):
         check_images(images)
         step, past = memory
         with torch.no_grad():
-            planes = self.preprocess.stage(images.to("cpu", torch.float32))
+            planes = self.preprocess.transform(images.to("cpu", torch.float32))
             seen, past = self.preprocess.stack(planes, past)
             goals = expand_goals(goal, planes).numpy().copy()
             # a copy: functions may write into their image

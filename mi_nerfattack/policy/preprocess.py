@@ -1,6 +1,6 @@
-"""From the camera's image to a network's input: differentiable stages.
+"""From the camera's image to a network's input: differentiable transforms.
 
-A stage maps planes (n, c, h, w) to planes. All but the transfer function of
+A transform maps planes (n, c, h, w) to planes. All but the transfer function of
 `ToLinear` are linear or affine; all are differentiable in reverse and forward mode.
 """
 
@@ -17,7 +17,7 @@ from mi_nerfattack.errors import InputError
 LUMA = (0.299, 0.587, 0.114)
 
 
-class AbstractStage(ABC):
+class AbstractTransform(ABC):
     """One step of the pre-processing."""
 
     @abstractmethod
@@ -29,7 +29,7 @@ class AbstractStage(ABC):
         """
 
 
-class Crop(AbstractStage):
+class Crop(AbstractTransform):
     """Cut margins off.
 
     Args:
@@ -49,7 +49,7 @@ class Crop(AbstractStage):
         return _cut(planes, self.margins)
 
 
-class FractionalCrop(AbstractStage):
+class FractionalCrop(AbstractTransform):
     """Cut margins off, given in parts of the height and the width.
 
     Rows and columns are rounded to whole ones, halves up.
@@ -108,7 +108,7 @@ def area(size: int, target: int) -> torch.Tensor:
     return covered.clamp(min=0) * (target / size)
 
 
-class Resize(AbstractStage):
+class Resize(AbstractTransform):
     """Resample to a size, pixel centres at half-integers, borders repeated.
 
     Each axis is multiplied by a matrix of weights, so that the derivative is the
@@ -145,7 +145,7 @@ class Resize(AbstractStage):
         return kept
 
 
-class ToLinear(AbstractStage):
+class ToLinear(AbstractTransform):
     """Take sRGB values to linear light, IEC 61966-2-1."""
 
     def apply(self, planes: torch.Tensor) -> torch.Tensor:
@@ -154,7 +154,7 @@ class ToLinear(AbstractStage):
         return torch.where(planes <= 0.04045, planes / 12.92, bent)
 
 
-class ColourMatrix(AbstractStage):
+class ColourMatrix(AbstractTransform):
     """Mix the three channels: c' = A c + b.
 
     Args:
@@ -197,7 +197,7 @@ def to_yuv() -> ColourMatrix:
     return ColourMatrix([LUMA, u, v], [0.0, 0.5, 0.5])
 
 
-class Normalise(AbstractStage):
+class Normalise(AbstractTransform):
     """Compute (scale x - mean) / std.
 
     Args:
@@ -254,10 +254,10 @@ def time_channels_last(frames: torch.Tensor) -> torch.Tensor:
 
 
 class Preprocess:
-    """Stages one after the other, then a stack of frames in a network's layout.
+    """Transforms one after the other, then a stack of frames in a network's layout.
 
     Args:
-        stages: applied to each camera image.
+        transforms: applied to each camera image.
         frames: length k of the stack: the image, and those `stride`, ...,
             (k - 1) `stride` control periods ago. Before there are so many, the first
             image stands for them.
@@ -267,14 +267,14 @@ class Preprocess:
 
     def __init__(
         self,
-        stages: Sequence[AbstractStage] = (),
+        transforms: Sequence[AbstractTransform] = (),
         frames: int = 1,
         stride: int = 1,
         layout: Layout = channels_first,
     ) -> None:
         if min(frames, stride) < 1:
             raise InputError(f"frames {frames}, stride {stride}; at least 1 each")
-        self.stages = tuple(stages)
+        self.transforms = tuple(transforms)
         self.frames, self.stride, self.layout = frames, stride, layout
 
     @property
@@ -282,15 +282,15 @@ class Preprocess:
         """Number of earlier images that the stack needs."""
         return (self.frames - 1) * self.stride
 
-    def stage(self, image: torch.Tensor) -> torch.Tensor:
-        """Apply the stages to images (n, height, width, 3), sRGB in [0, 1].
+    def transform(self, image: torch.Tensor) -> torch.Tensor:
+        """Apply the transforms to images (n, height, width, 3), sRGB in [0, 1].
 
         Returns:
             Planes (n, c, h, w).
         """
         planes = image.permute(0, 3, 1, 2)
-        for stage in self.stages:
-            planes = stage.apply(planes)
+        for transform in self.transforms:
+            planes = transform.apply(planes)
         return planes
 
     def stack(
@@ -299,7 +299,7 @@ class Preprocess:
         """Put a frame on the stack.
 
         Args:
-            planes: (n, c, h, w) from `stage`.
+            planes: (n, c, h, w) from `transform`.
             past: (n, t, c, h, w), oldest first, at most `history` of them; any
                 tensor with t = 0 before the first image.
 

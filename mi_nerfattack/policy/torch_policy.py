@@ -168,7 +168,7 @@ class TorchPolicy(AbstractPolicy):
         self.module.to(image.device)
         image = image.to(self._precision() or image.dtype)
         memory = tuple(part.to(image) for part in memory)
-        planes = self.preprocess.stage(image)
+        planes = self.preprocess.transform(image)
         past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
         network_image, past = self.preprocess.stack(planes, past)
         hidden = memory[1:] if self.preprocess.history else memory

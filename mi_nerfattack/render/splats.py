@@ -176,8 +176,8 @@ class SplatBackground(AbstractBackdrop):
         for tier, start in zip(self._tiers, reached, strict=True):
             chosen = waits & (start == nearest) & (start < rays.t_max)
             waits &= ~chosen
-            place = tier.zoom * (rays.origin + start * rays.direction)
-            ray = mi.Ray3f(mi.Point3f(place), mi.Vector3f(rays.direction))
+            entry = tier.zoom * (rays.origin + start * rays.direction)
+            ray = mi.Ray3f(mi.Point3f(entry), mi.Vector3f(rays.direction))
             shell = tier.scene.ray_intersect_preliminary(
                 ray, coherent=False, active=chosen
             )
@@ -223,8 +223,8 @@ class SplatBackground(AbstractBackdrop):
         def colour(index: mi.UInt32, active: mi.Bool) -> mi.Color3f:
             total = mi.Color3f(0.5)
             for j, value in enumerate(basis):
-                place = self._terms * index + j
-                term = dr.gather(mi.Color3f, self._harmonics, place, active)
+                slot = self._terms * index + j
+                term = dr.gather(mi.Color3f, self._harmonics, slot, active)
                 total += value * term
             return dr.maximum(total, 0)
 
@@ -247,7 +247,7 @@ def _choose(mask: mi.Bool, a: _Hit, b: _Hit) -> _Hit:
 
 
 def _insert(waiting: list[_Hit], new: _Hit) -> list[_Hit]:
-    """Put a hit at its place among those sorted by peak; the last place is free.
+    """Put a hit among those sorted by peak, of which the last is free.
 
     A shell that rounding lets a ray enter twice is still among those that wait.
     """

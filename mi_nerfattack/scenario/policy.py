@@ -20,7 +20,7 @@ from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.preprocess import (
-    AbstractStage,
+    AbstractTransform,
     Crop,
     FractionalCrop,
     Normalise,
@@ -52,7 +52,7 @@ LAYOUTS = {
     "NTCHW": time_first,
     "NTHWC": time_channels_last,
 }
-COLOURS: dict[str, Callable[[], AbstractStage]] = {
+COLOURS: dict[str, Callable[[], AbstractTransform]] = {
     "linear": ToLinear,
     "yuv": to_yuv,
     "grey": to_grey,
@@ -102,19 +102,19 @@ class PreprocessSection(Section):
         return self
 
     def build(self) -> Preprocess:
-        """Make the stages, in the order of the keys."""
-        stages: list[AbstractStage] = []
+        """Make the transforms, in the order of the keys."""
+        transforms: list[AbstractTransform] = []
         if self.crop_px is not None:
-            stages.append(Crop(*self.crop_px))
+            transforms.append(Crop(*self.crop_px))
         if self.crop_fraction is not None:
-            stages.append(FractionalCrop(*self.crop_fraction))
+            transforms.append(FractionalCrop(*self.crop_fraction))
         if self.resize_px is not None:
-            stages.append(Resize(*self.resize_px, FILTERS[self.filter]))
+            transforms.append(Resize(*self.resize_px, FILTERS[self.filter]))
         if self.colour != "srgb":
-            stages.append(COLOURS[self.colour]())
+            transforms.append(COLOURS[self.colour]())
         if (self.scale, self.mean, self.std) != (1.0, (0.0,), (1.0,)):
-            stages.append(Normalise(self.scale, self.mean, self.std))
-        return Preprocess(stages, self.frames, self.stride, LAYOUTS[self.layout])
+            transforms.append(Normalise(self.scale, self.mean, self.std))
+        return Preprocess(transforms, self.frames, self.stride, LAYOUTS[self.layout])
 
 
 class PlainGoal(Section):
@@ -285,12 +285,12 @@ class CallableSection(AbstractPolicySection):
 
     def build(self) -> AbstractPolicy:
         """Load the function."""
-        stages = self.preprocess.build()
+        preprocess = self.preprocess.build()
         function, scale = (
             self.file.load("policy.file", self.trust_code),
             self.control_scale,
         )
-        return CallablePolicy(function, self.source, stages, scale, self.output)
+        return CallablePolicy(function, self.source, preprocess, scale, self.output)
 
 
 class HttpSection(AbstractPolicySection):
@@ -303,9 +303,9 @@ class HttpSection(AbstractPolicySection):
 
     def build(self) -> AbstractPolicy:
         """Make the client."""
-        stages, scale = self.preprocess.build(), self.control_scale
+        preprocess, scale = self.preprocess.build(), self.control_scale
         return HttpPolicy(
-            self.url, self.timeout_s, self.retries, stages, scale, self.output
+            self.url, self.timeout_s, self.retries, preprocess, scale, self.output
         )
 
 

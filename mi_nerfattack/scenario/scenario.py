@@ -163,8 +163,8 @@ class Scenario(Section):
             InputError: a file cannot be read.
         """
         found = {}
-        for place, value in self.leaves():
-            key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in place)
+        for location, value in self.leaves():
+            key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in location)
             value = value.content() if isinstance(value, NamedFile) else value
             found[f"scenario{key}"] = json.dumps(value, sort_keys=True)
         return found
@@ -246,7 +246,7 @@ def _line_of(text: str, location: Location) -> int | None:
         if inner is None:
             break
         holder, key, item = item, part, inner
-        if not isinstance(item, Table | AoT | OutOfOrderTableProxy):
+        if not isinstance(inner, Table | AoT | OutOfOrderTableProxy):
             break  # a value, or an inline table
     if holder is None:
         return None

@@ -60,14 +60,14 @@ class Section(BaseModel):
         return found
 
     def leaves(self) -> Iterator[tuple[Location, Any]]:
-        """Yield the place in the file of each value that counts, and the value."""
+        """Yield the location of each value that counts, and the value."""
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
             if field.exclude:
                 continue
             if isinstance(value, Section):
-                place = () if field.validation_alias else (name,)
-                yield from ((place + rest, leaf) for rest, leaf in value.leaves())
+                location = () if field.validation_alias else (name,)
+                yield from ((location + rest, leaf) for rest, leaf in value.leaves())
             elif isinstance(value, tuple) and value and isinstance(value[0], Section):
                 for index, item in enumerate(value):
                     for rest, leaf in item.leaves():
@@ -181,10 +181,10 @@ def _with(reasons: Mapping[str, str], validate: Callable[[], _Value]) -> _Value:
 
 
 def _error(
-    place: Location, message: str, kind: Any = "told", value: Any = None
+    location: Location, message: str, kind: Any = "told", value: Any = None
 ) -> InitErrorDetails:
     error = PydanticCustomError(kind, "{why}", {"why": message})
-    return InitErrorDetails(type=error, loc=place, input=value)
+    return InitErrorDetails(type=error, loc=location, input=value)
 
 
 def read_section(name: str, kind: Any, values: Any, folder: str | Path) -> Any:
@@ -211,13 +211,13 @@ def problems(err: ValidationError) -> Iterator[tuple[Location, str]]:
     found = err.errors()
     lists = {error["loc"][:1] for error in found if len(error["loc"]) > 1}
     for error in found:
-        kind, place = error["type"], error["loc"]
-        if kind == "too_short" and place in lists:
+        kind, location = error["type"], error["loc"]
+        if kind == "too_short" and location in lists:
             continue  # its only item is wrong, and told
         message = _WORDS.get(kind, error["msg"])
         given = "" if kind in ("told", "missing") else f" (is {error['input']!r})"
-        keys = tuple(part for part in place if not str(part).startswith("("))
-        yield keys or place, message[0].lower() + message[1:] + given
+        keys = tuple(part for part in location if not str(part).startswith("("))
+        yield keys or location, message[0].lower() + message[1:] + given
 
 
 def _defaults(members: Iterable[type[Section]]) -> dict[str, Any]:

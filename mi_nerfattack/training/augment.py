@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-#: Normal numbers that are drawn for a batch; images take theirs from random places,
+#: Normal numbers that are drawn for a batch; images take theirs from random offsets,
 #: because drawing is what takes longest.
 _NOISE_POOL = 1 << 18
 

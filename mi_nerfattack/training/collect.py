@@ -49,7 +49,7 @@ class CollectSettings:
         frames: wanted.
         seed: of everything random.
         shard: frames that are written together, under the same conditions.
-        group: states that are drawn around one place, with the same object.
+        group: states that are drawn around one point, with the same object.
         groups_a_texture: groups that share a texture.
         object_share: share of the groups with an object.
         original_share: share of these where it keeps its own texture.
@@ -58,7 +58,7 @@ class CollectSettings:
         margin_m: arc length before and after an open route, from where frames come
             too.
         scatter: deviations of the states from the route.
-        roadside: sizes and places of the objects.
+        roadside: sizes and positions of the objects.
     """
 
     frames: Count = 9000
@@ -161,11 +161,11 @@ class _Shards(AbstractWork):
         """Return what a file must be."""
         return Unit(path, self.identity, ShardRecord, _REMEDY)
 
-    def open(self) -> _Stage:
+    def open(self) -> _Opened:
         """Load objects, ground and what the source needs."""
-        return _Stage(self.site, self.settings, self.source.prepare())
+        return _Opened(self.site, self.settings, self.source.prepare())
 
-    def do(self, opened: _Stage, index: int, report: OnUnits) -> None:
+    def do(self, opened: _Opened, index: int, report: OnUnits) -> None:
         """Render, label and write one shard."""
         rng = np.random.default_rng(
             [self.settings.seed, index, *self.site.name.encode()]
@@ -187,24 +187,27 @@ class _Shards(AbstractWork):
             ShardRecord(conditions=asdict(conditions), goals=counts),
         )
 
-    def close(self, opened: _Stage) -> None:
+    def close(self, opened: _Opened) -> None:
         """Close the environment."""
         opened.close()
 
     def _rows(
-        self, stage: _Stage, environment: AbstractEnvironment, rng: np.random.Generator
+        self,
+        opened: _Opened,
+        environment: AbstractEnvironment,
+        rng: np.random.Generator,
     ) -> Iterator[tuple[int, Labelled]]:
         """Yield goals and labelled frames without end."""
         experts = {route.name: expert_of(self.site, route) for route in self.routes}
         states = _draw_states(self.routes, self.settings, rng)
         for number, (route, arc, poses) in enumerate(states):
-            stage.dress(environment, route, arc, number, rng)
+            opened.dress(environment, route, arc, number, rng)
             scenery = Scenery(environment, route, experts[route.name], poses, rng)
-            for labelled in self.source.frames(stage.prepared, scenery):
+            for labelled in self.source.frames(opened.prepared, scenery):
                 yield route.goal, labelled
 
 
-class _Stage:
+class _Opened:
     """What a worker keeps from shard to shard: one environment, objects, ground.
 
     Args:
@@ -266,7 +269,7 @@ class _Stage:
         posed = []
         if rng.uniform() < settings.object_share:
             reach = (arc + settings.ahead_m[0], arc + settings.ahead_m[1])
-            pose = settings.roadside.place(chosen, route, reach, self.ground, rng)
+            pose = settings.roadside.draw(chosen, route, reach, self.ground, rng)
             posed = [PosedField(chosen, pose)]
         environment.show(posed)
 

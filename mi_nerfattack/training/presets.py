@@ -29,7 +29,7 @@ class Preset:
         epochs: passes over the frames.
         dagger_epochs: passes over all frames after each round.
         weather: conditions of the frames.
-        collecting: how states, objects and their places are drawn.
+        collecting: how states, objects and their poses are drawn.
     """
 
     place: str

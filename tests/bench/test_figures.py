@@ -22,8 +22,8 @@ def test_all_horizons_drive_the_same_road():
     assert {SPEED_MS * job.dt * job.horizon for job in jobs} == {12.5}
     assert np.array_equal(*(job.initial() for job in jobs))
     planes = torch.rand(1, 3, 188, 366)
-    for stage in jobs[0].stages():
-        planes = stage.apply(planes)
+    for transform in jobs[0].transforms():
+        planes = transform.apply(planes)
     assert planes.shape == (1, 3, 66, 200)
     assert jobs[0].arguments() == ["366", "188", "3", "25"]
 

@@ -51,7 +51,7 @@ def test_a_scatter_out_of_range_is_refused(change):
 def test_objects_keep_clear_of_the_lane(grid, rng, route):
     sides = []
     for _ in range(50):
-        pose = Roadside().place(grid, route, (2.0, 20.0), flat_ground, rng)
+        pose = Roadside().draw(grid, route, (2.0, 20.0), flat_ground, rng)
         state = np.array([*pose.translation[:2], 0.0])
         (error,) = route.cross_track_numpy(state)
         radius = pose.scale * np.hypot(0.2, 0.2)
@@ -68,7 +68,7 @@ def test_blocked_roadside_is_an_error(grid, rng):
         return np.full(len(points), np.nan)
 
     with pytest.raises(InputError, match="'straight'.*no free ground"):
-        Roadside().place(grid, straight(), (2.0, 20.0), nowhere, rng)
+        Roadside().draw(grid, straight(), (2.0, 20.0), nowhere, rng)
 
 
 def test_ground_is_the_highest_low_surface(variant):

@@ -248,7 +248,7 @@ def test_drjit_networks_are_torch_s_with_the_same_weights(tmp_path, rng):
     image, weight = camera(3, rng), mi.Float(1, -2, 0.5)
     control, gradient = policy.vjp(image, [0, 1, 2], weight)
     leaf = torch.from_numpy(image.numpy()).double().requires_grad_(True)
-    planes = policy.preprocess.stage(leaf).flatten(1)
+    planes = policy.preprocess.transform(leaf).flatten(1)
     expected = reference(torch.cat([planes, torch.eye(3).double()], 1))[:, 1]
     torch.autograd.backward(expected, torch.tensor([1, -2, 0.5]).double())
     np.testing.assert_allclose(control, expected.detach(), atol=1e-5)

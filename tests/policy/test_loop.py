@@ -54,14 +54,13 @@ class Stacked(nn.Module):
 
 def policies():
     torch.manual_seed(4)
-    stages = [Resize(4, 2), to_yuv(), Normalise(2.0, (0.5,), (0.7,))]
+    transforms = [Resize(4, 2), to_yuv(), Normalise(2.0, (0.5,), (0.7,))]
+    stack = Preprocess(transforms, 3, 2)
     return {
         "recurrent": TorchPolicy(
             Recurrent().double(), OneHotGoal(3), recurrent=[(-1, 6)]
         ),
-        "stacked": TorchPolicy(
-            Stacked().double(), NoGoal(), Preprocess(stages, 3, 2), control_scale=-1.5
-        ),
+        "stacked": TorchPolicy(Stacked().double(), NoGoal(), stack, control_scale=-1.5),
     }
 
 
@@ -75,7 +74,7 @@ class Carried(nn.Module):
     def forward(self, image, goal):
         policy, preprocess = self.policy, self.policy.preprocess
         frame = image.permute(0, 2, 3, 1)
-        self.frames.append(preprocess.stage(frame))
+        self.frames.append(preprocess.transform(frame))
         last, stride = len(self.frames) - 1, preprocess.stride
         ages = [i * stride for i in reversed(range(preprocess.frames))]
         stack = torch.cat([self.frames[max(0, last - age)] for age in ages], 1)

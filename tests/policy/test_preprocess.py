@@ -152,7 +152,7 @@ def test_stages_follow_each_other(rng):
     image = torch.rand(1, 6, 8, 3)
     preprocess = Preprocess([Crop(2, 0, 0, 0), to_grey(), Normalise(2.0)])
     expected = 2 * (image[:, 2:] @ torch.tensor([0.299, 0.587, 0.114]))[:, None]
-    torch.testing.assert_close(preprocess.stage(image), expected)
+    torch.testing.assert_close(preprocess.transform(image), expected)
 
 
 @pytest.mark.parametrize(

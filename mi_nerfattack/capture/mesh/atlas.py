@@ -68,7 +68,7 @@ def lay_out(corners: np.ndarray, texel_m: float) -> Atlas:
     flat = _flattened(corners) / texel_m
     boxes = np.ceil(flat.max(1)).astype(np.int64) + 2 * _BORDER
     width = _width(boxes)
-    places, height = _packed(boxes, _order(corners, boxes), width)
+    offsets, height = _packed(boxes, _order(corners, boxes), width)
     if max(width, height) > _MAX_EDGE:
         raise InputError(
             f"texel_m: {texel_m}; gives an image of {width} x {height} pixels, of "
@@ -77,8 +77,8 @@ def lay_out(corners: np.ndarray, texel_m: float) -> Atlas:
         )
     triangles, local = _box_texels(boxes)
     weights = _nearest(flat[triangles], local + 0.5 - _BORDER)
-    columns, rows = (places[triangles] + local).T
-    uv = (places[:, None] + flat + _BORDER) / [width, height]
+    columns, rows = (offsets[triangles] + local).T
+    uv = (offsets[:, None] + flat + _BORDER) / [width, height]
     uv[..., 1] = 1 - uv[..., 1]
     return Atlas(width, height, uv, rows, columns, triangles, weights)
 
@@ -123,15 +123,15 @@ def _order(corners: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 def _packed(boxes: np.ndarray, order: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Put boxes side by side in strips: column and row of each, and the height."""
-    places = np.empty_like(boxes)
+    offsets = np.empty_like(boxes)
     column = row = strip = 0
     for index in order.tolist():
         across, high = boxes[index].tolist()
         if column + across > width:
             column, row, strip = 0, row + strip, 0
-        places[index] = column, row
+        offsets[index] = column, row
         column, strip = column + across, max(strip, high)
-    return places, row + strip
+    return offsets, row + strip
 
 
 def _box_texels(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

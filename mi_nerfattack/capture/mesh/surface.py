@@ -100,7 +100,7 @@ def painted_mesh(field: GridField, mesh: TexturedMesh) -> ColouredMesh:
     corners = _divided(mesh, voxel)
     normal = face_normals(corners).repeat(3, axis=0)
     rows = np.concatenate([corners.reshape(-1, 3), normal], axis=1)
-    # corners at one place and in one plane are one vertex
+    # corners at one point and in one plane are one vertex
     unit = np.repeat([1e-4 * voxel, 1e-4], 3)
     keys = np.round(rows / unit).astype(np.int64)
     _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -211,8 +211,8 @@ def seen_colours(
         origin, direction = _point(eye), mi.Vector3f(_point(-normals[part]))
         with dr.suspend_grad():
             seen = march(posed, Rays(origin, direction, far, half))
-            place = _point(points[part])
-            _, own = field.eval(place, direction, mi.Bool(True))
+            point = _point(points[part])
+            _, own = field.eval(point, direction, mi.Bool(True))
             clear = seen.opacity > _FAINT
             weight = dr.select(clear, seen.opacity, 1)
             colour = dr.select(clear, seen.radiance / weight, own)
@@ -245,11 +245,11 @@ def _density(field: GridField, points: np.ndarray) -> np.ndarray:
     result = np.empty(len(points))
     for start in range(0, len(points), _CHUNK):
         part = slice(start, start + _CHUNK)
-        place = _point(points[part])
-        unit = field.unit(place)
+        point = _point(points[part])
+        unit = field.unit(point)
         inside = dr.all((unit >= 0) & (unit <= 1))
         distance, _ = field.occupancy.query(unit, inside)
-        result[part] = field.density(place, inside & (distance == 0)).numpy()
+        result[part] = field.density(point, inside & (distance == 0)).numpy()
     return result
 
 

@@ -54,12 +54,12 @@ class Paster:
             InputError: the camera is so far away that single precision cannot tell
                 where an object ends.
         """
-        place = np.asarray(camera_to_world)[:3, 3]
-        if not np.abs(place).max() <= FARTHEST_M:
+        position = np.asarray(camera_to_world)[:3, 3]
+        if not np.abs(position).max() <= FARTHEST_M:
             raise InputError(
-                f"camera at {place.round(1).tolist()} m: objects are pasted in single "
-                f"precision, within {FARTHEST_M:g} m of the origin; put the origin of "
-                "poses and objects near the drive"
+                f"camera at {position.round(1).tolist()} m: objects are pasted in "
+                f"single precision, within {FARTHEST_M:g} m of the origin; put the "
+                "origin of poses and objects near the drive"
             )
         with dr.suspend_grad():
             return self._frozen(self._rays.at(camera_to_world))

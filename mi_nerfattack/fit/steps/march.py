@@ -71,6 +71,6 @@ class MarchStep:
 
 def _put_back(value: Any, order: mi.UInt32) -> Any:
     """Undo `pick_rays(..., order)`."""
-    place = dr.zeros(mi.UInt32, dr.width(order))
-    dr.scatter(place, dr.arange(mi.UInt32, dr.width(order)), order)
-    return pick_rays(value, place)
+    rank = dr.zeros(mi.UInt32, dr.width(order))
+    dr.scatter(rank, dr.arange(mi.UInt32, dr.width(order)), order)
+    return pick_rays(value, rank)

@@ -148,10 +148,10 @@ class PointStep:
         """Measure spread in steps of the march, as a share of those across the box."""
         corners = mi.Vector3f(*map(float, self.field.upper - self.field.lower))
         width = dr.rcp(self.posed.lattice_index(mi.Float(dr.norm(corners))))
-        place = self.posed.lattice_index(samples.t) * width
+        position = self.posed.lattice_index(samples.t) * width
         rays = dr.maximum(dr.count(samples.fits), 1)
         factor = self.source.weights.spread * dr.rcp(mi.Float(rays))
-        return measure_spread(samples, depths, place, width, factor)
+        return measure_spread(samples, depths, position, width, factor)
 
     def _record_scatter(self, draw: Draw, samples: Samples, slopes: mi.Float) -> None:
         point = _points(draw.rays, samples)

@@ -171,7 +171,7 @@ class Spread:
 
     Attributes:
         factor: (n,), of the penalty in the objective.
-        place: (m,), positions s of the samples.
+        position: (m,), s of the samples.
         width: of an interval, in the same unit; one entry.
         weight: (n,), sum of w_k.
         moment: (n,), sum of w_k s_k.
@@ -181,39 +181,39 @@ class Spread:
     """
 
     factor: mi.Float = field(default_factory=lambda: mi.Float(0))
-    place: mi.Float = field(default_factory=lambda: mi.Float(0))
+    position: mi.Float = field(default_factory=lambda: mi.Float(0))
     width: mi.Float = field(default_factory=lambda: mi.Float(0))
     weight: mi.Float = field(default_factory=lambda: mi.Float(0))
     moment: mi.Float = field(default_factory=lambda: mi.Float(0))
     penalty: mi.Float = field(default_factory=lambda: mi.Float(0))
 
     def slope(
-        self, weight: mi.Float, place: mi.Float, before: mi.Float, moment: mi.Float
+        self, weight: mi.Float, position: mi.Float, before: mi.Float, moment: mi.Float
     ) -> mi.Float:
         """Return the penalty's derivative by a weight.
 
         Args:
             weight: of the sample.
-            place: of the sample.
+            position: of the sample.
             before: sum of the weights before it.
-            moment: sum of weight times place before it.
+            moment: sum of weight times position before it.
         """
         behind = self.weight - before - weight
-        rest = self.moment - moment - weight * place
-        distance = place * (before - behind) - (moment - rest)
+        rest = self.moment - moment - weight * position
+        distance = position * (before - behind) - (moment - rest)
         return 2 * distance + (2 / 3) * weight * self.width
 
 
 @dr.syntax
 def measure_spread(
-    samples: Samples, depths: mi.Float, place: mi.Float, width: mi.Float, factor: Any
+    samples: Samples, depths: mi.Float, position: mi.Float, width: mi.Float, factor: Any
 ) -> Spread:
     """Measure the spread of weights along each ray.
 
     Args:
         samples: n rays, m slots.
         depths: (m,), optical depth of each interval.
-        place: (m,), positions of the samples, in whatever unit the spread is to have.
+        position: (m,), of the samples, in whatever unit the spread is to have.
         width: of an interval, in the same unit; one entry.
         factor: (n,), of the penalty in the objective.
     """
@@ -222,7 +222,7 @@ def measure_spread(
     active = slot < end
     while active:
         x = dr.gather(mi.Float, depths, slot, active)
-        s = dr.gather(mi.Float, place, slot, active)
+        s = dr.gather(mi.Float, position, slot, active)
         weight = sample_weight(tau, x)
         # each pair is met once, at its farther sample
         penalty += weight * (2 * (s * before - moment) + weight * width / 3)
@@ -231,7 +231,7 @@ def measure_spread(
         tau += x
         slot += 1
         active &= slot < end
-    return Spread(factor, place, width, before, moment, penalty)
+    return Spread(factor, position, width, before, moment, penalty)
 
 
 @dr.syntax
@@ -273,7 +273,7 @@ def cotangents(
     active = slot < end
     while active:
         x = dr.gather(mi.Float, depths, slot, active)
-        s = dr.gather(mi.Float, spread.place, slot, active)
+        s = dr.gather(mi.Float, spread.position, slot, active)
         value = _pick(colour, slot, active)
         weight = sample_weight(tau, x)
         g = (

@@ -133,11 +133,11 @@ class Relighting:
         unshadowed = mi.Color3f(0)
         while k < self.samples:
             i = mi.Float(k)
-            place = mi.Point2f((shift.x + i) / self.samples, shift.y + i * _GOLDEN)
-            place -= dr.floor(place)
+            sample = mi.Point2f((shift.x + i) / self.samples, shift.y + i * _GOLDEN)
+            sample -= dr.floor(sample)
             wavelengths, weight = _wavelengths(turn + i * _SILVER)
             it.wavelengths = wavelengths
-            ds, light = scene.sample_emitter_direction(it, place, True, active)
+            ds, light = scene.sample_emitter_direction(it, sample, True, active)
             cosine = dr.maximum(dr.dot(surface.normal, ds.d), 0)
             light = _to_rgb(light * weight, wavelengths) * (cosine / self.samples)
             is_far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -178,11 +178,11 @@ def _transmittance(objects: list[PosedField], rays: Rays, stop: float) -> mi.Flo
     return passed
 
 
-def _wavelengths(place: mi.Float) -> tuple[Any, Any]:
+def _wavelengths(sample: mi.Float) -> tuple[Any, Any]:
     """Sample wavelengths (nm) of spectral variants, and their weights."""
     if not mi.is_spectral:
         return mi.Color0f(), mi.Spectrum(1)
-    shifted = mi.Spectrum(*[place + i / 4 for i in range(4)])
+    shifted = mi.Spectrum(*[sample + i / 4 for i in range(4)])
     return mi.sample_rgb_spectrum(shifted - dr.floor(shifted))
 
 

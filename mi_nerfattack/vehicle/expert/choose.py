@@ -54,7 +54,7 @@ def expert_for(
     on an open route and by `PIDExpert` on a closed one. Distances grow with the
     route's speed.
 
-    The lag only moves the place where the curvature is read. One policy for cars with
+    The lag only moves the point where the curvature is read. One policy for cars with
     and without lag cannot know which it drives: label its frames with the lag in
     between that is the default, which costs some centimetres in bends.
 
