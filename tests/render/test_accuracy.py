@@ -143,6 +143,23 @@ def test_overlapping_boxes_by_depth_are_a4_to_a6() -> None:
 # Through Mitsuba
 
 
+WIDTH, HEIGHT = 40, 30
+
+
+def sensor(fov: float) -> dict[str, Any]:
+    """Describe a camera at x = 3 that looks at the origin."""
+    eye = mi.ScalarTransform4f().look_at([3.0, 0.4, 0.3], [0, 0, 0], [0, 0, 1])
+    film = {
+        "type": "hdrfilm",
+        "width": WIDTH,
+        "height": HEIGHT,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    return {"type": "perspective", "fov": fov, "to_world": eye, "film": film}
+
+
 def window(path: Path, x: float) -> None:
     """Write a wall in the plane of one x that faces +x, with a rectangular hole."""
     outer = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
@@ -162,7 +179,7 @@ def window(path: Path, x: float) -> None:
 
 @pytest.mark.parametrize("x", [1.5, 0.2, -1.5], ids=["before", "within", "behind"])
 def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
-    width, height, density, wall, sky = 40, 30, 0.7, 2.0, 0.25
+    density, wall, sky = 0.7, 2.0, 0.25
     save_field(tmp_path / "box.safetensors", small.homogeneous(density))
     window(tmp_path / "wall.ply", x)
     volume = {"type": "grid_field", "filename": str(tmp_path / "box.safetensors")}
@@ -178,28 +195,14 @@ def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
                 "box": volume,
                 "behind": {"type": "path", "max_depth": 2},
             },
-            "sensor": {
-                "type": "perspective",
-                "fov": 60.0,
-                "to_world": mi.ScalarTransform4f().look_at(
-                    [3.0, 0.4, 0.3], [0, 0, 0], [0, 0, 1]
-                ),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": width,
-                    "height": height,
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
-            },
+            "sensor": sensor(60.0),
             "wall": {"type": "ply", "filename": path, "light": light, "bsdf": dark},
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": sky}},
         },
         parallel=False,
     )
     image = np.array(mi.render(scene, spp=1, seed=0)).reshape(-1, 10)
-    ray = camera_rays(scene, width, height)
+    ray = camera_rays(scene)
     o, d = ray.o.numpy().T.astype(float), ray.d.numpy().T.astype(float)
     t_wall = (x - o[:, 0]) / d[:, 0]
     y, z = (o + t_wall[:, None] * d)[:, 1:].T
@@ -219,13 +222,13 @@ def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
     np.testing.assert_allclose(image[hit, 4], moment[hit] / opacity[hit], rtol=1e-3)
 
 
-def camera_rays(scene: mi.Scene, width: int, height: int) -> mi.Ray3f:
+def camera_rays(scene: mi.Scene) -> mi.Ray3f:
     """Return the rays that are traced with one sample and seed 0."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, width * height)
-    pixel = dr.arange(mi.UInt32, width * height)
-    corner = mi.Vector2f(pixel % width, pixel // width)
-    place = (corner + sampler.next_2d()) / mi.Vector2f(width, height)
+    sampler.seed(0, WIDTH * HEIGHT)
+    pixel = dr.arange(mi.UInt32, WIDTH * HEIGHT)
+    corner = mi.Vector2f(pixel % WIDTH, pixel // WIDTH)
+    place = (corner + sampler.next_2d()) / mi.Vector2f(WIDTH, HEIGHT)
     return scene.sensors()[0].sample_ray(0, 0, place, mi.Point2f(0.5))[0]
 
 
@@ -266,26 +269,12 @@ def test_rays_that_leave_the_box_see_the_sky(tmp_path: Path, angle: float) -> No
         {
             "type": "scene",
             "integrator": {"type": "field_integrator", "stop": 0.0, "ngp": volume},
-            "sensor": {
-                "type": "perspective",
-                "fov": 100.0,
-                "to_world": mi.ScalarTransform4f().look_at(
-                    [3.0, 0.4, 0.3], [0, 0, 0], [0, 0, 1]
-                ),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 40,
-                    "height": 30,
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
-            },
+            "sensor": sensor(100.0),
         },
         parallel=False,
     )
     image = np.array(mi.render(scene, spp=1, seed=0)).reshape(-1, 10)
-    d = camera_rays(scene, 40, 30).d.numpy().T.astype(float)
+    d = camera_rays(scene).d.numpy().T.astype(float)
     local = d @ np.array(turn.matrix)[:3, :3]  # the transpose: into the field's frame
     sky = sky_colour(raw, local)
     # Channels 5 to 7 are the field alone, premultiplied.

@@ -51,10 +51,6 @@ def road_rays(x: float = -10.0) -> Rays:
     return Rays(origin, direction)
 
 
-def some_cells(rng) -> Occupancy:
-    return Occupancy(rng.random((6, 5, 4)) < 0.4)
-
-
 def assert_same(posed: PosedField, rays: Rays, stop: float = STOP) -> None:
     found = PackedMarch(posed, stop).march(rays)
     expected = march(posed, rays, stop)
@@ -69,31 +65,22 @@ def test_it_is_the_march_of_the_bundled_scene():
     )
 
 
-@pytest.mark.parametrize("cone", [0.0, 0.05])
-def test_it_is_the_march_of_a_small_field(rng, cone):
+@pytest.mark.parametrize(
+    ("cone", "pose", "spread", "stop"),
+    [
+        (0.0, None, 3.0, STOP),
+        (0.05, None, 3.0, STOP),
+        (0.0, None, 3.0, 0.3),  # another place of termination would be seen
+        (0.02, Pose.upright((0.3, -0.2, 0.1), 0.7, 1.6), 5.0, STOP),
+        (0.0, None, 0.9, STOP),  # from inside
+    ],
+)
+def test_it_is_the_march_of_a_small_field(rng, cone, pose, spread, stop):
     field = small_ngp(cone=cone)
-    field.occupancy = some_cells(rng)
-    posed = PosedField(field)
-    rays = random_rays(rng)
+    field.occupancy = Occupancy(rng.random((6, 5, 4)) < 0.4)
+    posed, rays = PosedField(field, pose), random_rays(rng, spread=spread)
     assert 0.05 < float(dr.mean(march(posed, rays).opacity)[0]) < 0.95
-    assert_same(posed, rays)
-
-
-def test_it_stops_where_the_march_stops(rng):
-    """With a coarse threshold, another place of termination would be seen."""
-    field = small_ngp()
-    assert_same(PosedField(field), random_rays(rng), stop=0.3)
-
-
-def test_pose_and_scale(rng):
-    field = small_ngp(cone=0.02)
-    field.occupancy = some_cells(rng)
-    posed = PosedField(field, Pose.upright((0.3, -0.2, 0.1), 0.7, 1.6))
-    assert_same(posed, random_rays(rng, spread=5.0))
-
-
-def test_rays_from_inside(rng):
-    assert_same(PosedField(small_ngp()), random_rays(rng, spread=0.9))
+    assert_same(posed, rays, stop)
 
 
 def test_several_features_and_levels(rng):
@@ -151,18 +138,6 @@ def test_gains_multiply_the_radiance(rng):
         np.testing.assert_allclose(np.array(lit.radiance), expected, atol=2e-5)
 
 
-def test_new_parameters_are_noticed(rng):
-    field = small_ngp()
-    posed, rays = PosedField(field), random_rays(rng)
-    scene = PackedMarch(posed, STOP)
-    before = np.array(scene.march(rays).radiance)
-    field.set_parameter("table", 0.5 * field.parameters()["table"])
-    after = np.array(scene.march(rays).radiance)
-    assert np.abs(after - before).max() > 0.01
-    expected = np.array(march(posed, rays).radiance)
-    np.testing.assert_allclose(after, expected, atol=2e-5)
-
-
 def test_parameters_may_lose_half_precision(rng):
     """A table that short words hold is followed by one that they do not, and back."""
     field = small_ngp()
@@ -209,13 +184,11 @@ def test_memory_does_not_grow_with_the_samples(rng):
     assert peaks[1] <= 1.05 * peaks[0]
 
 
-def test_the_choice_is_by_field():
+def test_the_choice_is_by_field(rng):
     assert isinstance(scene_march(PosedField(small_ngp()), STOP), PackedMarch)
-    assert isinstance(scene_march(PosedField(homogeneous()), STOP), FieldMarch)
-
-
-def test_grid_fields_are_marched_as_ever(rng):
     posed, rays = PosedField(homogeneous()), random_rays(rng)
-    found = scene_march(posed, STOP).march(rays)
+    chosen = scene_march(posed, STOP)
+    assert isinstance(chosen, FieldMarch)
     expected = np.array(march(posed, rays).radiance)
-    np.testing.assert_allclose(np.array(found.radiance), expected, atol=1e-6)
+    found = np.array(chosen.march(rays).radiance)
+    np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -159,13 +159,8 @@ def test_a_large_splat_comes_behind_what_it_begins_in_front_of() -> None:
 
 
 def test_an_opaque_wall_is_a_coloured_wall() -> None:
-    y, z = np.meshgrid(np.arange(-1, 1, 0.1), np.arange(-1, 1, 0.1))
-    places = np.stack([4 + 0 * y, y, z], -1).reshape(-1, 3)
-    wall = made.splats(places, RED, 0.9999, [0.001, 0.1, 0.1])
-    origins = np.stack(
-        [np.zeros(50), *np.random.default_rng(1).uniform(-0.6, 0.6, (2, 50))]
-    )
-    seen = look(wall, origins.T, stop=1e-3)
+    origins = np.random.default_rng(1).uniform(-0.6, 0.6, (50, 3)) * [0, 1, 1]
+    seen = look(made.wall(4, RED, half=1, step=0.1), origins, stop=1e-3)
     np.testing.assert_allclose(seen.opacity.numpy(), 1, atol=2e-3)
     expected = np.tile(srgb_to_linear_numpy(RED), (50, 1))
     np.testing.assert_allclose(seen.radiance.numpy().T, expected, atol=2e-3)

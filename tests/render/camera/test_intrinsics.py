@@ -81,16 +81,6 @@ def test_mount_pose_agrees_with_matrix():
         np.testing.assert_allclose(column.numpy().T, matrix[:, :3, i], atol=1e-6)
 
 
-def test_first_ray_is_top_left():
-    camera = cam.from_fov(4, 2, 90.0)
-    _, directions = rays_of(camera, np.eye(4)[None])
-    slopes = directions[0] / directions[0, ..., 2:]
-    np.testing.assert_allclose(slopes[0, 0, :2], [-0.75, -0.25], atol=1e-6)
-    np.testing.assert_allclose(slopes[0, 3, :2], [0.75, -0.25], atol=1e-6)
-    np.testing.assert_allclose(slopes[1, 0, :2], [-0.75, 0.25], atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     "lens",
     [
