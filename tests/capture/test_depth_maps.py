@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -164,14 +165,7 @@ def test_unknown_depth_has_no_loss():
 
 class TestBoundsFromPoints:
     def posed(self, points) -> PosedImages:
-        images, _ = sphere_views(4)
-        return PosedImages(
-            images.images,
-            images.camera_to_world,
-            images.camera,
-            images.names,
-            points=points,
-        )
+        return replace(sphere_views(4)[0], points=points)
 
     def test_outliers_do_not_count(self):
         rng = np.random.default_rng(0)

@@ -62,12 +62,9 @@ class TestMesh:
         [
             ("a.fbx", b"Kaydara"),
             ("a.ply", b"ply garbage"),
-            ("a.obj", b""),
             ("a.obj", b"v 0 0 0\nv 1 0 0\n"),
             ("a.obj", b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 9\n"),
             ("a.obj", b"v 0 0 0\nv 1 0 0\nv 1 nan 0\nf 1 2 3\n"),
-            ("a.glb", b"glTFxxxxxxxxxxxxxxxxxxxxx"),
-            ("a.gltf", b"{}"),
         ],
     )
     def test_not_a_mesh(self, tmp_path, name, content):

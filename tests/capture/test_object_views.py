@@ -124,7 +124,7 @@ class TestCommand:
         code = cli.main(["asset", *map(str, arguments)])
         return code, capsys.readouterr().err
 
-    def test_refused(self, tmp_path, capsys):
+    def test_refused(self, tmp_path, capsys, monkeypatch):
         views, opaque = tmp_path / "views", tmp_path / "opaque"
         folder(views, count=8)
         images, _ = sphere_views(4, alpha=False)
@@ -138,47 +138,42 @@ class TestCommand:
         (tmp_path / "lost.obj").write_text("mtllib lost.mtl\nusemtl A\n" + box)
         (tmp_path / "bare.mtl").write_text("newmtl A\nmap_Kd gone.png\n")
         (tmp_path / "bare.obj").write_text("mtllib bare.mtl\nusemtl A\n" + box)
-        out = tmp_path / "out.safetensors"
+        monkeypatch.chdir(tmp_path)
         before = set(tmp_path.iterdir())
-        for arguments, message in (
-            ((tmp_path / "none.glb", "-o", out), "none.glb: does not exist"),
-            ((tmp_path / "a.xyz", "-o", out), "a.xyz: unknown suffix; use .glb"),
-            ((tmp_path / "bad.glb", "-o", out), "bad.glb: not a binary glTF 2.0"),
-            ((tmp_path / "empty.obj", "-o", out), "empty.obj: contains no triangle"),
-            ((tmp_path / "flat.obj", "-o", out), "flat.obj: all its triangles are"),
-            ((tmp_path / "lost.obj", "-o", out), "missing file 'lost.mtl'"),
-            ((tmp_path / "bare.obj", "-o", out), "missing file 'gone.png'"),
-            ((tmp_path / "box.obj", "-o", out, "--size", 0), "--size: 0; at least 11"),
-            (("cube", "-o", out, "--edge-m", 1, "--size", 10), "--size: 10; at least"),
-            (
-                (tmp_path / "box.obj", "-o", out, "--skip-missing"),
-                "--skip-missing: is for folders",
-            ),
-            ((tmp_path / "box.obj", "-o", out, "--height-m", 0), "height_m: 0.0; must"),
-            ((tmp_path / "box.obj", "-o", out, "--longest-m=-1"), "longest_m: -1.0; "),
-            ((tmp_path / "box.obj", "-o", out, "--edge-m", 1), "--edge-m: is for the"),
-            (
-                (tmp_path / "box.obj", "-o", out, "--ambient", 2),
-                "ambient: 2.0; must be",
-            ),
-            ((tmp_path / "box.obj", "-o", out, "--views", 0), "n_views 0"),
-            ((tmp_path / "box.obj", "-o", tmp_path / "a.pt"), "end in .safetensors"),
-            (("cube", "-o", out), "--edge-m: is missing"),
-            (("cube", "-o", out, "--edge-m", 0), "edge_m: 0.0; must be positive"),
-            (("cube", "-o", out, "--edge-m", 1, "--up", "x"), "--up: is for meshes"),
-            (("./cube", "-o", out), "cube: does not exist"),
-            ((opaque, "-o", out), "opaque: its images have no alpha"),
-            ((tmp_path / "gone", "-o", out), "gone: does not exist"),
-            ((views, "-o", out, "--height-m=-3"), "height_m: -3.0; must be positive"),
-            ((views, "-o", out, "--edge-m", 1), "--edge-m: is for the cube, not for"),
-            ((views, "-o", out, "--views", 8), "--views: is for meshes and the cube"),
-            ((views, "-o", out, "--size", 99), "--size: is for meshes and the cube"),
-            ((views, "-o", out, "--ambient", 1), "--ambient: is for meshes and the"),
+        for words, message in (
+            ("none.glb", "none.glb: does not exist"),
+            ("a.xyz", "a.xyz: unknown suffix; use .glb"),
+            ("bad.glb", "bad.glb: not a binary glTF 2.0"),
+            ("empty.obj", "empty.obj: contains no triangle"),
+            ("flat.obj", "flat.obj: all its triangles are"),
+            ("lost.obj", "missing file 'lost.mtl'"),
+            ("bare.obj", "missing file 'gone.png'"),
+            ("box.obj --size 0", "--size: 0; at least 11"),
+            ("cube --edge-m 1 --size 10", "--size: 10; at least"),
+            ("box.obj --skip-missing", "--skip-missing: is for folders"),
+            ("box.obj --height-m 0", "height_m: 0.0; must"),
+            ("box.obj --longest-m=-1", "longest_m: -1.0; "),
+            ("box.obj --edge-m 1", "--edge-m: is for the"),
+            ("box.obj --ambient 2", "ambient: 2.0; must be"),
+            ("box.obj --views 0", "n_views 0"),
+            ("cube", "--edge-m: is missing"),
+            ("cube --edge-m 0", "edge_m: 0.0; must be positive"),
+            ("cube --edge-m 1 --up x", "--up: is for meshes"),
+            ("./cube", "cube: does not exist"),
+            ("opaque", "opaque: its images have no alpha"),
+            ("gone", "gone: does not exist"),
+            ("views --height-m=-3", "height_m: -3.0; must be positive"),
+            ("views --edge-m 1", "--edge-m: is for the cube, not for"),
+            ("views --views 8", "--views: is for meshes and the cube"),
+            ("views --size 99", "--size: is for meshes and the cube"),
+            ("views --ambient 1", "--ambient: is for meshes and the"),
+            ("box.obj -o a.pt", "end in .safetensors"),
         ):
-            code, error = self.call(capsys, *arguments)
+            output = () if "-o" in words else ("-o", "out.safetensors")
+            code, error = self.call(capsys, *words.split(), *output)
             assert code == 2, error
             assert message in error and error.count("\n") == 1, error
-            assert set(tmp_path.iterdir()) == before, arguments
+            assert set(tmp_path.iterdir()) == before, words
 
     def test_unfinished_fit_is_told_before_anything_is_read(self, tmp_path, capsys):
         (tmp_path / "a.checkpoint.safetensors").write_text("")

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from helpers.occupancy import build
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -283,18 +282,3 @@ def test_occupancy_fraction_and_shape() -> None:
     assert Occupancy.full(3).fraction == 1
     with pytest.raises(ValueError, match="occupancy: shape"):
         Occupancy(np.ones((2, 2), bool))
-
-
-def test_build_finds_the_cells_above_the_threshold() -> None:
-    field = small.speck((0.4, 0.4, 0.4))
-    built = build(field, 10, threshold=1e-3, dilate=0)
-    centres = (np.stack(np.indices(built.shape), -1).reshape(-1, 3) + 0.5) / 5 - 1
-    dense = small.eval_grid(field, centres)[0] >= 1e-3
-    assert built.cells.ravel()[dense].all()
-    assert 0 < built.fraction < 0.1
-    grown = build(field, 10, threshold=1e-3, dilate=1)
-    assert (grown.cells >= built.cells).all() and grown.fraction > built.fraction
-
-
-def test_build_of_an_empty_field_is_empty() -> None:
-    assert build(small.homogeneous(0.1), 4, threshold=1.0).fraction == 0

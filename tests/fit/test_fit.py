@@ -9,12 +9,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers.posed_folders import write_transforms
-from helpers.sphere_views import BOX, RADIUS, directions, sphere_views
+from helpers.sphere_views import (
+    BOX,
+    RADIUS,
+    TINY_GRID,
+    TINY_NGP,
+    directions,
+    sphere_views,
+)
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.capture.posed_images import held_out
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridField, GridLayout, NGPLayout
+from mi_nerfattack.fields import GridField
 from mi_nerfattack.fit import FitOptions, fit_grid, fit_ngp
 from mi_nerfattack.fit.scores import compare, evaluate
 from mi_nerfattack.fit.training import unpack
@@ -24,9 +31,6 @@ from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-TINY_GRID = GridLayout(4, 4, 16)
-TINY_NGP = NGPLayout(4, 2, 10, 4, 32, 16)
 
 
 def test_unpack_takes_packed_values_apart():
@@ -55,7 +59,7 @@ def test_psnr_of_a_constant_error():
     assert ssim < 1
 
 
-def grid_options(steps: int = 60) -> FitOptions:
+def grid_options(steps: int) -> FitOptions:
     return FitOptions(
         steps=steps,
         batch_rays=512,
@@ -68,22 +72,27 @@ def grid_options(steps: int = 60) -> FitOptions:
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A sphere fitted with depth; the kernels that were compiled after ten steps."""
+    """A sphere fitted with depth: its reports, kernels compiled by each, the result."""
     mi.set_variant("llvm_ad_rgb")
     images, depth = sphere_views(32)
-    reports = []
-    return (
-        images,
-        reports,
-        fit_grid(
-            images, *BOX, TINY_GRID, grid_options(150), depth, progress=reports.append
-        ),
-    )
+    reports, compiled = [], []
+
+    def progress(report):
+        history = dr.kernel_history([dr.KernelType.JIT])
+        compiled.append(sum(not entry["cache_hit"] for entry in history))
+        reports.append(report)
+
+    arguments = (*BOX, TINY_GRID, grid_options(150), depth)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        return reports, compiled, fit_grid(images, *arguments, progress=progress)
 
 
 def test_grid_learns_a_sphere(fitted):
-    images, reports, result = fitted
+    reports, compiled, result = fitted
     assert result.steps == 150
+    # at 25 steps the march, at 50 the first update of the occupancy
+    assert compiled[2:] == [0] * 4
     assert [score.index for score in result.per_view] == held_out(32).tolist()
     assert result.psnr_heldout_db > 24
     assert result.psnr_heldout_db == pytest.approx(
@@ -95,27 +104,12 @@ def test_grid_learns_a_sphere(fitted):
 
 
 def test_fitted_sphere_is_solid_and_where_it_was(fitted):
-    grid = fitted[2].field
+    grid = fitted[-1].field
     eye = 1.6 * directions(50).T
     rays = Rays(mi.Point3f(np.float32(eye)), mi.Vector3f(np.float32(-eye / 1.6)))
     result = march(PosedField(grid), rays)
     assert np.median(result.opacity.numpy()) > 0.95
     assert abs(np.median(result.depth.numpy()) - (1.6 - RADIUS)) < 0.05
-
-
-def test_nothing_is_compiled_after_the_first_steps():
-    images, depth = sphere_views(16)
-    compiled = []
-
-    def watch(progress):
-        history = dr.kernel_history([dr.KernelType.JIT])
-        compiled.append(sum(not entry["cache_hit"] for entry in history))
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        fit_grid(images, *BOX, TINY_GRID, grid_options(100), depth, progress=watch)
-    # at 25 steps the march, at 50 the first update of the occupancy
-    assert compiled[2:] == [0, 0]
 
 
 def test_ngp_learns_a_sphere_and_its_sky():
@@ -143,11 +137,20 @@ def test_grid_needs_alpha():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"steps": 0}, {"budget_minutes": 0.0}, {"learning_rate": 1.0}]
+    ("name", "value"),
+    [
+        ("steps", 0),
+        ("budget_minutes", 0.0),
+        ("learning_rate", 1.0),
+        ("epochs", 0.0),
+        ("patience", 0),
+        ("camera_rate", -1.0),
+        ("seed", -1),
+    ],
 )
-def test_options_out_of_range(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        FitOptions(**wrong)
+def test_options_out_of_range(name, value):
+    with pytest.raises(InputError, match=name):
+        FitOptions(**{name: value})
 
 
 @pytest.mark.slow

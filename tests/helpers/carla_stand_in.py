@@ -29,7 +29,6 @@ from helpers.carla_stand_in_data import (
     Vector3D,
     VehicleControl,
     VehiclePhysicsControl,
-    Waypoint,
     WeatherParameters,
     WheelPhysicsControl,
     WorldSettings,
@@ -368,29 +367,3 @@ class Sensor(Actor):
             ),
             Rotation(own.rotation.pitch, base.rotation.yaw + own.rotation.yaw),
         )
-
-
-#: Classes that must not differ from those of the same name in the client.
-MIMICS = (
-    Location,
-    Vector2D,
-    Rotation,
-    Transform,
-    VehicleControl,
-    WorldSettings,
-    WeatherParameters,
-    Client,
-    World,
-    WorldSnapshot,
-    ActorSnapshot,
-    BlueprintLibrary,
-    ActorBlueprint,
-    Actor,
-    Vehicle,
-    WheelPhysicsControl,
-    VehiclePhysicsControl,
-    Sensor,
-    Image,
-    Map,
-    Waypoint,
-)

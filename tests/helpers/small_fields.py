@@ -200,3 +200,15 @@ def half_occupied() -> tuple[GridField, mi.Point3f, mi.Vector3f]:
     )
     origin = mi.Point3f([0, 0, 3], [0, 0, 0], [1, -0.5, 1])
     return field, origin, mi.Vector3f([0, 0, 0], [0, 0, 0], [-1, -1, -1])
+
+
+def first_rays(scene: mi.Scene) -> mi.Ray3f:
+    """Return the rays that a scene's film traces with one sample a pixel and seed 0."""
+    (sensor,) = scene.sensors()
+    width, height = map(int, sensor.film().size())
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, width * height)
+    pixel = dr.arange(mi.UInt32, width * height)
+    corner = mi.Vector2f(pixel % width, pixel // width)
+    place = (corner + sampler.next_2d()) / mi.Vector2f(width, height)
+    return sensor.sample_ray(0, 0, place, mi.Point2f(0.5))[0]

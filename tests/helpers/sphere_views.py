@@ -8,12 +8,15 @@ import numpy as np
 from helpers.posed_folders import write_transforms
 
 from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.fields import GridLayout, NGPLayout
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
 
 SIZE = 24
 RADIUS = 0.4
 BOX = np.full(3, -0.5), np.full(3, 0.5)
+#: One of each kind for all fits: their kernels take seconds to compile.
+TINY_GRID, TINY_NGP = GridLayout(4, 4, 16), NGPLayout(4, 2, 10, 4, 32, 16)
 
 
 def directions(count: int) -> np.ndarray:

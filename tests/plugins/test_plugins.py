@@ -55,6 +55,13 @@ def load(text: str) -> Any:
     return mi.load_string(f'{head} version="3.0.0" {tail}', parallel=False)
 
 
+def nesting(plugin: str, inside: str) -> str:
+    """Write a field_integrator, or a cube with a field_emitter, as XML."""
+    if plugin == "field_integrator":
+        return f'<integrator type="{plugin}">{inside}</integrator>'
+    return f'<shape type="cube"><emitter type="{plugin}">{inside}</emitter></shape>'
+
+
 def points(rng: np.random.Generator, count: int = 50) -> tuple[np.ndarray, Any]:
     """Make positions in [-1.2, 1.2]^3, as an array and as interactions."""
     place = rng.uniform(-1.2, 1.2, (count, 3)).astype(np.float32)
@@ -76,8 +83,7 @@ def test_volumes_load_from_xml_and_dict(paths, kind: str) -> None:
 
 
 def test_emitter_loads_from_xml_and_dict(grid: Path) -> None:
-    text = f'<emitter type="field_emitter">{volume(grid)}</emitter>'
-    from_xml = load(f'<shape type="cube">{text}</shape>')
+    from_xml = load(nesting("field_emitter", volume(grid)))
     nested = {"type": "grid_field", "filename": str(grid)}
     emitter = {"type": "field_emitter", "object": nested}
     from_dict = mi.load_dict({"type": "cube", "emitter": emitter}, parallel=False)
@@ -88,7 +94,7 @@ def test_emitter_loads_from_xml_and_dict(grid: Path) -> None:
 def test_integrator_loads_from_xml_and_dict(paths) -> None:
     both = volume(paths["ngp_field"], "ngp_field", id="scene")
     both += volume(paths["grid_field"])
-    from_xml = load(f'<integrator type="field_integrator">{both}</integrator>')
+    from_xml = load(nesting("field_integrator", both))
     nested = [{"type": kind, "filename": str(paths[kind])} for kind in KINDS]
     from_dict = mi.load_dict(
         {"type": "field_integrator", "scene": nested[1], "object": nested[0]}
@@ -110,7 +116,7 @@ def test_relative_names_follow_mitsubas_file_resolver(grid: Path) -> None:
 def test_parameters_show_under_the_id_and_are_differentiable(paths) -> None:
     both = volume(paths["ngp_field"], "ngp_field", id="scene")
     both += volume(paths["grid_field"])
-    loaded = load(f'<integrator type="field_integrator">{both}</integrator>')
+    loaded = load(nesting("field_integrator", both))
     params = mi.traverse(loaded)
     names = ("table", "density_weights", "colour_weights", "sky")
     expected = {"object.texture", "object.density", *[f"scene.{n}" for n in names]}
@@ -122,67 +128,39 @@ def test_parameters_show_under_the_id_and_are_differentiable(paths) -> None:
 # Errors
 
 
-REFUSED = '<float name="foo" value="1"/>'
-
-
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        pytest.param(lambda p: volume(p, more=REFUSED), id="grid_field"),
-        pytest.param(
-            lambda p: (
-                f'<integrator type="field_integrator">{volume(p)}{REFUSED}</integrator>'
-            ),
-            id="field_integrator",
-        ),
-        pytest.param(
-            lambda p: (
-                '<shape type="cube"><emitter type="field_emitter">'
-                f"{volume(p)}{REFUSED}</emitter></shape>"
-            ),
-            id="field_emitter",
-        ),
-    ],
-)
-def test_unknown_parameters_are_named(grid: Path, wrap) -> None:
-    with pytest.raises(RuntimeError, match=r'(?s)1 unreferenced property.*"foo"'):
-        load(wrap(grid))
-
-
 def refuse(text: str, message: str) -> None:
     """Check that an XML string is refused with a message."""
     with pytest.raises(Exception, match=message):
         load(text)
 
 
+def test_unknown_parameters_are_named(grid: Path) -> None:
+    more, message = '<float name="foo" value="1"/>', '(?s)1 unreferenced pro.*"foo"'
+    refuse(volume(grid, more=more), message)
+    for plugin in ("field_integrator", "field_emitter"):
+        refuse(nesting(plugin, volume(grid) + more), message)
+
+
+UNEVEN = "fields take rotation, translation and uniform scale"
+
+
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("transform", "message"),
     [
-        (
-            '<string name="quantity" value="colour"/>',
-            "quantity: 'colour'; allowed: density, radiance",
-        ),
-        (
-            '<transform name="to_world"><scale x="2"/></transform>',
-            "to_world: .*fields take rotation, translation and uniform scale",
-        ),
-        (
-            '<transform name="to_world"><scale x="-1"/></transform>',
-            "to_world: .*fields take rotation, translation and uniform scale",
-        ),
-        (
-            '<transform name="to_world"><matrix value="1 .5 0 0 0 1 0 0 0 0 1 0 '
-            '0 0 0 1"/></transform>',
-            "to_world: .*fields take rotation, translation and uniform scale",
-        ),
-        (
-            '<transform name="to_world"><scale value="0"/></transform>',
-            "to_world: .*is singular",
-        ),
+        ('<scale x="2"/>', UNEVEN),
+        ('<scale x="-1"/>', UNEVEN),
+        ('<matrix value="1 .5 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>', UNEVEN),
+        ('<scale value="0"/>', "is singular"),
     ],
 )
-def test_volumes_refuse_properties(grid: Path, more: str, message: str) -> None:
-    refuse(volume(grid, more=more), message)
+def test_volumes_refuse_transforms(grid: Path, transform: str, message: str) -> None:
+    more = f'<transform name="to_world">{transform}</transform>'
+    refuse(volume(grid, more=more), f"to_world: .*{message}")
+
+
+def test_volumes_refuse_quantities(grid: Path) -> None:
+    more = '<string name="quantity" value="colour"/>'
+    refuse(volume(grid, more=more), "quantity: 'colour'; allowed: density, radiance")
 
 
 def test_volumes_refuse_files(paths, tmp_path: Path) -> None:
@@ -206,21 +184,14 @@ def test_volumes_refuse_files(paths, tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("plugin", ["field_emitter", "field_integrator"])
 def test_nesting_plugins_refuse(grid: Path, plugin: str, inside: str, message) -> None:
-    nested = inside + (volume(grid) if inside else "")
-    if plugin == "field_emitter":
-        text = f'<shape type="cube"><emitter type="{plugin}">{nested}</emitter></shape>'
-    else:
-        text = f'<integrator type="{plugin}">{nested}</integrator>'
-    refuse(text, message)
+    refuse(nesting(plugin, inside + (volume(grid) if inside else "")), message)
 
 
 def test_integrator_takes_one_sampling_integrator(grid: Path) -> None:
-    start = f'<integrator type="field_integrator">{volume(grid)}'
     one = '<integrator type="path"/>'
-    assert load(f"{start}{one}</integrator>").behind is not None
-    refuse(
-        f"{start}{one}{one}</integrator>", "and one sampling integrator such as path"
-    )
+    assert load(nesting("field_integrator", volume(grid) + one)).behind is not None
+    two = nesting("field_integrator", volume(grid) + 2 * one)
+    refuse(two, "and one sampling integrator such as path")
 
 
 # Values

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,14 @@ from helpers.camera_scenes import (
     sensor,
     world,
 )
+from helpers.variants import RGB, SPECTRAL
 
 from mi_nerfattack.fields import save_field
 
-
-@pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_spectral"])
-def each_variant(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = mi.variant()
-    mi.set_variant(request.param)
-    yield request.param
-    if before is not None and before != request.param:
-        mi.set_variant(before)
+IN_COLOUR = pytest.mark.parametrize("each_variant", [*RGB, *SPECTRAL], indirect=True)
 
 
+@IN_COLOUR
 @pytest.mark.parametrize(
     ("kind", "more"),
     [
@@ -55,6 +49,7 @@ def test_image_of_the_stock_sensor(each_variant: str, kind: str, more: Any) -> N
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-4)
 
 
+@IN_COLOUR
 @pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
 def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
     ours, theirs = (load(sensor(d, **more)) for d in (PINHOLE, STOCK))
@@ -65,6 +60,7 @@ def test_rays_of_the_stock_sensor(each_variant: str, more: Any) -> None:
     np.testing.assert_allclose(np.array(weight_a), np.array(weight_b), rtol=1e-6)
 
 
+@IN_COLOUR
 @pytest.mark.parametrize("more", [{}, CROP], ids=["full", "crop"])
 def test_directions_of_the_stock_sensor(each_variant: str, more: Any) -> None:
     # Centred: the stock sensor leaves out a strip where the principal point is not.

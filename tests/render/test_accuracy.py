@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -143,16 +142,13 @@ def test_overlapping_boxes_by_depth_are_a4_to_a6() -> None:
 # Through Mitsuba
 
 
-WIDTH, HEIGHT = 40, 30
-
-
 def sensor(fov: float) -> dict[str, Any]:
     """Describe a camera at x = 3 that looks at the origin."""
     eye = mi.ScalarTransform4f().look_at([3.0, 0.4, 0.3], [0, 0, 0], [0, 0, 1])
     film = {
         "type": "hdrfilm",
-        "width": WIDTH,
-        "height": HEIGHT,
+        "width": 40,
+        "height": 30,
         "pixel_format": "rgb",
         "component_format": "float32",
         "rfilter": {"type": "box"},
@@ -202,7 +198,7 @@ def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
         parallel=False,
     )
     image = np.array(mi.render(scene, spp=1, seed=0)).reshape(-1, 10)
-    ray = camera_rays(scene)
+    ray = small.first_rays(scene)
     o, d = ray.o.numpy().T.astype(float), ray.d.numpy().T.astype(float)
     t_wall = (x - o[:, 0]) / d[:, 0]
     y, z = (o + t_wall[:, None] * d)[:, 1:].T
@@ -220,16 +216,6 @@ def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
     assert hit.any() and not hit.all()
     assert np.all(image[~hit, 4] == np.inf)
     np.testing.assert_allclose(image[hit, 4], moment[hit] / opacity[hit], rtol=1e-3)
-
-
-def camera_rays(scene: mi.Scene) -> mi.Ray3f:
-    """Return the rays that are traced with one sample and seed 0."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, WIDTH * HEIGHT)
-    pixel = dr.arange(mi.UInt32, WIDTH * HEIGHT)
-    corner = mi.Vector2f(pixel % WIDTH, pixel // WIDTH)
-    place = (corner + sampler.next_2d()) / mi.Vector2f(WIDTH, HEIGHT)
-    return scene.sensors()[0].sample_ray(0, 0, place, mi.Point2f(0.5))[0]
 
 
 # What lies beyond the box
@@ -274,7 +260,7 @@ def test_rays_that_leave_the_box_see_the_sky(tmp_path: Path, angle: float) -> No
         parallel=False,
     )
     image = np.array(mi.render(scene, spp=1, seed=0)).reshape(-1, 10)
-    d = camera_rays(scene).d.numpy().T.astype(float)
+    d = small.first_rays(scene).d.numpy().T.astype(float)
     local = d @ np.array(turn.matrix)[:3, :3]  # the transpose: into the field's frame
     sky = sky_colour(raw, local)
     # Channels 5 to 7 are the field alone, premultiplied.

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from helpers.occupancy import build
+from helpers.kernels import nothing_compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -240,7 +240,9 @@ def test_skipping_empty_cells_changes_nothing(rng, cone: float, jitter: float) -
     o, d = speck_rays(rng, pose)
     full = march(*small.arguments(PosedField(field, pose), o, d, jitter=jitter), stop=0)
     assert (full.opacity.numpy() > 0.1).mean() > 0.1
-    field.occupancy = build(field, 30, threshold=1e-9)
+    # Density fades out within a vertex, 2 / 15, of the speck, and cells reach 1 / 30.
+    centres = (np.stack(np.indices((30, 30, 30)), -1) + 0.5) / 15 - 1
+    field.occupancy = Occupancy((np.abs(centres - 0.4) < 0.37).all(-1))
     assert field.occupancy.fraction < 0.1
     skipped = march(
         *small.arguments(PosedField(field, pose), o, d, jitter=jitter), stop=0
@@ -281,12 +283,9 @@ def test_other_poses_and_textures_compile_nothing(rng: np.random.Generator) -> N
         dr.eval(march(*small.arguments(posed, o, d)))
 
     look(0, 0, 1)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
+    with nothing_compiled():
         look(0.2, 0.3, 1.5)
         look(-0.7, 1.0, 0.9)
-        kernels = dr.kernel_history([dr.KernelType.JIT])
-    assert kernels and all(kernel["cache_hit"] for kernel in kernels)
 
 
 def test_the_sky_turns_with_its_field() -> None:

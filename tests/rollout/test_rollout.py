@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers.derivatives import central_difference
+from helpers.kernels import nothing_compiled
 from helpers.rollouts import (
     ADJOINTS,
     INITIAL,
@@ -160,13 +161,9 @@ def test_adjoints_agree_and_compile_nothing_after_the_first_steps(toy):
     found = {}
     for adjoint in ADJOINTS:
         gradient(make_rollout(toy, loop, 4, adjoint=adjoint))
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
+        with nothing_compiled():
             rollout = make_rollout(toy, loop, 4, adjoint=adjoint)
             found[adjoint] = texture_gradient(rollout, INITIAL + 0.07)
-            history = dr.kernel_history((dr.KernelType.JIT,))
-        assert history
-        assert all(entry["cache_hit"] for entry in history)
     for name in ("kept", "checkpointed"):
         error = np.linalg.norm(found[name] - found["replay"])
         assert error <= 1e-6 * np.linalg.norm(found["replay"])

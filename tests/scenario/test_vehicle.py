@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.scenario_text import HEAD, write_named_files
-from helpers.states import rows64, state64
+from helpers.states import row64, state64
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
@@ -97,9 +97,9 @@ def test_models_of_the_section():
 def test_function_of_a_file(folder, name, framework):
     dynamics = custom(folder, f"car.py:{name}", framework)
     np.testing.assert_array_equal(dynamics.extend(np.zeros(3)), [[0, 0, 0, 5]])
-    slope = dynamics.derivative(state64([[0], [0], [0], [6]]), rows64([[0.5]])[0])
+    slope = dynamics.derivative(state64([[0], [0], [0], [6]]), row64([0.5]))
     np.testing.assert_allclose(slope.numpy()[:, 0], [6, 0, 0.5, 2])
-    assert float(dynamics.saturate(rows64([[100.0]])[0])[0]) == pytest.approx(1.5)
+    assert float(dynamics.saturate(row64([100.0]))[0]) == pytest.approx(1.5)
 
 
 def test_function_without_the_word_of_trust(folder):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import analytic_loop as analytic
-from helpers.states import rows64, state64
+from helpers.states import row64, state64
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
@@ -53,18 +53,18 @@ def test_own_model_equals_ours(framework, count, integrator):
     u, t_u = rng.normal(size=(2, count)) * 0.4
 
     def products(dynamics):
-        start, control = state64(x), rows64([u])[0]
+        start, control = state64(x), row64(u)
         dr.enable_grad(start, control)
         end = integrator.step(dynamics, start, dynamics.saturate(control), 0.1)
         integrator.check(dynamics, start, end, dynamics.saturate(control), 0.1)
         value = end.numpy().copy()
         dr.backward(dr.sum(dr.sum(end * state64(weight), axis=0)))
         reverse = dr.grad(start).numpy().copy(), dr.grad(control).numpy().copy()
-        start, control = state64(x), rows64([u])[0]
+        start, control = state64(x), row64(u)
         dr.enable_grad(start, control)
         end = integrator.step(dynamics, start, dynamics.saturate(control), 0.1)
         dr.set_grad(start, state64(t_x))
-        dr.set_grad(control, rows64([t_u])[0])
+        dr.set_grad(control, row64(t_u))
         return [value, *reverse, dr.forward_to(end).numpy().copy()]
 
     for found, expected in zip(products(own), products(LAG), strict=True):
@@ -111,7 +111,7 @@ def test_single_precision_in_torch():
 
 def test_numbers_and_single_rows_are_taken():
     own = FunctionDynamics(lambda x, u: (1.5, dr.cos(x[2]), u))
-    found = own.derivative(state64(np.zeros((3, 4))), rows64([[1, 2, 3, 4]])[0])
+    found = own.derivative(state64(np.zeros((3, 4))), row64([1, 2, 3, 4]))
     np.testing.assert_array_equal(found.numpy(), [[1.5] * 4, [1.0] * 4, [1, 2, 3, 4]])
 
 
@@ -143,7 +143,7 @@ def test_own_models_reject_parameters(kind, arguments, words):
 
 def call(own):
     """Evaluate at three vehicles, differentiating by the control."""
-    x, u = state64(np.ones((own.state_size, 3))), rows64([[0.1, 0.2, 0.3]])[0]
+    x, u = state64(np.ones((own.state_size, 3))), row64([0.1, 0.2, 0.3])
     dr.enable_grad(u)
     dr.backward(dr.sum(dr.sum(own.derivative(x, u), axis=0)))
 
@@ -157,7 +157,7 @@ def call(own):
         (lambda x, u: [x[0], u], "returned 2 rows; 3 rows"),
         (lambda x, u: np.zeros((3, 3)), r"returned ndarray of shape \(3, 3\)"),
         (lambda x, u: ("a", u, u), r"rows \(str, Float64, Float64\)"),
-        (lambda x, u: (u, u, rows64([[1, 2]])[0]), r"rows of \[3, 3, 2\] entries"),
+        (lambda x, u: (u, u, row64([1, 2])), r"rows of \[3, 3, 2\] entries"),
         (lambda x, u: (x[0], x[1], dr.detach(u)), "no derivative by the control"),
         (lambda x, u: x[7], r"raised \w+ in line \d+"),
     ],
@@ -188,7 +188,7 @@ def test_what_a_torch_function_must_not_return(returned, words):
 
 def test_states_that_are_not_finite_are_reported():
     own = FunctionDynamics(lambda x, u: (x[0], x[1], u / (x[2] - 1)))
-    x, u = state64([[0.0, 0.0], [0.0, 0.0], [2.0, 1.0]]), rows64([[1.0, 1.0]])[0]
+    x, u = state64([[0.0, 0.0], [0.0, 0.0], [2.0, 1.0]]), row64([1.0, 1.0])
     end = RK4().step(own, x, u, 0.1)
     with pytest.raises(InputError, match=r"gave .*inf.* for vehicle 1"):
         RK4().check(own, x, end, u, 0.1)
@@ -198,4 +198,4 @@ def test_states_that_are_not_finite_are_reported():
 def test_trial_does_not_mind_kinks():
     own = FunctionDynamics(lambda x, u: (dr.abs(x[0]), dr.maximum(x[1], 0), u))
     start = state64([[0.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
-    require_model("own", own, start, rows64([[0.1, 0.2]])[0])
+    require_model("own", own, start, row64([0.1, 0.2]))

@@ -16,7 +16,15 @@ def parameters(function) -> list[str]:
     return re.findall(r"\(\w+\)(\w+)", signature)[1:]
 
 
-@pytest.mark.parametrize("mimic", stand_in.MIMICS, ids=lambda item: item.__name__)
+MIMICS = [
+    item
+    for item in vars(stand_in).values()
+    if inspect.isclass(item) and item.__module__.startswith("helpers.carla_stand_in")
+    if item is not stand_in.Server
+]
+
+
+@pytest.mark.parametrize("mimic", MIMICS, ids=lambda item: item.__name__)
 def test_the_stand_in_has_nothing_that_the_client_has_not(carla, mimic):
     real = getattr(carla, mimic.__name__)
     names = set(vars(mimic))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -211,7 +214,7 @@ def test_moved_rays_are_those_of_the_corrected_poses(rng):
     corrections = CameraCorrections(COUNT, (POSES,))
     corrections.values = {POSES: mi.Float(value)}
     poses = corrections.poses(images.camera_to_world)
-    moved = PosedImages(images.images, poses, images.camera, images.names)
+    moved = replace(images, camera_to_world=poses)
     index = mi.UInt32(rng.integers(COUNT * 24 * 24, size=50).tolist())
     found = RayBank(images, np.arange(COUNT), corrections=corrections).batch(index)
     expected = RayBank(moved, np.arange(COUNT)).batch(index)
@@ -223,13 +226,7 @@ def test_moved_rays_are_those_of_the_corrected_poses(rng):
 def test_intrinsics_of_single_images_make_their_rays():
     images, _ = sphere_views(2)
     wide = from_fov(24, 24, 80.0)
-    own = PosedImages(
-        images.images,
-        images.camera_to_world,
-        images.camera,
-        images.names,
-        cameras=(images.camera, wide),
-    )
+    own = replace(images, cameras=(images.camera, wide))
     bank = RayBank(own, np.arange(2))
     corner = bank.batch(mi.UInt32([0, 24 * 24])).direction.numpy().T
     axes = images.camera_to_world[:, :3, 2]
@@ -270,17 +267,11 @@ def test_cells_at_the_rim_of_a_distorted_image_are_seen():
     )
     low, high = np.full(3, -10.0), np.full(3, 10.0)
     seen = seen_cells(images, np.array([0]), low, high, (200, 200, 200))
-    corner = world_rays_of(lens)[0, 0]  # right and down of the axis, at distance 1
-    x, y = 9 * corner
+    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+    first = np.array([[[0.5, 0.5]]])  # pixel
+    corner = cv2.undistortPoints(first, matrix, np.array(lens.distortion))[0, 0]
+    x, y = 9 * corner  # right and down of the axis
     assert seen[int(10 * 19), int(10 * (10 - x)), int(10 * (10 - y))]
-
-
-def world_rays_of(camera: Camera) -> np.ndarray:
-    """Undistorted image plane positions of the first pixel, by OpenCV."""
-    cv2 = pytest.importorskip("cv2")
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    pixel = np.array([[[0.5, 0.5]]])
-    return cv2.undistortPoints(pixel, matrix, np.array(camera.distortion))
 
 
 def test_running_occupancy_finds_the_dense_half():

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import torch
+from helpers.states import state64
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -72,13 +73,9 @@ def reference(points, closed, x, y, theta, within=1e-6):
     return measured, max(apart) <= 1e-9
 
 
-def drjit_state(states):
-    return dr.llvm.ad.Array3f64(np.asarray(states, np.float64).T.copy())
-
-
 def all_three(route, states):
     """Return the measures of each implementation, (3 implementations, 3, n)."""
-    by_drjit = [item.numpy() for item in route.project(drjit_state(states))]
+    by_drjit = [item.numpy() for item in route.project(state64(np.transpose(states)))]
     by_torch = TorchRoute(route).project(torch.tensor(states, dtype=torch.float64))
     by_torch = [item.numpy() for item in by_torch]
     return np.array([list(route.project_numpy(states)), by_drjit, by_torch])
@@ -215,7 +212,7 @@ def regular_states(route, count=60):
 
 
 def gradient_drjit(route, name, states):
-    state = drjit_state(states)
+    state = state64(states.T)
     dr.enable_grad(state)
     dr.backward(dr.sum(getattr(route, name)(state)))
     return dr.grad(state).numpy().T
@@ -254,12 +251,12 @@ def test_dot_product_identity(name):
     v, w = rng.normal(size=states.shape), rng.normal(size=len(states))
 
     def start():
-        state = drjit_state(states)
+        state = state64(states.T)
         dr.enable_grad(state)
         return state, getattr(route, name)(state)
 
     state, value = start()
-    dr.set_grad(state, drjit_state(v))
+    dr.set_grad(state, state64(v.T))
     ahead = w @ dr.forward_to(value).numpy()
     state, value = start()
     dr.set_grad(value, type(value)(w))

@@ -7,30 +7,19 @@ import json
 import drjit as dr
 import numpy as np
 import pytest
+from helpers.states import row64, state64
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle import (
-    RK4,
     Dubins,
     ExplicitEuler,
-    ImplicitMidpoint,
     Route,
     load_routes,
     smooth_absolute,
 )
 from mi_nerfattack.vehicle.expert import LaneFollower
 
-INTEGRATORS = [ExplicitEuler(), RK4(), ImplicitMidpoint()]
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def array64(values):
-    """Upload (3, n) as a differentiable float64 state."""
-    return dr.llvm.ad.Array3f64(np.asarray(values, np.float64))
-
-
-def row64(values):
-    return dr.llvm.ad.Float64(np.asarray(values, np.float64))
 
 
 def lane(lead=15.0, radius=6.0, turn=np.pi / 2, tail=15.0, step=0.5):
@@ -61,18 +50,14 @@ def test_pose_at_inverts_projection():
 
 
 def test_one_kernel_for_every_route_and_state():
-    def launches():
-        history = dr.kernel_history([dr.KernelType.JIT])
-        return [(entry["hash"], entry["cache_hit"]) for entry in history]
-
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for route, x in [(STRAIGHT, 1.0), (lane(), 7.0), (lane(turn=-1.0), 3.0)]:
             state = dr.llvm.ad.Array3f(x, 0.5, 0.1)
             dr.make_opaque(state)
             dr.eval(route.cross_track(state))
-        hashes = {entry[0] for entry in launches()}
-    assert len(hashes) == 1
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len({entry["hash"] for entry in history}) == 1
 
 
 def test_smooth_absolute():
@@ -128,29 +113,20 @@ def test_route_file_errors(tmp_path, changes, message):
     assert "routes.json" in str(error.value)
 
 
-def drive(route, integrator, start, steps):
-    """Follow the route at 5 m/s with 0.1 s steps; return errors (steps, n)."""
-    euler = isinstance(integrator, ExplicitEuler)
-    expert = LaneFollower(route, 5.0, heading_preview_m=0.25 if euler else 0.0)
-    states, errors = np.atleast_2d(start), []
-    for _ in range(steps):
+@pytest.mark.parametrize("turn", [np.pi / 2, -np.pi / 2, 1e-9])
+def test_a_previewed_heading_follows_and_recovers_by_euler_steps(turn):
+    """At 5 m/s with 0.1 s steps, from the lane and from beside it."""
+    route = lane(turn=turn)
+    expert = LaneFollower(route, 5.0, heading_preview_m=0.25)
+    lateral, heading = np.meshgrid([-1.5, -0.5, 1.5], [-0.4, 0.0, 0.4])
+    beside = route.pose_at(0.0, lateral.ravel(), heading.ravel())
+    states, errors = np.vstack([route.pose_at(0.0), beside]), []
+    for _ in range(70):
         control = row64(expert.control(states))
         assert np.abs(control.numpy()).max() <= 1.5
-        state = integrator.step(Dubins(5.0), array64(states.T), control, 0.1)
+        state = ExplicitEuler().step(Dubins(5.0), state64(states.T), control, 0.1)
         states = state.numpy().T
-        errors.append(route.cross_track_numpy(states))
-    return np.abs(errors)
-
-
-@pytest.mark.parametrize(
-    ("integrator", "turn"),
-    list(zip(INTEGRATORS, [np.pi / 2, -np.pi / 2, 1e-9], strict=True)),
-)
-def test_expert_follows_and_recovers(integrator, turn):
-    route = lane(turn=turn)
-    assert drive(route, integrator, route.pose_at(0.0), 70).mean() < 0.03
-    lateral, heading = np.meshgrid([-1.5, -0.5, 1.5], [-0.4, 0.0, 0.4])
-    start = route.pose_at(0.0, lateral.ravel(), heading.ravel())
-    errors = drive(route, integrator, start, 70)
-    assert errors[28:].max() < 0.1
-    assert errors[-5:].max() < 0.05
+        errors.append(np.abs(route.cross_track_numpy(states)))
+    errors = np.array(errors)
+    assert errors[:, 0].mean() < 0.03
+    assert errors[28:].max() < 0.1 and errors[-5:].max() < 0.05
