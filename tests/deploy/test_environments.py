@@ -271,7 +271,7 @@ def test_conditions_and_place_are_checked(tmp_path):
         (Conditions(), {"sky": "night"}, "sky: 'night'; one of day, morning"),
         (place, {"period": 0}, "place.period: 0; must be .* above 0, seconds"),
         (place.camera, {"width": 0}, "camera.width: 0; must be positive"),
-        (CAR, {"max_steer": 2}, "car.max_steer: 2 rad; below pi / 2"),
+        (CAR, {"max_steer": 2}, r"car.max_steer: 2; .* in \(0, 1.57.*, radians"),
         (CAR, {"control_unit": "deg"}, "car.control_unit: 'deg'"),
         (CAR, {"control_unit": "rad"}, "max_control: 1.5 rad; .* max_steer, 0.75"),
     ):
