@@ -164,12 +164,11 @@ class Evaluate:
         )
 
     def _routes(self, path: Path) -> tuple[Route, ...]:
-        from mi_nerfattack.vehicle.route.route import Route, load_routes
+        from mi_nerfattack.vehicle.route.route import load_routes
 
-        if not self.routes:
-            return tuple(load_routes(path))
-        _check_different("--routes", self.routes)
-        return tuple(Route.from_file(path, name) for name in self.routes)
+        if self.routes:
+            _check_different("--routes", self.routes)
+        return tuple(load_routes(path, self.routes))
 
     def _environments(self) -> tuple[EnvironmentUnder, ...]:
         from mi_nerfattack.deploy.registry import ENVIRONMENTS

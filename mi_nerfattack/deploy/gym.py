@@ -202,10 +202,7 @@ def make_gym(
     place = bundled_place(place) if isinstance(place, str) else place
     if size_px is not None:
         place = replace(place, camera=place.camera.resized(*size_px))
-    if routes:
-        found = [Route.from_file(place.routes, route) for route in routes]
-    else:
-        found = load_routes(place.routes)
+    found = load_routes(place.routes, routes)
     environment = make_environment(name, place, conditions)
     more.setdefault("width", place.car.width)
     try:

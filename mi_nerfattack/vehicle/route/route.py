@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -285,9 +286,9 @@ def smooth_absolute(error: Any, width: float = 0.05) -> Any:
     return dr.sqrt(dr.square(error) + width**2) - width
 
 
-def load_routes(path: str | Path) -> list[Route]:
-    """Read all routes of a file, in its order; raises as `Route.from_file`."""
-    return [Route.from_file(path, name) for name in _read_table(path)]
+def load_routes(path: str | Path, names: Sequence[str] = ()) -> list[Route]:
+    """Read routes of a file, all without names; raises as `Route.from_file`."""
+    return [Route.from_file(path, name) for name in names or _read_table(path)]
 
 
 def _read_table(path: str | Path) -> dict[str, Any]:
