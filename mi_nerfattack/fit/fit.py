@@ -117,10 +117,9 @@ def fit_grid(
         layout: None for 16 levels from 16 to 64.
         options: None for the defaults.
         depth: (n, height, width), metres along the ray, infinite beside the object.
-        progress: called every 25 steps and at the end.
-        checkpoint: file that keeps the state of the fit, for `resume`; it is the
-            caller's to delete once the field is saved.
-        resume: continue from `checkpoint`.
+        progress: as of `fit_ngp`, and so are `checkpoint` and `resume`.
+        checkpoint: likewise.
+        resume: likewise.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -155,9 +154,9 @@ def fit_object(
         views: with the object's box, which the field's header keeps.
         resolution: of the finest level.
         options: of the fit.
-        progress: called every 25 steps and at the end.
-        checkpoint: see `fit_grid`.
-        resume: continue from `checkpoint`.
+        progress: as of `fit_ngp`, and so are `checkpoint` and `resume`.
+        checkpoint: likewise.
+        resume: likewise.
     """
     # room for the outermost vertices' own cells
     room = 2.0 / resolution * float((views.upper - views.lower).max())

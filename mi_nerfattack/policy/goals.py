@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Count, checked
 
 
 class AbstractGoal(ABC):
@@ -27,15 +29,16 @@ class AbstractGoal(ABC):
         """
 
 
+@dataclass(frozen=True)
+@checked("goals")
 class IntegerGoal(AbstractGoal):
     """Pass the goals themselves, (n,) int64.
 
     Args:
-        count: number of goals, at least 1.
+        count: number of goals.
     """
 
-    def __init__(self, count: int) -> None:
-        self.count = _checked(count)
+    count: Count
 
     def arguments(
         self, goals: torch.Tensor, like: torch.Tensor
@@ -45,15 +48,16 @@ class IntegerGoal(AbstractGoal):
         return (_in_range(goals, self.count),)
 
 
+@dataclass(frozen=True)
+@checked("goals")
 class OneHotGoal(AbstractGoal):
     """Pass rows (n, count) that are one at the goal and zero elsewhere.
 
     Args:
-        count: number of goals, at least 1.
+        count: number of goals.
     """
 
-    def __init__(self, count: int) -> None:
-        self.count = _checked(count)
+    count: Count
 
     def arguments(
         self, goals: torch.Tensor, like: torch.Tensor
@@ -72,12 +76,6 @@ class NoGoal(AbstractGoal):
         """Drop the goals."""
         del goals, like
         return ()
-
-
-def _checked(count: int) -> int:
-    if type(count) is not int or count < 1:
-        raise InputError(f"goals: {count!r}; an integer of at least 1")
-    return count
 
 
 def _in_range(goals: torch.Tensor, count: int) -> torch.Tensor:

@@ -342,15 +342,7 @@ def sort_by_depth(layers: list[March]) -> list[March]:
         for i in range(end):
             swap = depths[i + 1] < depths[i]
             a, b = ordered[i], ordered[i + 1]
-            ordered[i], ordered[i + 1] = _select(swap, b, a), _select(swap, a, b)
+            ordered[i], ordered[i + 1] = dr.select(swap, b, a), dr.select(swap, a, b)
             da, db = depths[i], depths[i + 1]
             depths[i], depths[i + 1] = dr.minimum(da, db), dr.maximum(da, db)
     return ordered
-
-
-def _select(mask: mi.Bool, a: March, b: March) -> March:
-    return March(
-        dr.select(mask, a.radiance, b.radiance),
-        dr.select(mask, a.opacity, b.opacity),
-        dr.select(mask, a.moment, b.moment),
-    )

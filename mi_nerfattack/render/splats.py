@@ -189,7 +189,7 @@ class SplatBackground(AbstractBackdrop):
             passed = entry + 1.5e-7 * (1e-7 + size)  # a step of single precision
             index = tier.first + shell.prim_index
             fresh = hit & ~far
-            found = _choose(fresh, self._meet(index, rays, fresh), found)
+            found = dr.select(fresh, self._meet(index, rays, fresh), found)
             end = dr.select(far, entry - 0.5 * tier.near, passed)
             end = dr.select(hit, end, dr.inf)
             result.append(dr.select(chosen, end, start))
@@ -238,14 +238,6 @@ def _nearest(distances: list[mi.Float]) -> mi.Float:
     return nearest
 
 
-def _choose(mask: mi.Bool, a: _Hit, b: _Hit) -> _Hit:
-    return _Hit(
-        dr.select(mask, a.peak, b.peak),
-        dr.select(mask, a.opacity, b.opacity),
-        dr.select(mask, a.index, b.index),
-    )
-
-
 def _insert(waiting: list[_Hit], new: _Hit) -> list[_Hit]:
     """Put a hit among those sorted by peak, of which the last is free.
 
@@ -254,19 +246,19 @@ def _insert(waiting: list[_Hit], new: _Hit) -> list[_Hit]:
     again = mi.Bool(False)
     for hit in waiting:
         again |= (hit.peak < dr.inf) & (hit.index == new.index)
-    new = _choose(again, _Hit(), new)
+    new = dr.select(again, _Hit(), new)
     result = []
     for hit in waiting:
         sooner = new.peak < hit.peak
-        result.append(_choose(sooner, new, hit))
-        new = _choose(sooner, hit, new)
+        result.append(dr.select(sooner, new, hit))
+        new = dr.select(sooner, hit, new)
     return result
 
 
 def _shift(waiting: list[_Hit], gone: mi.Bool) -> list[_Hit]:
     """Remove the first hit of the rays of a mask."""
     following = [*waiting[1:], _Hit()]
-    return [_choose(gone, b, a) for a, b in zip(waiting, following, strict=True)]
+    return [dr.select(gone, b, a) for a, b in zip(waiting, following, strict=True)]
 
 
 def _group(splats: Splats) -> tuple[np.ndarray, list[slice]]:

@@ -6,26 +6,34 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import numpy as np
+from pydantic import Field
 
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.ranges import Positive, checked
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics, soft_limit
 
 
 @dataclass(frozen=True)
+@checked("{self.__class__.__name__}")
 class AbstractUserDynamics(AbstractDynamics):
     """Vehicle model given as a function, with what describes its state and control."""
 
     function: Callable[[Any, Any], Any]
-    size: int = 3
-    limit: float = 1.0
+    size: Annotated[int, Field(ge=3)] = 3
+    limit: Positive = 1.0
     rest: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        require_model(type(self).__name__, self.size, self.limit, self.rest)
+        more = self.size - 3
+        if len(self.rest) not in (0, more) or not np.isfinite(self.rest).all():
+            raise InputError(
+                f"{type(self).__name__}.rest: {self.rest!r}; {more} finite numbers are "
+                f"needed, one for each row after theta of a state of {self.size}"
+            )
 
     @property
     def name(self) -> str:
@@ -113,19 +121,6 @@ class FunctionDynamics(AbstractUserDynamics):
         return (
             f"{self.name}: returned {found}; {self.size} rows are needed, one number "
             "for each vehicle"
-        )
-
-
-def require_model(owner: str, size: int, limit: float, rest: tuple[float, ...]) -> None:
-    """Check what describes a model of the user's own; raise `InputError` if wrong."""
-    if size < 3:
-        raise InputError(f"{owner}.size: {size!r}; at least 3 rows: px, py, theta")
-    if not 0 < limit < float("inf"):
-        raise InputError(f"{owner}.limit: {limit!r} is not a positive number")
-    if len(rest) not in (0, size - 3) or not np.isfinite(rest).all():
-        raise InputError(
-            f"{owner}.rest: {rest!r}; {size - 3} finite numbers are needed, one for "
-            f"each row after theta of a state of {size}"
         )
 
 

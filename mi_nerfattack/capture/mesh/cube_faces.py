@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -83,7 +84,7 @@ def render_faces(field: GridField, pixels_per_m: float | None = None) -> CubeFac
         )
     posed = PosedField(field)
     images = {
-        name: _render(posed, field, lower, upper, scale, *map(np.array, axes))
+        name: _render(posed, lower, upper, scale, axes)
         for name, axes in CUBE_FACES.items()
     }
     return CubeFaces(lower, upper, scale, images)
@@ -117,21 +118,17 @@ def write_faces(folder: str | Path, faces: CubeFaces) -> None:
 
 
 def _render(
-    posed: PosedField,
-    field: GridField,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    scale: float,
-    normal: np.ndarray,
-    right: np.ndarray,
-    up: np.ndarray,
+    posed: PosedField, lower: np.ndarray, upper: np.ndarray, scale: float, axes: Any
 ) -> np.ndarray:
+    normal, right, up = map(np.array, axes)
     extent, middle = upper - lower, 0.5 * (lower + upper)
     across, high = float(abs(right @ extent)), float(abs(up @ extent))
     width, height = (max(1, round(scale * edge)) for edge in (across, high))
     column = ((np.arange(width) + 0.5) / width - 0.5) * across
     row = (0.5 - (np.arange(height) + 0.5) / height) * high
-    away = float(np.abs(np.stack([field.lower, field.upper]) - middle).max())
+    away = float(
+        np.abs(np.stack([posed.field.lower, posed.field.upper]) - middle).max()
+    )
     eye = middle + 1.1 * away * normal
     origin = eye + row[:, None, None] * up + column[:, None] * right
     half = mi.Float(0.5)

@@ -26,10 +26,11 @@ _GLB, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _FLOAT, _UBYTE, _USHORT, _UINT = 5126, 5121, 5123, 5125
+_GLOSS = "KHR_materials_pbrSpecularGlossiness"
 _SUPPORTED = frozenset(
     {
         "EXT_texture_webp",
-        "KHR_materials_pbrSpecularGlossiness",
+        _GLOSS,
         "KHR_texture_transform",
         # without these gloss, light or choices are lost, but no diffuse colour
         "KHR_lights_punctual",
@@ -168,13 +169,9 @@ def _prepare_tree(path: Path, tree: Any, has_chunk: bool) -> tuple[BaseColour, .
 
 def _base_colour(path: Path, tree: Any, index: int) -> BaseColour:
     material = tree["materials"][index]
-    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-    factor = None
-    if gloss is not None:
-        info = gloss.get("diffuseTexture")
-    else:
+    info, factor = _base_texture(material), None
+    if _GLOSS not in material.get("extensions", {}):
         metallic = material.get("pbrMetallicRoughness", {})
-        info = metallic.get("baseColorTexture")
         factor = np.reshape(metallic.get("baseColorFactor", (1.0,) * 4), 4)
     cutoff = float(material.get("alphaCutoff", 0.5))
     if info is None:
@@ -190,6 +187,14 @@ def _base_colour(path: Path, tree: Any, index: int) -> BaseColour:
     sampler = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
     wrap = [_WRAPS[sampler.get(name, 10497)] for name in ("wrapS", "wrapT")]
     return BaseColour(True, (wrap[0], wrap[1]), _matrix(info), cutoff, factor)
+
+
+def _base_texture(material: Any) -> Any:
+    """Return what says how the base colour's texture is laid on; None without one."""
+    gloss = material.get("extensions", {}).get(_GLOSS)
+    if gloss is not None:
+        return gloss.get("diffuseTexture")
+    return material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
 
 
 def _matrix(info: Any) -> np.ndarray:
@@ -237,11 +242,7 @@ def _prepare_primitive(
 
 
 def _coordinate_set(material: Any) -> int:
-    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-    if gloss is not None:
-        info = gloss["diffuseTexture"]
-    else:
-        info = material["pbrMetallicRoughness"]["baseColorTexture"]
+    info = _base_texture(material)
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     return int(transform.get("texCoord", info.get("texCoord", 0)))
 

@@ -114,58 +114,32 @@ def judge(
         fitted_db: PSNR of the rays fitted to, at the end of the fit; None if unknown.
         subject: what the field stands for.
     """
-    gap = [] if fitted_db is None else [_gap(scores, fitted_db, subject)]
-    return [*_criteria(scores, subject), *gap]
-
-
-def _gap(scores: Sequence[ViewScore], fitted_db: float, subject: Subject) -> Criterion:
-    pooled = pooled_db([score.psnr_db for score in scores])
-    return Criterion(
-        "PSNR of fitted rays less that of held-out ones (dB)",
-        0.0 if pooled == fitted_db else fitted_db - pooled,  # both may be infinite
-        MAX_GAP_DB,
-        False,
-        subject.learnt,
-        subject,
-    )
-
-
-def _criteria(scores: Sequence[ViewScore], subject: Subject) -> list[Criterion]:
     psnr = [score.psnr_db for score in scores]
-    return [
-        Criterion(
-            "held-out views",
-            len(scores),
-            MIN_VIEWS,
-            True,
-            subject.few,
-            subject,
-        ),
-        Criterion(
+    hazy = f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}"
+    rows: list[tuple[str, float, float, bool, str]] = [
+        ("held-out views", len(scores), MIN_VIEWS, True, subject.few),
+        (
             "mean PSNR of held-out views (dB)",
             float(np.mean(psnr)),
             MIN_PSNR_DB,
             True,
             subject.blurred,
-            subject,
         ),
-        Criterion(
+        (
             "PSNR of the worst held-out view (dB)",
             float(min(psnr)),
             MIN_WORST_DB,
             True,
             subject.worst,
-            subject,
         ),
-        Criterion(
-            f"share of rays with an opacity from {HAZY[0]:g} to {HAZY[1]:g}",
-            float(np.mean([score.hazy for score in scores])),
-            MAX_HAZY,
-            False,
-            subject.fog,
-            subject,
-        ),
+        (hazy, float(np.mean([s.hazy for s in scores])), MAX_HAZY, False, subject.fog),
     ]
+    if fitted_db is not None:
+        pooled = pooled_db(psnr)
+        gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite
+        name = "PSNR of fitted rays less that of held-out ones (dB)"
+        rows.append((name, gap, MAX_GAP_DB, False, subject.learnt))
+    return [Criterion(*row, subject) for row in rows]
 
 
 def verdict(criteria: Sequence[Criterion]) -> str:
