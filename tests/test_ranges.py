@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+from mi_nerfattack.evaluation.field_and_scene import CompareOptions
 from mi_nerfattack.ranges import Acute, Count, Finite, Fraction, Whole, checked
+from mi_nerfattack.training.collect import CollectSettings
+from mi_nerfattack.training.train import TrainSettings
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,25 @@ class Sizes:
 def test_what_is_outside_is_refused(change, message):
     with pytest.raises(InputError, match=message):
         Sizes(**change)
+
+
+@pytest.mark.parametrize(
+    ("make", "changes"),
+    [
+        (CollectSettings, [{"frames": 0}, {"object_share": 1.5}]),
+        (
+            CompareOptions,
+            [{"spp": 1}, {"spacing_m": 0.0}, {"near_m": math.inf}, {"worst": -1}],
+        ),
+        (EvaluateSettings, [{"runs": 0}, {"objects": -1}, {"horizon": 0}]),
+        (TrainSettings, [{"epochs": 0}, {"batch": 0}, {"learning_rate": 0.0}]),
+    ],
+)
+def test_settings_out_of_range_are_named(make, changes):
+    for change in changes:
+        (name,) = change
+        with pytest.raises(InputError, match=rf"{name}\b.*; "):
+            make(**change)
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -237,15 +237,6 @@ def test_report_and_table(place, tmp_path, capsys):
     assert mi.variant() == "llvm_ad_rgb"
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"spp": 1}, {"spacing_m": 0.0}, {"near_m": float("inf")}, {"worst": -1}],
-)
-def test_options_out_of_range(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        CompareOptions(**wrong)
-
-
 def test_arguments_are_checked_first(place, tmp_path):
     scene, routes = place
     with pytest.raises(InputError, match="needs both"):

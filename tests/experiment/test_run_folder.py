@@ -5,10 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import subprocess
 
 import pytest
-from helpers.attack_jobs import checkpoint_of, contents, interrupt, job, stop_at
+from helpers.attack_jobs import contents, interrupt, job, stop_at
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import locks
@@ -124,45 +123,6 @@ def test_failed_checkpoint_leaves_the_one_before(
     assert "checkpoint of iteration 3 is intact" in message
     assert contents(output) == kept
     job(folder, output).run(resume=True)
-
-
-@pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("kind", ["full", "read-only"])
-def test_checkpoint_on_a_real_disk_that_is_full_or_read_only(folder, tmp_path, kind):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=256k", "none", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(command).returncode:
-        pytest.skip("this user may not mount a small disk")
-    try:
-        _fail_on(disk, folder, kind)
-    finally:
-        subprocess.run(["umount", "-l", str(disk)], check=True)
-
-
-def _fail_on(disk, folder, kind):
-    output = disk / "run"
-    path = output / "checkpoint.safetensors"
-
-    def spoil():
-        if kind == "full":
-            room = os.statvfs(disk)
-            (disk / "other").write_bytes(bytes(room.f_bavail * room.f_bsize))
-        else:
-            subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
-
-    progress = stop_at("surrogate: attack", 4 * 4, spoil)
-    with pytest.raises(InputError) as failed:
-        job(folder, output, on_progress=progress).run()
-    assert str(path) in str(failed.value)
-    assert ("no space left" if kind == "full" else "read-only") in str(failed.value)
-    assert len(checkpoint_of(output)["history"]) == 3
-    if kind == "full":
-        (disk / "other").unlink()
-    else:
-        subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
-    job(folder, output).run(resume=True)
-    assert len(checkpoint_of(output)["history"]) == 6
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):

@@ -121,21 +121,6 @@ def test_forward_mode_goes_through_the_memory(name, rng):
     assert found == pytest.approx(right, rel=1e-9)
 
 
-def test_memory_matters_to_the_gradient(monkeypatch):
-    """Guard the tests above: cut the memory's derivative, and they would fail."""
-    loop, twin, initial = make("recurrent")
-    _, (by_texture, *_) = expected_gradient(loop, twin, initial, HORIZON, False)
-    whole = TorchPolicy.step_vjp
-
-    def forgetful(self, image, goal, memory, cotangent, d_memory):
-        return whole(self, image, goal, memory, cotangent, ())
-
-    monkeypatch.setattr(TorchPolicy, "step_vjp", forgetful)
-    rollout = Rollout(loop, Wave(), HORIZON)
-    found = rollout.gradient(rollout.run(to_state(initial))).textures[0].numpy()
-    assert np.linalg.norm(found - by_texture) > 0.05 * np.linalg.norm(by_texture)
-
-
 def test_black_boxes_drive_and_are_refused():
     loop, _, initial = make("recurrent")
     policy = CallablePolicy(lambda image, *_: image.mean((1, 2, 3)) - 0.5, "mine")

@@ -32,6 +32,7 @@ from mi_nerfattack.vehicle import Dubins, Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
+FUNCTION = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
 ROUTE = Route("lane", 0, np.array([[0, 0], [10, 0], [20, 5]], np.float64))
 COST = """\
 from __future__ import annotations
@@ -176,8 +177,7 @@ at = "end"
 
 
 def test_function_of_the_user(write):
-    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
-    objective = build(write(f'{text}"costs.py:squared"'))
+    objective = build(write(f'{FUNCTION}"costs.py:squared"'))
     assert isinstance(objective.cost, UserCost)
     rows = dr.llvm.ad.Array3f64([[1, 2, 3, 4], [0, 1, 0, 2], [0] * 4])
     dr.enable_grad(rows)
@@ -185,9 +185,9 @@ def test_function_of_the_user(write):
     assert value.numpy() == pytest.approx([-5.0])
     dr.backward(value)
     np.testing.assert_allclose(dr.grad(rows).numpy()[1], [0, 2, 0, 4])
-    slope = build(write(f'{text}"costs.py:slope"'))
+    slope = build(write(f'{FUNCTION}"costs.py:slope"'))
     assert slope.cost(rows).numpy().tolist() == [0] * 4
-    path = write(f'{text}"costs.py:slope"'.replace("true", "false"))
+    path = write(f'{FUNCTION}"costs.py:slope"'.replace("true", "false"))
     with pytest.raises(InputError, match="objective.function: costs.*trust_code = "):
         build(path)
 
@@ -209,8 +209,7 @@ def test_function_of_the_user(write):
     ],
 )
 def test_unusable_functions_are_named(write, function, words):
-    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
-    path = write(f'{text}"{function}"')
+    path = write(f'{FUNCTION}"{function}"')
     with pytest.raises(InputError) as caught:
         build(path)
     for word in words:
@@ -328,8 +327,7 @@ def test_examples_of_the_manual(write, tmp_path):
     assert [weight for weight, _ in objective.terms] == [1.0, 0.1]
     blocks = re.findall(r"```python\n(.*?)```", section, re.S)
     (tmp_path / "manual.py").write_text(blocks[0])
-    text = '[objective]\nkind = "function"\ntrust_code = true\nfunction = '
-    objective = build(write(f'{text}"manual.py:leave_to_the_right"'))
+    objective = build(write(f'{FUNCTION}"manual.py:leave_to_the_right"'))
     state = dr.llvm.ad.Array3f64([0, 0], [1, -7], [0, 0])
     assert objective.cost(state).numpy().tolist() == [7, 0]
     names = {"route": ROUTE, "weights": np.ones(4)}

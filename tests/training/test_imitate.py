@@ -189,13 +189,6 @@ def test_exported_program_gives_the_modules_controls(tmp_path):
         torch.testing.assert_close(program(image, goal), module(image, goal))
 
 
-def test_steering_policies_say_their_unit(tmp_path):
-    PilotNet(1, 0.34, "rad").save(tmp_path / "small.safetensors")
-    assert PilotNet.load(tmp_path / "small.safetensors").unit == "rad"
-    with pytest.raises(InputError, match="unit: 'deg'"):
-        PilotNet(1, 0.34, "deg")
-
-
 def test_presets_have_the_figures_of_the_paper():
     assert find_preset("intersection").frames == {
         "mitsuba": 120_000,
