@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 import torch
+from helpers import toy_loop as toy
 
 from mi_nerfattack.rollout.adjoint import Checkpointed, KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
@@ -19,7 +20,7 @@ ADJOINTS = {
 }
 
 
-def make_rollout(toy, loop, horizon, attached=False, adjoint="replay"):
+def make_rollout(loop, horizon, attached=False, adjoint="replay"):
     objective = StageSum(toy.square_error)
     return Rollout(
         loop, objective, horizon, adjoint=ADJOINTS[adjoint], attached=attached
@@ -42,7 +43,7 @@ def unit(value):
     return value / np.linalg.norm(value)
 
 
-def along_texture(toy, rollout, item, direction):
+def along_texture(rollout, item, direction):
     """Return J as a function of a step along a direction of the texture."""
     base = toy.texture_of(item)
 

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import toy_loop as toy
 from helpers.derivatives import central_difference
 from helpers.kernels import nothing_compiled
 from helpers.rollouts import (
@@ -42,20 +43,20 @@ pytestmark = pytest.mark.usefixtures("variant")
         (3, {"composite": InterleavedComposite()}),
     ],
 )
-def test_attached_gradient_is_that_of_the_whole_loop(toy, horizon, changes, rng):
+def test_attached_gradient_is_that_of_the_whole_loop(horizon, changes, rng):
     loop, item = toy.make_loop(**changes)  # Euler feels a control after two steps
-    rollout = make_rollout(toy, loop, horizon, attached=True)
+    rollout = make_rollout(loop, horizon, attached=True)
     found = texture_gradient(rollout)
     along = unit(found)
     for direction in (along, unit(along + 0.5 * unit(rng.normal(size=found.shape)))):
-        value = along_texture(toy, rollout, item, direction)
+        value = along_texture(rollout, item, direction)
         expected = float((found * direction).sum())
         assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
-def test_attached_gradient_by_the_initial_state(toy):
+def test_attached_gradient_by_the_initial_state():
     loop, _ = toy.make_loop()
-    rollout = make_rollout(toy, loop, 5, attached=True)
+    rollout = make_rollout(loop, 5, attached=True)
     found = np.array(gradient(rollout).initial)[:, 0]
     for axis, step in ((0, 4e-2), (1, 4e-2), (2, 1e-2)):
 
@@ -68,9 +69,9 @@ def test_attached_gradient_by_the_initial_state(toy):
         assert central_difference(value, step) == expected
 
 
-def test_gradient_by_the_pose_of_an_object(toy):
+def test_gradient_by_the_pose_of_an_object():
     loop, _ = toy.make_loop()
-    rollout = make_rollout(toy, loop, 4, attached=True)
+    rollout = make_rollout(loop, 4, attached=True)
     loop.sensor.set_offsets(OFFSET)
     found = gradient(rollout, offsets=True).offsets
     for axis in range(6):
@@ -88,9 +89,9 @@ def test_gradient_by_the_pose_of_an_object(toy):
         assert central_difference(value, 3e-3) == expected
 
 
-def test_gradient_by_the_pose_through_the_interleaved_composite(toy):
+def test_gradient_by_the_pose_through_the_interleaved_composite():
     loop, _ = toy.make_loop(composite=InterleavedComposite())
-    rollout = make_rollout(toy, loop, 3, attached=True)
+    rollout = make_rollout(loop, 3, attached=True)
     found = gradient(rollout, offsets=True).offsets[0, 2]
 
     def value(s):
@@ -100,9 +101,9 @@ def test_gradient_by_the_pose_through_the_interleaved_composite(toy):
     assert central_difference(value, 1e-3) == pytest.approx(found, rel=2e-2)
 
 
-def test_the_interleaved_composite_has_no_ray_tangents(toy):
+def test_the_interleaved_composite_has_no_ray_tangents():
     loop, _ = toy.make_loop(composite=InterleavedComposite())
-    rollout = make_rollout(toy, loop, 2, attached=True)
+    rollout = make_rollout(loop, 2, attached=True)
     evaluation = rollout.run(loop.initial(INITIAL))
     with pytest.raises(TypeError, match="keep the camera detached"):
         zero = [0 * texture for texture in loop.sensor.textures()]
@@ -110,9 +111,9 @@ def test_the_interleaved_composite_has_no_ray_tangents(toy):
 
 
 @pytest.mark.parametrize("attached", [True, False])
-def test_forward_and_reverse_mode_are_transposes(toy, rng, attached):
+def test_forward_and_reverse_mode_are_transposes(rng, attached):
     loop, _ = toy.make_loop()
-    rollout = make_rollout(toy, loop, 4, attached)
+    rollout = make_rollout(loop, 4, attached)
     evaluation = rollout.run(loop.initial(INITIAL))
     found = rollout.gradient(evaluation)
     by_texture = found.textures[0].numpy().astype(float)
@@ -126,16 +127,16 @@ def test_forward_and_reverse_mode_are_transposes(toy, rng, attached):
     assert tangent == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_euler_needs_two_steps_to_feel_a_control(toy):
+def test_euler_needs_two_steps_to_feel_a_control():
     loop, _ = toy.make_loop()
-    found = gradient(make_rollout(toy, loop, 1, attached=True))
+    found = gradient(make_rollout(loop, 1, attached=True))
     assert not found.textures[0].numpy().any()
     assert found.costates.shape == (1, 1, 3)
 
 
-def test_a_batch_is_one_sequence_of_launches(toy):
+def test_a_batch_is_one_sequence_of_launches():
     loop, _ = toy.make_loop()
-    rollout = make_rollout(toy, loop, 3, adjoint="kept")
+    rollout = make_rollout(loop, 3, adjoint="kept")
     counts = []
     for size in (2, 8):
         poses = np.repeat(INITIAL, size, 0) + 0.01 * np.arange(size)[:, None]
@@ -148,7 +149,7 @@ def test_a_batch_is_one_sequence_of_launches(toy):
     assert counts[0] == counts[1] > 0
 
 
-def test_jitter_is_replayed(toy):
+def test_jitter_is_replayed():
     loop, _ = toy.make_loop(jitter_seed=7)
     state = loop.initial(INITIAL)
     a = loop.sensor.observe(state, 3).image.numpy()
@@ -156,20 +157,20 @@ def test_jitter_is_replayed(toy):
     assert not np.array_equal(a, loop.sensor.observe(state, 4).image.numpy())
 
 
-def test_adjoints_agree_and_compile_nothing_after_the_first_steps(toy):
+def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
     loop, _ = toy.make_loop()
     found = {}
     for adjoint in ADJOINTS:
-        gradient(make_rollout(toy, loop, 4, adjoint=adjoint))
+        gradient(make_rollout(loop, 4, adjoint=adjoint))
         with nothing_compiled():
-            rollout = make_rollout(toy, loop, 4, adjoint=adjoint)
+            rollout = make_rollout(loop, 4, adjoint=adjoint)
             found[adjoint] = texture_gradient(rollout, INITIAL + 0.07)
     for name in ("kept", "checkpointed"):
         error = np.linalg.norm(found[name] - found["replay"])
         assert error <= 1e-6 * np.linalg.norm(found["replay"])
 
 
-def test_memory_does_not_grow_with_the_horizon(toy):
+def test_memory_does_not_grow_with_the_horizon():
     loop, _ = toy.make_loop()
     backend = dr.backend_v(mi.Float)
 
@@ -177,7 +178,7 @@ def test_memory_does_not_grow_with_the_horizon(toy):
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
-        gradient(make_rollout(toy, loop, horizon))
+        gradient(make_rollout(loop, horizon))
         dr.sync_thread()
         return dr.detail.malloc_watermark(backend)
 
@@ -185,7 +186,7 @@ def test_memory_does_not_grow_with_the_horizon(toy):
     assert peak(32) <= 1.05 * peak(8)
 
 
-def test_a_sensor_without_derivatives_is_refused(toy):
+def test_a_sensor_without_derivatives_is_refused():
     class Blind(AbstractSensor):
         def __init__(self, sensor):
             self.sensor = sensor
@@ -196,29 +197,29 @@ def test_a_sensor_without_derivatives_is_refused(toy):
     loop, _ = toy.make_loop()
     blind = replace(loop, sensor=Blind(loop.sensor))
     with pytest.raises(TypeError, match="Blind: has no derivatives"):
-        gradient(make_rollout(toy, blind, 1))
+        gradient(make_rollout(blind, 1))
 
 
-def test_horizon_below_one_and_bad_states_are_refused(toy):
+def test_horizon_below_one_and_bad_states_are_refused():
     loop, _ = toy.make_loop()
     with pytest.raises(ValueError, match="horizon"):
-        objective(make_rollout(toy, loop, 0))
+        objective(make_rollout(loop, 0))
     with pytest.raises(ValueError, match="states"):
         to_state(np.array([[0.0, np.nan, 0.0]]))
     with pytest.raises(ValueError, match=r"offsets: shape \(2, 6\)"):
         loop.sensor.set_offsets(np.zeros((2, 6)))
     with pytest.raises(ValueError, match="textures: 2 given for 1 objects"):
-        rollout = make_rollout(toy, loop, 1)
+        rollout = make_rollout(loop, 1)
         rollout.install(2 * loop.sensor.textures(), None)
 
 
-def test_objects_that_share_a_field_are_refused(toy):
+def test_objects_that_share_a_field_are_refused():
     old = toy.make_loop()[0].sensor
     with pytest.raises(ValueError, match="two of them share a field"):
         FieldSensor(old.scene, 2 * old.objects, old.camera)
 
 
-def test_another_mount_makes_another_image(toy):
+def test_another_mount_makes_another_image():
     loop, _ = toy.make_loop()
     state = loop.initial(INITIAL)
     before = loop.sensor.observe(state, 0).image.numpy().copy()
@@ -226,9 +227,9 @@ def test_another_mount_makes_another_image(toy):
     assert np.abs(loop.sensor.observe(state, 0).image.numpy() - before).max() > 0.01
 
 
-def test_kept_backgrounds_are_not_rendered_again(toy):
+def test_kept_backgrounds_are_not_rendered_again():
     loop, _ = toy.make_loop()
-    rollout = make_rollout(toy, loop, 3, adjoint="kept")
+    rollout = make_rollout(loop, 3, adjoint="kept")
     evaluation = rollout.run(loop.initial(INITIAL))
     kept = evaluation.trajectory.kept
     bytes_kept = sum(
@@ -242,7 +243,7 @@ def test_kept_backgrounds_are_not_rendered_again(toy):
     assert loop.sensor.renders == before
 
 
-def test_sensors_die_safely_while_others_record(toy):
+def test_sensors_die_safely_while_others_record():
     """Dr.Jit aborts when a recording is destroyed while another is made."""
     before = gc.get_threshold()
     gc.set_threshold(1)
@@ -250,6 +251,6 @@ def test_sensors_die_safely_while_others_record(toy):
         for _ in range(4):
             loop, _ = toy.make_loop()
             loop.sensor.cycle = loop.sensor  # only the collector can free it
-            gradient(make_rollout(toy, loop, 1))
+            gradient(make_rollout(loop, 1))
     finally:
         gc.set_threshold(*before)

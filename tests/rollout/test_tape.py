@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import toy_loop as toy
 from helpers.rollouts import OFFSET
 from helpers.tape import leaf, taped_image, tensor64
 
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 BOTH = np.array([[0.0, 0.35, 0.02], [0.1, -0.2, -0.05]])
 
 
-def test_products_of_the_sensor_are_those_of_the_tape(toy, rng):
+def test_products_of_the_sensor_are_those_of_the_tape(rng):
     """Two objects overlap in the image, each with its texture and offset."""
     loop, _ = toy.make_loop(coarse=True)
     old, state = loop.sensor, loop.initial(BOTH)
