@@ -323,19 +323,6 @@ def test_errors_and_convergence(tmp_path):
     assert count(image, RED) > 1000
 
 
-def test_plots_refuse_bad_input(tmp_path):
-    path = tmp_path / "a.png"
-    mixed = [make_drive([0.1]), make_drive([0.1], route="left")]
-    with pytest.raises(InputError, match="exactly one route"):
-        plots.errors(path, mixed, 0.85)
-    with pytest.raises(InputError, match="route_points: shape"):
-        plots.overhead(path, plot_drives(), np.zeros((3, 3)), 3.5, [], 0.85)
-    for history in ([], [{"objective": 1.0}]):
-        with pytest.raises(InputError, match="cross_track_mean_m"):
-            plots.convergence(path, history)
-    assert not path.exists()
-
-
 # Page
 
 
