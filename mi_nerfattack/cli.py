@@ -21,6 +21,7 @@ import tyro
 import mi_nerfattack
 from mi_nerfattack.commands import COMMANDS, Command
 from mi_nerfattack.errors import NerfAttackError, is_interrupt
+from mi_nerfattack.system.heap import map_large_blocks
 
 PROG = "mi-nerfattack"
 EXIT_INPUT = 2
@@ -46,6 +47,7 @@ def main(
         commands: what can be run, by name.
         prog: the program's name, for its help.
     """
+    map_large_blocks()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     arguments = [item for item in arguments if item != "--debug"]
