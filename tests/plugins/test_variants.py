@@ -6,6 +6,7 @@ directions, rough and smooth, and with each other (dot-product identity).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,13 @@ IN_RGB_FIRST = pytest.mark.parametrize(
 )
 BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 NGP_PARAMETERS = ("table", "density_weights", "colour_weights", "sky")
+
+
+@pytest.fixture(autouse=True)
+def silent(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
+    """Let what Dr.Jit logs fail the test."""
+    yield
+    assert capfd.readouterr().err == ""
 
 
 def write(path: Path, field: Any) -> str:

@@ -30,7 +30,14 @@ def attached(
     Returns:
         premultiplied radiance (3, n) and opacity (n,).
     """
-    rays = dr.detach(rays)
+    # Stock integrators switch recorded loops off to be differentiated themselves.
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+        return _attached(composite, posed, dr.detach(rays), stop)
+
+
+def _attached(
+    composite: AbstractComposite, posed: list[PosedField], rays: Rays, stop: float
+) -> tuple[mi.Color3f, mi.Float]:
     sources = [
         array
         for item in posed
