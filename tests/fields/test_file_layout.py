@@ -1,0 +1,40 @@
+"""Field files are what `docs/fields.md` says: read by NumPy alone, they are equal."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.file_reader import FileReader
+
+from mi_nerfattack.fields import NGPField, load_field
+from mi_nerfattack.scenes import bundled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.mark.parametrize("name", ["hydrant", "intersection"])
+def test_a_reader_written_from_the_page_sees_the_same_field(name, rng):
+    path = bundled(f"{name}/field.safetensors")
+    field, reader = load_field(path), FileReader(path)
+    np.testing.assert_array_equal(reader.cells, field.occupancy.cells)
+    anywhere = rng.uniform(0, 1, (300, 3))
+    cells = np.argwhere(field.occupancy.cells)
+    inside = cells[rng.integers(len(cells), size=300)] + rng.uniform(0, 1, (300, 3))
+    unit = np.vstack([anywhere, inside / field.occupancy.shape]).astype(np.float32)
+    # in single precision, as they reach the field
+    points = (field.lower + unit * (field.upper - field.lower)).astype(np.float32)
+    directions = rng.normal(0, 1, (600, 3)).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+
+    towards = mi.Vector3f(directions.T.copy())
+    density, radiance = field.eval(mi.Point3f(points.T.copy()), towards, mi.Bool(True))
+    expected = reader.density(points.astype(float))
+    np.testing.assert_allclose(density, expected, rtol=2e-3)
+    expected = reader.radiance(points.astype(float), directions.astype(float))
+    np.testing.assert_allclose(np.array(radiance).T, expected, atol=5e-4)
+    assert expected.std() > 0.05
+    if isinstance(field, NGPField):
+        sky = np.array(field.background(towards)).T
+        expected = reader.background(directions.astype(float))
+        np.testing.assert_allclose(sky, expected, atol=1e-4)

@@ -1,0 +1,149 @@
+"""A reader of field files in NumPy alone, written from `docs/fields.md`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+TYPES = {"F16": "<f2", "F32": "<f4", "U8": "u1"}
+PRIMES = np.array([1, 2654435761, 805459861], np.uint64)
+CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+class FileReader:
+    """A field file of either kind, evaluated in double precision.
+
+    Attributes:
+        header: entries by name.
+        tensors: arrays by name.
+        cells: (rx, ry, rz), True where the occupancy is set.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        raw = Path(path).read_bytes()
+        start = 8 + int.from_bytes(raw[:8], "little")
+        entries = json.loads(raw[8:start])
+        self.header: dict[str, str] = entries.pop("__metadata__")
+        self.tensors = {}
+        for name, entry in entries.items():
+            first, last = entry["data_offsets"]
+            values = np.frombuffer(
+                raw[start + first : start + last], TYPES[entry["dtype"]]
+            )
+            self.tensors[name] = values.reshape(entry["shape"])
+        self.lower, self.upper = (self._numbers(key) for key in ("lower", "upper"))
+        shape = self._numbers("occupancy_shape").astype(int)
+        bits = np.unpackbits(self.tensors["occupancy"], count=shape.prod())
+        self.cells = bits.reshape(shape).astype(bool)
+        self.is_grid = self.header["kind"] == "grid_field"
+
+    def density(self, points: np.ndarray) -> np.ndarray:
+        """Evaluate (n,), 1/metre, at points (n, 3) in the box."""
+        if self.is_grid:
+            raw = self._levels(points, self.tensors["density"][:, None]).sum(1)[:, 0]
+            scale = float(self.header["density_scale"])
+        else:
+            raw = self._geometry(points)[:, 0]
+            scale = 1 / (self.upper - self.lower).max()
+        return scale * np.exp(np.minimum(raw, 15))
+
+    def radiance(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Evaluate (n, 3), linear, at points (n, 3) along unit directions (n, 3)."""
+        if self.is_grid:
+            return decode(self._levels(points, self.tensors["texture"]).sum(1))
+        inputs = np.hstack([self._geometry(points), harmonics(directions)])
+        return decode(self._network("colour_net", inputs))
+
+    def background(self, directions: np.ndarray) -> np.ndarray:
+        """Interpolate the sky (n, 3), linear, in unit directions (n, 3)."""
+        sky = self.tensors["sky"].astype(float)
+        height, width, _ = sky.shape
+        x, y, z = directions.T
+        column = np.arctan2(y, x) / (2 * np.pi) * width
+        row = np.arccos(z) / np.pi * height - 0.5
+        u, v = np.floor(column).astype(int), np.floor(row).astype(int)
+        total = np.zeros((len(directions), 3))
+        for du in (0, 1):
+            for dv in (0, 1):
+                weight = np.abs(1 - du - (column - u)) * np.abs(1 - dv - (row - v))
+                texel = sky[np.clip(v + dv, 0, height - 1), (u + du) % width]
+                total += weight[:, None] * texel
+        return decode(total)
+
+    def _geometry(self, points: np.ndarray) -> np.ndarray:
+        table = self.tensors["table"].reshape(-1, int(self.header["features"]))
+        features = self._levels(points, table).reshape(len(points), -1)
+        return self._network("density_net", features)
+
+    def _network(self, name: str, values: np.ndarray) -> np.ndarray:
+        layers = sorted(key for key in self.tensors if key.startswith(f"{name}."))
+        for key in layers[:-1]:
+            values = np.maximum(values @ self.tensors[key].T.astype(float), 0)
+        return values @ self.tensors[layers[-1]].T.astype(float)
+
+    def _levels(self, points: np.ndarray, table: np.ndarray) -> np.ndarray:
+        """Interpolate (n, levels, values of a vertex) in a table of all vertices."""
+        unit = np.clip((points - self.lower) / (self.upper - self.lower), 0, 1 - 1e-6)
+        levels, base, largest = (
+            int(self.header[key])
+            for key in ("levels", "base_resolution", "max_resolution")
+        )
+        growth = (largest / base) ** (1 / (levels - 1)) if levels > 1 else 1.0
+        values, start = [], 0
+        for level in range(levels):
+            cells = np.exp2(level * np.log2(growth)) * base - 1
+            edge = int(np.ceil(cells)) + 1
+            size = self._size(edge)
+            place = unit * cells
+            low = np.floor(place).astype(np.uint64)
+            total = np.zeros((len(points), table.shape[1]))
+            for corner in CORNERS:
+                vertex = low + corner.astype(np.uint64)
+                weight = np.abs(1 - corner - (place - low)).prod(1)
+                index = start + self._index(vertex, edge, size)
+                total += weight[:, None] * table[index]
+            values.append(total)
+            start += size
+        assert start == len(table)
+        return np.stack(values, 1)
+
+    def _size(self, edge: int) -> int:
+        """Return the vertices that a level takes in the file."""
+        features = 4 if self.is_grid else int(self.header["features"])
+        size = -(-(edge**3) // features) * features
+        return size if self.is_grid else min(size, 1 << int(self.header["log2_table"]))
+
+    def _index(self, vertex: np.ndarray, edge: int, size: int) -> np.ndarray:
+        """Number the vertices (n, 3) of a level."""
+        if edge**3 <= size:
+            return (vertex * np.array([1, edge, edge**2], np.uint64)).sum(1).astype(int)
+        x, y, z = (vertex * PRIMES & np.uint64(0xFFFFFFFF)).T
+        return ((x ^ y ^ z) % np.uint64(size)).astype(int)
+
+    def _numbers(self, key: str) -> np.ndarray:
+        return np.array([float(word) for word in self.header[key].split()])
+
+
+def decode(raw: np.ndarray) -> np.ndarray:
+    """Turn raw colours into linear ones: the sRGB curve of their sigmoid."""
+    value = 1 / (1 + np.exp(-raw))
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def harmonics(directions: np.ndarray) -> np.ndarray:
+    """Evaluate the real spherical harmonics of degree 0 to 3, (n, 16)."""
+    x, y, z = directions.T
+    tilt = 0.45704580 - 2.28522900 * z**2
+    columns = [
+        0.28209479 + 0 * x,
+        *(-0.48860251 * y, 0.48860251 * z, -0.48860251 * x),
+        *(1.09254843 * x * y, -1.09254843 * y * z),
+        0.94617470 * z**2 - 0.31539157,
+        *(-1.09254843 * x * z, 0.54627422 * (x**2 - y**2)),
+        *(-0.59004359 * y * (3 * x**2 - y**2), 2.89061144 * x * y * z),
+        *(tilt * y, z * (1.86588166 * z**2 - 1.11952900), tilt * x),
+        *(1.44530572 * z * (x**2 - y**2), -0.59004359 * x * (x**2 - 3 * y**2)),
+    ]
+    return np.stack(columns, 1)
