@@ -6,6 +6,7 @@ import sys
 
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
+from bench.commands.memory import BenchMemory
 from bench.commands.speed import BenchAttack, BenchComposite, BenchFit, BenchRender
 from bench.commands.training import BenchCollect, BenchDagger
 from mi_nerfattack import cli
@@ -14,6 +15,7 @@ COMMANDS = {
     "render": BenchRender,
     "fit": BenchFit,
     "attack": BenchAttack,
+    "memory": BenchMemory,
     "composite": BenchComposite,
     "experts": BenchExperts,
     "circle": BenchCircle,

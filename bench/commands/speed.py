@@ -38,13 +38,13 @@ class BenchRender:
 
         from bench.render import run as render
 
-        sizes = _read_sizes(self.sizes)
+        sizes = read_sizes(self.sizes)
         _check_repeats(self.repeats)
         if self.quick:
             settings = render.Settings.quick(sizes, self.repeats)
         else:
             settings = render.Settings(sizes, sizes[-1], repeats=self.repeats)
-        document = _measure(render.run, settings)
+        document = measure(render.run, settings)
         document = _publish("render", document, self._command(), self.output)
         if self.json:
             print(json.dumps(document, allow_nan=False))
@@ -79,7 +79,7 @@ class BenchComposite:
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
-        (size,) = _read_sizes((self.size,))
+        (size,) = read_sizes((self.size,))
         files.check_writable(self.output)
         variant.ensure()
         from bench.driving import composite
@@ -133,7 +133,7 @@ class BenchFit:
         settings = dataclasses.replace(
             settings, folder=self.folder, long_edge=self.long_edge
         )
-        document = _measure(fit.run, settings)
+        document = measure(fit.run, settings)
         document = _publish("fit", document, self._command(), self.output)
         if self.json:
             print(json.dumps(document, allow_nan=False))
@@ -179,12 +179,12 @@ class BenchAttack:
 
         from bench.attack import run as attack
 
-        sizes = _read_sizes(self.sizes)
+        sizes = read_sizes(self.sizes)
         _check_repeats(self.repeats)
         settings = attack.Settings(sizes, self.parts, repeats=self.repeats)
         if self.quick:
             settings = attack.Settings.quick(sizes, self.parts, self.repeats)
-        document = _measure(attack.run, settings)
+        document = measure(attack.run, settings)
         document = _publish("attack", document, self._command(), self.output)
         if self.json:
             print(json.dumps(document, allow_nan=False))
@@ -198,7 +198,7 @@ class BenchAttack:
         return [*command, "--quick"] if self.quick else command
 
 
-def _measure(run: Callable[..., dict[str, Any]], settings: Any) -> dict[str, Any]:
+def measure(run: Callable[..., dict[str, Any]], *settings: Any) -> dict[str, Any]:
     """Run a benchmark, and show how far it is."""
     from mi_nerfattack.commands.shared.progress import StageBars
 
@@ -207,7 +207,7 @@ def _measure(run: Callable[..., dict[str, Any]], settings: Any) -> dict[str, Any
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        return run(settings, show)
+        return run(*settings, show)
 
 
 def _publish(
@@ -223,7 +223,8 @@ def _publish(
     return document
 
 
-def _read_sizes(texts: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+def read_sizes(texts: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    """Read widths and heights as in 200x66."""
     from mi_nerfattack.errors import InputError
 
     sizes = []

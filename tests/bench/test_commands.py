@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bench.__main__ import COMMANDS, main
+from bench.attack import memory
 from bench.attack.table import memory_table, time_table
 from bench.attack.table import remarks as attack_remarks
 from bench.driving import circle, experts
@@ -110,6 +111,31 @@ def test_attack_prints_the_promised_keys(capsys, tmp_path):
     assert time_table(document).row_count == 5
     assert memory_table(document).row_count == 6
     assert len(attack_remarks(document)) == 4
+
+
+def test_memory_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path):
+    path, driven = tmp_path / "memory.json", []
+
+    def peak(job):
+        driven.append((job.poses, job.horizon))
+        if len(driven) == 4:
+            raise KeyboardInterrupt
+        return 500.0 + job.poses + (6 if job.horizon == 9 else 0)
+
+    monkeypatch.setattr(memory, "_peak_mb", peak)
+    command = ["memory", "--size", "32x16", "-o", str(path), "--horizons", "3", "9"]
+    assert main(command) == cli.EXIT_INTERRUPTED
+    assert driven == [(1, 2), (4, 2), (1, 3), (4, 3)]  # the first two only compile
+    assert json.loads(path.read_text())["rows"] == [
+        {"poses": 1, "horizon": 3, "peak_memory_mb": 501.0}
+    ]
+    assert main(command) == 1  # by more than 1 %
+    assert driven[4:] == [(4, 2), (1, 2), (4, 3), (1, 9), (4, 9)]
+    assert "1.20%" in capsys.readouterr().out
+    assert main([*command, "--poses", "1"]) == cli.EXIT_INPUT
+    assert "name another file" in capsys.readouterr().err
+    assert main([*command, "--poses", "0"]) == cli.EXIT_INPUT
+    assert "poses: (0,); must be a whole number of at" in capsys.readouterr().err
 
 
 @pytest.mark.slow
