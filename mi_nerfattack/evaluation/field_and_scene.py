@@ -17,7 +17,7 @@ from pydantic import Field
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fit.scores import FieldRenderer, Rendering, compare
+from mi_nerfattack.fit.scores import SOLID, FieldRenderer, Rendering, compare
 from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
@@ -28,8 +28,6 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
 from mi_nerfattack.vehicle.route.route import Route, load_routes
-
-_SOLID = 0.5  # opacity from which on a ray counts as stopped
 
 
 def drive_camera() -> Camera:
@@ -77,6 +75,7 @@ class Station:
         wrong: share of rays that the field stops (opacity of at least 0.5) and the
             scene does not, or the other way round.
         hazy: see `evaluation.Rendering.hazy`.
+        holes: see `FieldRenderer.holes`.
     """
 
     arc_m: float
@@ -87,6 +86,7 @@ class Station:
     depth_p90_m: float
     wrong: float
     hazy: float
+    holes: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +133,10 @@ class RouteComparison:
     worst: tuple[ComparedFrame, ...]
 
     def mean(self, name: str) -> float:
-        """Return the mean of a number over the stations."""
-        return float(np.mean([getattr(station, name) for station in self.stations]))
+        """Return the mean of a number over the stations; NaN ones do not count."""
+        values = np.array([getattr(station, name) for station in self.stations])
+        known = values[~np.isnan(values)]
+        return float(np.mean(known)) if known.size else float("nan")
 
     def least(self, name: str) -> float:
         """Return the least value of a number over the stations."""
@@ -230,8 +232,9 @@ class _Eyes:
             ssim,
             quantile(errors, 0.5),
             quantile(errors, 0.9),
-            float(np.mean((shown.opacity >= _SOLID) != np.isfinite(depth))),
+            float(np.mean((shown.opacity >= SOLID) != np.isfinite(depth))),
             shown.hazy,
+            self._field.holes(shown, options.camera, pose, depth),
         )
         return ComparedFrame(station, shown, image, depth)
 

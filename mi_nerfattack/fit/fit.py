@@ -202,7 +202,9 @@ def _run(
     if checkpoint is not None:
         checkpoint.save(clock.elapsed, clock.history)  # scoring may be interrupted
     training.finish()
-    scores = evaluate(training.field, training.images, training.held_out)
+    scores = evaluate(
+        training.field, training.images, training.held_out, training.depth
+    )
     poses = training.images.camera_to_world[training.fitted]
     return FitResult(
         training.field,

@@ -19,6 +19,7 @@ from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
 
 HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
+SOLID = 0.5  # opacity from which on a field stops a ray
 MIN_EDGE_PX = 11  # of the window of SSIM
 _WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
 
@@ -54,6 +55,7 @@ class ViewScore:
         psnr_db: of sRGB values in [0, 1], infinite for equal images.
         ssim: Wang et al. 2004, Gaussian window of 1.5 px, mean over channels.
         hazy: share of rays that are neither solid nor free; see `Rendering.hazy`.
+        holes: see `FieldRenderer.holes`; NaN where no depth is known.
         rendering: what the field shows; kept for the worst views alone.
     """
 
@@ -62,6 +64,7 @@ class ViewScore:
     psnr_db: float
     ssim: float
     hazy: float = 0.0
+    holes: float = float("nan")
     rendering: Rendering | None = field(default=None, repr=False, compare=False)
 
 
@@ -99,6 +102,34 @@ class FieldRenderer:
             depth.numpy().reshape(size).copy(),
         )
 
+    def holes(
+        self,
+        rendering: Rendering,
+        camera: Camera,
+        camera_to_world: np.ndarray,
+        depth: np.ndarray,
+    ) -> float:
+        """Return the share of known surfaces that a view looks through.
+
+        Args:
+            rendering: of the view.
+            camera: intrinsics.
+            camera_to_world: (4, 4), OpenCV axes, metres.
+            depth: (height, width), metres along the ray; infinite or NaN without a
+                surface. Those outside of the field's box do not count.
+
+        Returns:
+            share of opacities below `SOLID`, NaN if there are no surfaces.
+        """
+        field = self._posed.field
+        d = generate_rays(camera, *pose_arrays(camera_to_world), 1)[1].numpy()
+        known = np.where(np.isfinite(depth), depth, np.nan)
+        point = camera_to_world[:3, 3] + (d * known.ravel()).T
+        inside = ((point > field.lower) & (point < field.upper)).all(1)
+        if not inside.any():
+            return float("nan")
+        return float(np.mean(rendering.opacity.ravel()[inside] < SOLID))
+
 
 def reference(images: PosedImages, index: int) -> np.ndarray:
     """Return an image, over white if it has alpha, sRGB (height, width, 3), float32."""
@@ -111,7 +142,11 @@ def reference(images: PosedImages, index: int) -> np.ndarray:
 
 
 def evaluate(
-    field: AbstractField, images: PosedImages, indices: Iterable[int], keep: int = 4
+    field: AbstractField,
+    images: PosedImages,
+    indices: Iterable[int],
+    depth: np.ndarray | None = None,
+    keep: int = 4,
 ) -> list[ViewScore]:
     """Score a field against images; those with alpha lie over white.
 
@@ -120,6 +155,8 @@ def evaluate(
             have alpha.
         images: the posed images.
         indices: of the images to score.
+        depth: (n, height, width), metres along the ray, NaN where unknown, of all
+            images; or None.
         keep: number of views, those of least PSNR, whose rendering is kept.
 
     Returns:
@@ -128,11 +165,14 @@ def evaluate(
     renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
     scores: list[ViewScore] = []
     for index in map(int, indices):
-        pose = images.camera_to_world[index]
-        rendering = renderer.render(images.camera_of(index), pose)
+        pose, camera = images.camera_to_world[index], images.camera_of(index)
+        rendering = renderer.render(camera, pose)
         psnr, ssim = compare(rendering.image, reference(images, index))
+        holes = float("nan")
+        if depth is not None:
+            holes = renderer.holes(rendering, camera, pose, depth[index])
         name, hazy = images.names[index], rendering.hazy
-        scores.append(ViewScore(index, name, psnr, ssim, hazy, rendering))
+        scores.append(ViewScore(index, name, psnr, ssim, hazy, holes, rendering))
         kept = {score.index for score in worst_views(scores, keep)}
         scores = [s if s.index in kept else replace(s, rendering=None) for s in scores]
     return scores

@@ -29,7 +29,13 @@ from mi_nerfattack.evaluation.field_and_scene import (
     depth_errors,
     quantile,
 )
-from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
+from mi_nerfattack.fields import (
+    GridField,
+    GridLayout,
+    Occupancy,
+    load_field,
+    save_field,
+)
 from mi_nerfattack.fit.options import FitResult
 from mi_nerfattack.fit.scores import evaluate
 from mi_nerfattack.io import files
@@ -109,6 +115,7 @@ def test_known_offset_in_depth_and_colour(offset):
     for at in route.stations:
         assert at.psnr_db == pytest.approx(expected, abs=0.02)
         assert at.ceiling_db > 80 and at.wrong == 0 and at.hazy == 0
+        assert np.isnan(at.holes)  # the scene's wall stands before the field's box
     # at x = 0 the wall is 12 m away, out of reach of what counts as near
     assert np.isnan(route.stations[0].depth_median_m)
     # 0.2 m along the axis, 0.2 / cos along other rays
@@ -129,6 +136,18 @@ def test_field_that_shows_nothing(place, tmp_path):
     assert "Not close enough on ahead" in text
     page = write_compare_report(tmp_path / "out", comparison, "nothing")
     assert "NaN" not in page_text(page)
+
+
+def test_field_with_rings_of_holes(place):
+    """A layer of 0.2 m, and the first sample up to 0.25 m behind the layer's front."""
+    field = wall(WALL_X - 0.1)
+    field.step_m = 0.5
+    field.occupancy = Occupancy((np.arange(100) == 0).reshape(-1, 1, 1))
+    comparison = compare_with_scene(field, *place, OPTIONS)
+    (route,) = comparison.routes
+    assert 0.1 < route.mean("holes") < 0.3
+    assert "Not close enough on ahead" in verdict(comparison)
+    assert document(comparison)["routes"]["ahead"]["holes"] == route.mean("holes")
 
 
 def test_half_transparent_field_is_hazy(place):
@@ -171,8 +190,10 @@ def test_ceiling_is_the_noise_of_the_reference(tmp_path, place):
     assert route.mean("ceiling_db") < 70
 
 
-def route_of(name: str, psnr: float, ceiling: float, depth: float) -> RouteComparison:
-    at = Station(0.0, psnr, ceiling, 0.9, depth, depth, 0.0, 0.0)
+def route_of(
+    name: str, psnr: float, ceiling: float, depth: float, holes: float = 0.0
+) -> RouteComparison:
+    at = Station(0.0, psnr, ceiling, 0.9, depth, depth, 0.0, 0.0, holes)
     return RouteComparison(name, 10.0, (at,), depth, depth, depth, depth, 0.5, ())
 
 
@@ -187,6 +208,8 @@ def route_of(name: str, psnr: float, ceiling: float, depth: float) -> RouteCompa
         ([("a", 20.0, 45.0, 0.05), ("b", 27.0, 30.0, 0.05)], False, True),
         # depth has no noise
         ([("a", 28.0, 30.0, 0.5)], False, True),
+        # nor have holes
+        ([("a", 28.0, 30.0, 0.05, 0.006)], False, True),
         ([("a", 24.2, 26.0, 0.05), ("b", 20.0, 45.0, 0.05)], True, True),
     ],
 )

@@ -25,6 +25,7 @@ from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_dept
 
 MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
+MAX_HOLES = 0.005  # share of the scene's surfaces, mean along a route
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
@@ -91,6 +92,7 @@ def _route_entry(route: RouteComparison) -> dict[str, Any]:
         "depth_p90_relative": route.depth_p90_relative,
         "near_share": route.near,
         "wrong_opacity": route.mean("wrong"),
+        "holes": route.mean("holes"),
         "hazy": route.mean("hazy"),
         "stations": [asdict(station) for station in route.stations],
     }
@@ -99,8 +101,9 @@ def _route_entry(route: RouteComparison) -> dict[str, Any]:
 def verdict(comparison: Comparison) -> str:
     """Say in words whether the field is close enough to attack a policy in."""
     wanted = (
-        f"at least {MIN_PSNR_DB:g} dB on average along each route, and a median depth "
-        f"error of at most {MAX_DEPTH_M:g} m within {comparison.options.near_m:g} m"
+        f"at least {MIN_PSNR_DB:g} dB on average along each route, a median depth "
+        f"error of at most {MAX_DEPTH_M:g} m within {comparison.options.near_m:g} m, "
+        f"and holes in at most {100 * MAX_HOLES:g} % of the scene's surfaces"
     )
     far = _far(comparison)
     if not far:
@@ -126,7 +129,7 @@ def _far(comparison: Comparison) -> list[str]:
     return [
         route.name
         for route in comparison.routes
-        if not _is_psnr_good(route) or not _is_depth_good(route)
+        if not (_is_psnr_good(route) and _is_geometry_good(route))
     ]
 
 
@@ -136,7 +139,7 @@ def _is_psnr_good(route: RouteComparison) -> bool:
 
 def _is_noise(route: RouteComparison) -> bool:
     """Whether the noise of the scene's frames is all that is wrong with a route."""
-    if _is_psnr_good(route) or not _is_depth_good(route):
+    if _is_psnr_good(route) or not _is_geometry_good(route):
         return False
     error, noise = (
         10 ** (-0.1 * route.mean(name)) for name in ("psnr_db", "ceiling_db")
@@ -147,6 +150,16 @@ def _is_noise(route: RouteComparison) -> bool:
 def _is_depth_good(route: RouteComparison) -> bool:
     """A route with nothing near has no depth to be wrong."""
     return math.isnan(route.depth_median_m) or route.depth_median_m <= MAX_DEPTH_M
+
+
+def _is_solid(route: RouteComparison) -> bool:
+    """A route without surfaces has none to see through."""
+    holes = route.mean("holes")
+    return math.isnan(holes) or holes <= MAX_HOLES
+
+
+def _is_geometry_good(route: RouteComparison) -> bool:
+    return _is_depth_good(route) and _is_solid(route)
 
 
 def settings_line(comparison: Comparison) -> str:
@@ -162,8 +175,10 @@ def settings_line(comparison: Comparison) -> str:
         f" m apart, {options.lateral_m:g} m left of the route; the scene with "
         f"{options.spp} samples per pixel, {noise}; the field with one ray per pixel, "
         f"as an attack sees it. Depth where the scene is nearer than {options.near_m:g}"
-        " m. Wrong: rays that only one of the two stops; hazy: those with an opacity in"
-        f" the field from {HAZY[0]:g} to {HAZY[1]:g}. {comparison.wall_s:.0f} s."
+        " m. Wrong: rays that only one of the two stops; holes: those that the field "
+        "lets through, of all that meet the scene in its box; hazy: those with an "
+        f"opacity in the field from {HAZY[0]:g} to {HAZY[1]:g}. "
+        f"{comparison.wall_s:.0f} s."
     )
 
 
@@ -182,6 +197,7 @@ def rows(comparison: Comparison) -> list[list[str]]:
                 metres,
                 relative,
                 f"{100 * route.mean('wrong'):.2f}",
+                _number(100 * route.mean("holes"), 2),
                 f"{100 * route.mean('hazy'):.2f}",
             ]
         )
@@ -189,6 +205,7 @@ def rows(comparison: Comparison) -> list[list[str]]:
 
 
 _PSNR, _DEPTH = "PSNR (dB)\nmean / min", "depth error (m)\nmedian / 90 %"
+_HOLES = "holes\n(%)"
 COLUMNS = (
     "route",
     _PSNR,
@@ -196,13 +213,14 @@ COLUMNS = (
     _DEPTH,
     "relative (%)\nmed. / 90 %",
     "wrong\n(%)",
+    _HOLES,
     "hazy\n(%)",
 )
 
 
 def routes_table(comparison: Comparison) -> Table:
     """Return the figures of the routes as a table for a terminal."""
-    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=0)
     for i, name in enumerate(COLUMNS):
         table.add_column(name, justify="right" if i else "left", no_wrap=i > 0)
     for cells in rows(comparison):
@@ -218,7 +236,11 @@ def _number(value: float, digits: int) -> str:
 
 def _bad(route: RouteComparison) -> set[int]:
     """Return the columns in which a route is too far off."""
-    good = {_PSNR: _is_psnr_good(route), _DEPTH: _is_depth_good(route)}
+    good = {
+        _PSNR: _is_psnr_good(route),
+        _DEPTH: _is_depth_good(route),
+        _HOLES: _is_solid(route),
+    }
     return {COLUMNS.index(name) for name in good if not good[name]}
 
 

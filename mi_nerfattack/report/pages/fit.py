@@ -13,7 +13,7 @@ from rich.table import Table
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fit.options import FitProgress, FitResult
-from mi_nerfattack.fit.scores import ViewScore, reference, worst_views
+from mi_nerfattack.fit.scores import SOLID, ViewScore, reference, worst_views
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.conventions import opencv_to_opengl
 from mi_nerfattack.report.pages.elements import render
@@ -27,7 +27,6 @@ from mi_nerfattack.report.pages.verdict import (
 )
 from mi_nerfattack.report.plots.fit import write_curve, write_histogram
 from mi_nerfattack.report.plots.views import (
-    SOLID,
     ViewPair,
     abs_difference,
     write_colours,
@@ -140,7 +139,7 @@ def summary(result: FitResult) -> dict[str, Any]:
 
 def view_entry(score: ViewScore) -> dict[str, Any]:
     """Return the score of one view without its pictures."""
-    names = ("index", "name", "psnr_db", "ssim", "hazy")
+    names = ("index", "name", "psnr_db", "ssim", "hazy", "holes")
     return {name: getattr(score, name) for name in names}
 
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.fit.scores import HAZY, ViewScore
+from mi_nerfattack.fit.scores import HAZY, SOLID, ViewScore
 
 MIN_PSNR_DB = 24.0  # mean over held-out views
 MIN_WORST_DB = 18.0  # of any held-out view
 MAX_GAP_DB = 5.0  # fitted less held-out views
 MAX_HAZY = 0.10  # share of rays, mean over held-out views
+MAX_HOLES = 0.005  # share of known surfaces, mean over held-out views
 MIN_VIEWS = 3  # held-out views that a mean is worth something from
 
 
@@ -27,6 +28,7 @@ class Subject:
         blurred: where the mean PSNR is low.
         worst: where one view is bad.
         fog: where many rays are hazy.
+        holes: where light comes through known surfaces.
         learnt: where the fitted rays are much better than the held-out ones.
     """
 
@@ -36,6 +38,7 @@ class Subject:
     blurred: str
     worst: str
     fog: str
+    holes: str
     learnt: str
 
 
@@ -49,6 +52,8 @@ SCENE = Subject(
     "images with a wrong pose, blur, or things that moved.",
     fog="Fog or thin floaters: add depth or views from other sides, or narrow the "
     "bounds; depths and occlusion by objects are unsure until then.",
+    holes="Light comes through surfaces: fit for longer, add images that show them, "
+    "and check that the depth belongs to the images.",
     learnt="The field has learnt images, not the scene: add images between the "
     "present ones, refine the poses, or take a smaller network.",
 )
@@ -63,6 +68,8 @@ OBJECT = Subject(
     "(--resolution 128); of a folder, leave out images that show something else.",
     fog="The surface is not solid: fit for longer (--steps) or with a finer grid "
     "(--resolution 128); what is transparent stays so.",
+    holes="The surface has holes: fit for longer (--steps) or with a finer grid "
+    "(--resolution 128).",
     learnt="The field has learnt views, not the object: give more views (--views for a "
     "mesh).",
 )
@@ -134,6 +141,10 @@ def judge(
         ),
         (hazy, float(np.mean([s.hazy for s in scores])), MAX_HAZY, False, subject.fog),
     ]
+    holes = [score.holes for score in scores if not np.isnan(score.holes)]
+    if holes:
+        name = f"share of known surfaces with an opacity below {SOLID:g}"
+        rows.append((name, float(np.mean(holes)), MAX_HOLES, False, subject.holes))
     if fitted_db is not None:
         pooled = pooled_db(psnr)
         gap = 0.0 if pooled == fitted_db else fitted_db - pooled  # both may be infinite

@@ -13,9 +13,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from mi_nerfattack.fit.scores import SOLID
 from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
 
-SOLID = 0.5  # opacity from which on a ray has a depth worth showing
 _ERROR_MAX = 0.4  # of sRGB values, at the end of the scale
 _FAR = 0.98  # quantile of depths at the end of the scale
 _DEPTHS, _ERRORS, _NOTHING = "viridis_r", "inferno", "#c8c8c8"

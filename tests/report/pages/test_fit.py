@@ -7,12 +7,14 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.far_room import SolidField, room_views, shell_cells
 from helpers.page_text import page_text
 from helpers.small_fields import homogeneous, sigmoid_to_linear, small_ngp
 from helpers.sphere_views import SIZE, sphere_views
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
+from mi_nerfattack.fields import Occupancy
 from mi_nerfattack.fit.options import FitProgress, FitResult
 from mi_nerfattack.fit.scores import (
     FieldRenderer,
@@ -87,6 +89,31 @@ def test_depth_and_haze_of_a_known_box():
     thin = homogeneous(0.3)  # 1 - exp(-0.6) = 0.45 along the axis
     view = FieldRenderer(thin).render(images.camera, images.camera_to_world[0])
     assert view.hazy == 1
+
+
+@pytest.mark.parametrize(("layers", "is_whole"), [(1, False), (2, True)])
+def test_rings_of_holes_in_far_walls_are_told(layers, is_whole):
+    """Cells of 0.94 m in one layer, and steps of 1 m at 32 m."""
+    images, depth = room_views(8)
+    field = SolidField(0.2, 1 / 32)
+    field.occupancy = Occupancy(shell_cells((72, 72, 36), layers))
+    scores = evaluate(field, images, range(8), depth)
+    (found,) = (item for item in judge(scores) if "known surfaces" in item.name)
+    assert found.met == is_whole and (found.value > 0.01) != is_whole
+    assert ("Light comes through surfaces" in verdict([found])) != is_whole
+
+
+def test_holes_are_counted_where_surfaces_are_known_and_in_the_box():
+    field, _ = solid_box()
+    images = grey_views([0])
+    known = np.full((1, 12, 16), 2.5, np.float32)
+    known[0, 0], known[0, 1] = np.nan, np.inf
+    known[0, 2] = 7  # behind the box
+    assert evaluate(field, images, [0], known)[0].holes == 0
+    field.occupancy = Occupancy(np.array([True, False]).reshape(1, 1, 2))  # below z = 0
+    assert evaluate(field, images, [0], known)[0].holes == pytest.approx(3 / 9)
+    assert np.isnan(evaluate(field, images, [0], np.full_like(known, 7))[0].holes)
+    assert np.isnan(evaluate(field, images, [0])[0].holes)
 
 
 def test_only_worst_views_keep_their_rendering():
@@ -169,24 +196,30 @@ def test_report_of_an_ngp_without_depth(tmp_path):
     assert images.camera.width == SIZE
 
 
-def scores_of(psnr: list[float], hazy: float = 0.01) -> list[ViewScore]:
-    return [ViewScore(i, f"{i}", value, 0.9, hazy) for i, value in enumerate(psnr)]
+def scores_of(
+    psnr: list[float], hazy: float = 0.01, holes: float = np.nan
+) -> list[ViewScore]:
+    return [
+        ViewScore(i, f"{i}", value, 0.9, hazy, holes) for i, value in enumerate(psnr)
+    ]
 
 
 @pytest.mark.parametrize(
-    ("psnr", "fitted", "hazy", "failed"),
+    ("psnr", "fitted", "hazy", "holes", "failed"),
     [
-        ([30, 31, 29], 31, 0.01, []),
-        ([30, 31], 31, 0.01, ["held-out views"]),
-        ([23, 23, 23], 25, 0.01, ["mean PSNR"]),
-        ([30, 17, 30], 25, 0.01, ["worst"]),
-        ([25, 25, 25], 31, 0.01, ["fitted rays less"]),
-        ([25, 25, 25], 26, 0.2, ["opacity"]),
-        ([np.inf] * 3, np.inf, 0.0, []),
+        ([30, 31, 29], 31, 0.01, np.nan, []),
+        ([30, 31], 31, 0.01, np.nan, ["held-out views"]),
+        ([23, 23, 23], 25, 0.01, np.nan, ["mean PSNR"]),
+        ([30, 17, 30], 25, 0.01, np.nan, ["worst"]),
+        ([25, 25, 25], 31, 0.01, np.nan, ["fitted rays less"]),
+        ([25, 25, 25], 26, 0.2, np.nan, ["opacity"]),
+        ([30, 31, 29], 31, 0.01, 0.004, []),
+        ([30, 31, 29], 31, 0.01, 0.006, ["known surfaces"]),
+        ([np.inf] * 3, np.inf, 0.0, np.nan, []),
     ],
 )
-def test_verdict_names_what_is_not_met(psnr, fitted, hazy, failed):
-    criteria = judge(scores_of(psnr, hazy), fitted)
+def test_verdict_names_what_is_not_met(psnr, fitted, hazy, holes, failed):
+    criteria = judge(scores_of(psnr, hazy, holes), fitted)
     names = [item.name for item in criteria if not item.met]
     assert len(names) == len(failed)
     assert all(part in name for part, name in zip(failed, names, strict=True))
