@@ -22,6 +22,7 @@ from mi_nerfattack.render.camera.intrinsics import (
 _CUBE = 2.0  # half edge of the cube, in distances of the farthest camera
 _MARGIN = 0.01  # around the box of all depth points, of its longest edge
 _MIN_MARGIN_M = 0.05
+_FAR_MARGIN = 1 / 128  # of the largest depth: what an NGP's march steps there
 _MILLIMETRE = 1e-3
 _POINTS_PERCENT = 2.0  # of the points on either side of each axis are outliers
 _POINTS_MARGIN = 0.1  # around the box of points and cameras, of its longest edge
@@ -136,10 +137,10 @@ def find_bounds(
     """Choose the box of a field.
 
     Given bounds win. With depth, the box of all points seen, and 1 % of its longest
-    edge (at least 5 cm) around it. With sparse points, the box of all cameras and of
-    the points without the outermost 2 % on either side, and 10 % around it. Otherwise
-    a cube around the point nearest to all optical axes; its half edge is twice the
-    distance of the farthest camera.
+    edge (at least 5 cm and a 128th of the largest depth) around it. With sparse points,
+    the box of all cameras and of the points without the outermost 2 % on either side,
+    and 10 % around it. Otherwise a cube around the point nearest to all optical axes;
+    its half edge is twice the distance of the farthest camera.
 
     Args:
         images: the posed images, perhaps with sparse points.
@@ -174,16 +175,19 @@ def _box_of_points(
     images: PosedImages, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the box of the points of depth maps, None where there are none."""
-    corners = [
-        (block.min(0), block.max(0))
-        for block in depth_points(images, depth, range(len(images)))
-        if len(block)
-    ]
-    if not corners:
+    ends = []
+    for eye, rays in depth_rays(images, depth, range(len(images))):
+        seen = rays[rays[..., 3] > 0].astype(np.float64)
+        if len(seen):
+            t = 1 / seen[:, 3:]
+            points = eye + t * seen[:, :3]
+            ends.append((points.min(0), points.max(0), t.max()))
+    if not ends:
         return None
-    lower = np.min([low for low, _ in corners], axis=0)
-    upper = np.max([high for _, high in corners], axis=0)
-    margin = max(_MIN_MARGIN_M, _MARGIN * float((upper - lower).max()))
+    lower = np.min([low for low, _, _ in ends], axis=0)
+    upper = np.max([high for _, high, _ in ends], axis=0)
+    room = _FAR_MARGIN * max(float(far) for _, _, far in ends)
+    margin = max(_MIN_MARGIN_M, _MARGIN * float((upper - lower).max()), room)
     return lower - margin, upper + margin
 
 
@@ -209,50 +213,25 @@ def _focus(camera_to_world: np.ndarray) -> np.ndarray:
     return np.linalg.solve(matrix, (across @ eyes[:, :, None]).mean(0)[:, 0])
 
 
-_UPSAMPLING = 4
-_SMOOTH_RATIO = 1.5  # neighbours with depths closer than this lie on one surface
-
-
-def depth_points(
-    images: PosedImages, depth: np.ndarray, indices: Iterable[int], reach_m: float = 0.0
-) -> Iterable[np.ndarray]:
-    """Yield points (n, 3), metres, on the surfaces that depth maps show.
-
-    Between neighbouring pixels on one surface points are interpolated, linear in
-    inverse depth, since pixels at a grazing angle lie far apart.
+def depth_rays(
+    images: PosedImages, depth: np.ndarray, indices: Iterable[int]
+) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+    """Yield the rays of images with the inverse of the distances that depth maps show.
 
     Args:
         images: the posed images.
-        depth: (n, height, width), metres along the ray; infinite or unknown (NaN)
-            depths give no point.
+        depth: (n, height, width), metres along the ray, infinite where nothing is hit
+            and NaN where it is unknown.
         indices: of the images to use.
-        reach_m: also yield the points this far before and behind the surface.
+
+    Returns:
+        for each image the origin of its rays (3,), metres, and (height, width, 4),
+        float32: their unit directions, and 1 / metre; 0 without a surface.
     """
     for index in indices:
         camera, pose = images.camera_of(index), images.camera_to_world[index]
         direction = generate_rays(camera, *pose_arrays(pose), 1)[1].numpy()
-        ray = direction.reshape(3, camera.height, camera.width).astype(np.float64)
-        inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0.0)
-        eye = pose[:3, 3]
-        for unit, t in (*_between(ray, inverse, 1), *_between(ray, inverse, 2)):
-            for offset in {0.0, -reach_m, reach_m}:
-                yield eye + ((t + offset) * unit).T
-
-
-def _between(
-    ray: np.ndarray, inverse: np.ndarray, axis: int
-) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-    """Yield directions (3, n) and depths (n,) between neighbours along an axis."""
-    first = [slice(None)] * 3
-    second = [slice(None)] * 3
-    first[axis], second[axis] = slice(None, -1), slice(1, None)
-    a, b = inverse[tuple(first[1:])], inverse[tuple(second[1:])]
-    both = (a > 0) & (b > 0)
-    joined = both & (np.maximum(a, b) < _SMOOTH_RATIO * np.minimum(a, b))
-    ray_a, ray_b = ray[tuple(first)], ray[tuple(second)]
-    for k in range(_UPSAMPLING):
-        share = k / _UPSAMPLING
-        used = joined if k else a > 0
-        mixed = (1 - share) * ray_a[:, used] + share * ray_b[:, used]
-        t = 1 / ((1 - share) * a[used] + share * b[used])
-        yield mixed / np.linalg.norm(mixed, axis=0), t
+        size = camera.height, camera.width
+        inverse = np.where(np.isfinite(depth[index]), 1 / depth[index], 0)
+        rays = np.concatenate([direction.T.reshape(*size, 3), inverse[..., None]], 2)
+        yield pose[:3, 3], rays.astype(np.float32)

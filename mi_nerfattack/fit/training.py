@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.capture.inputs import depth_points
+from mi_nerfattack.capture.inputs import depth_rays
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -113,8 +113,8 @@ class Training:
                     "a part of this box, give bounds around what the cameras look at"
                 )
             return cells
-        points = depth_points(self.images, depth, self.fitted, self.field.step_m)
-        cells = cells_near_surfaces(points, lower, upper, shape)
+        views = depth_rays(self.images, depth, self.fitted)
+        cells = cells_near_surfaces(views, self.field, shape)
         if not cells.any():
             raise InputError(
                 f"bounds: {lower.tolist()} to {upper.tolist()}; no depth lies inside"

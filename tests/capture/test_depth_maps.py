@@ -14,7 +14,7 @@ from helpers.posed_folders import write_transforms
 from helpers.sphere_views import RADIUS, sphere_views, write_folder
 from PIL import Image
 
-from mi_nerfattack.capture.inputs import depth_points, find_bounds, read_depth
+from mi_nerfattack.capture.inputs import find_bounds, read_depth
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.capture.transforms import (
     find_transforms,
@@ -142,13 +142,6 @@ def test_no_depth_without_a_json_file(tmp_path):
     assert read_depth(tmp_path, sphere_views(2)[0]) is None
     with pytest.raises(InputError, match="neither transforms.json"):
         find_transforms(tmp_path)
-
-
-def test_unknown_depth_gives_no_points():
-    images, depth = sphere_views(2)
-    everything = np.full_like(depth, np.nan)
-    blocks = depth_points(images, everything, [0, 1])
-    assert sum(len(block) for block in blocks) == 0
 
 
 def test_unknown_depth_has_no_loss():

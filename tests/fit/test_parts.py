@@ -12,10 +12,9 @@ from helpers import small_fields as small
 from helpers.sphere_views import RADIUS, SIZE, sphere_views, world_rays, write_folder
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
-from mi_nerfattack.capture.inputs import depth_points, find_bounds, read_depth
+from mi_nerfattack.capture.inputs import find_bounds, read_depth
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fit.cells import cells_near_surfaces, grid_shape
 from mi_nerfattack.fit.loss import LossWeights, huber, loss_and_cotangent
 from mi_nerfattack.fit.rays import RayBank, RayBatch
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
@@ -129,27 +128,6 @@ def test_loss_of_white_before_white_still_has_a_derivative():
     assert cotangent.radiance.numpy().min() > 0.1
 
 
-def test_cells_near_a_plane_are_those_it_crosses():
-    camera = from_fov(64, 32, 90.0)
-    pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 1.3]))
-    images = PosedImages(
-        np.zeros((1, 32, 64, 3), np.uint8), pose[None], camera, ("plane",)
-    )
-    ray = world_rays(camera, pose)
-    down = ray[..., 2] < 0
-    depth = np.where(down, -1.5 / np.where(down, ray[..., 2], -1), np.inf)
-    lower, upper = np.array([0.0, -5.0, -1.0]), np.array([20.0, 5.0, 3.0])
-    shape = grid_shape(lower, upper, 40)
-    assert shape == (40, 20, 20)
-    points = depth_points(images, depth[None].astype(np.float32), [0], 0.01)
-    cells = cells_near_surfaces(points, lower, upper, shape)
-    assert set(np.nonzero(cells)[2]) <= {4, 5}  # the plane lies between these layers
-    # Pixels lie d^2 / (h f) apart, 2 m at d = 10 m, points a quarter of that: no gap
-    # up to there, although the cells are 0.5 m long.
-    along = cells[:, 9:11].any(axis=(1, 2))
-    assert along[4:19].all()
-
-
 def test_bounds_given_must_be_in_order():
     images, _ = sphere_views(2)
     lower, upper = find_bounds(images, None, (0, 0, 0, 1, 2, 3))
@@ -171,11 +149,16 @@ def test_bounds_around_the_points_that_depth_shows():
     np.testing.assert_allclose(upper - lower, 2 * (RADIUS + 0.05), atol=0.02)
 
 
-def test_bounds_where_depth_gives_no_point_are_those_without_depth():
+def test_bounds_hold_a_step_of_the_march_behind_what_is_far():
+    camera, pose = from_fov(8, 8, 1.0), look_at(np.zeros(3), [1.0, 0.0, 0.0])
+    images = PosedImages(np.zeros((1, 8, 8, 3), np.uint8), pose[None], camera, ("a",))
+    upper = find_bounds(images, np.full((1, 8, 8), 45, np.float32))[1]
+    assert upper[0] == pytest.approx(45 + 45 / 128, abs=0.01)
+
+
+def test_bounds_where_no_depth_is_known_are_those_without_depth():
     images, depth = sphere_views(12)
-    alone = np.full_like(depth, np.nan)
-    alone[:, -1, -1] = 1.0  # points lie between a pixel and the next
-    lower, upper = find_bounds(images, alone)
+    lower, upper = find_bounds(images, np.full_like(depth, np.nan))
     assert [lower.tolist(), upper.tolist()] == [b.tolist() for b in find_bounds(images)]
 
 
