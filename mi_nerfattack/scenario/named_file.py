@@ -84,7 +84,8 @@ class NamedFile:
             digest = hashlib.sha256(raw + self.name.encode())
             return {"file": self.name, "sha256": digest.hexdigest()}
         raw = _read(self.path)
-        digest = hashlib.sha256(raw + self.function.encode())
+        digest = hashlib.sha256(raw)
+        digest.update(self.function.encode())
         if self.path.suffix.lower() == ".xml":
             text = raw.decode("utf-8", "replace")
             for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):

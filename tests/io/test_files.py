@@ -6,6 +6,8 @@ import os
 import pickle
 import re
 import stat
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -70,6 +72,31 @@ def test_safetensors_bytes_are_reproducible_and_standard(tmp_path):
     np.testing.assert_array_equal(read["b"], tensors["b"])
     assert read["a"].shape == ()
     assert int.from_bytes(raw[:8], "little") % 8 == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the size from /proc")
+def test_reading_asks_for_no_more_memory_than_the_file_has(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    code = (
+        "import resource\n"
+        "from mi_nerfattack.io import files\n"
+        "pages = int(open('/proc/self/statm').read().split()[0])\n"
+        "most = pages * resource.getpagesize() + (256 << 20)\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (most, most))\n"
+        "raw = files.read_bytes('a', files.MAX_TENSOR_BYTES)\n"
+        "print(raw, files.sha256('a')[:8])\n"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    # SHA-256 of "abc" as printed in FIPS 180-2, appendix B.1
+    assert done.stdout == "b'abc' ba7816bf\n", done.stderr
+
+
+def test_a_file_that_grows_while_it_is_read(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(b"abc")
+    monkeypatch.setattr(files, "_check_file", lambda *_: 2)
+    with pytest.raises(InputError, match="more than 2 bytes; it grows"):
+        files.read_bytes(tmp_path / "a", 2)
 
 
 @on_one_file
