@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
 import sys
-import threading
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Mapping, Sequence
 
 import tyro
 
 import mi_nerfattack
+from mi_nerfattack.backend.interrupts import raised_interrupts
 from mi_nerfattack.commands import COMMANDS, Command
 from mi_nerfattack.errors import NerfAttackError, is_interrupt
 from mi_nerfattack.system.heap import map_large_blocks
@@ -52,7 +49,7 @@ def main(
     debug = "--debug" in arguments
     arguments = [item for item in arguments if item != "--debug"]
     try:
-        with _terminate_as_interrupt():
+        with raised_interrupts(_end):
             code = _run(arguments, commands, prog)
             if sys.stdout is not None:  # closed before we started
                 sys.stdout.flush()
@@ -60,11 +57,6 @@ def main(
     except NerfAttackError as err:
         return _fail(f"error: {err}", EXIT_INPUT, debug)
     except KeyboardInterrupt:
-        return _fail("interrupted", EXIT_INTERRUPTED, debug)
-    except RuntimeError as err:
-        # Dr.Jit wraps whatever is raised while it records a loop
-        if not is_interrupt(err):
-            raise
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except MemoryError as err:
         advice = "give fewer or smaller images, cells or views"
@@ -81,6 +73,11 @@ def main(
             EXIT_INPUT,
             debug,
         )
+    except Exception as err:
+        # Dr.Jit, recording a loop, and modules, being imported, wrap what is raised
+        if not is_interrupt(err):
+            raise
+        return _fail("interrupted", EXIT_INTERRUPTED, debug)
 
 
 def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str) -> int:
@@ -114,25 +111,17 @@ def _drop_output() -> None:
 def _fail(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print(f"{PROG}: {message}", file=sys.stderr)
+    shown = "".join(
+        c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in message
+    )
+    print(f"{PROG}: {shown}", file=sys.stderr)  # files and servers name things
     return code
 
 
-@contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt, in the main thread alone."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+def _end() -> None:
+    """End the process at once, for a library that does not come back to Python."""
+    os.write(2, f"{PROG}: interrupted, in the midst of a computation\n".encode())
+    os._exit(EXIT_INTERRUPTED)
 
 
 if __name__ == "__main__":

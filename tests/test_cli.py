@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass
 
 import pytest
+from helpers.variants import later
 
 import mi_nerfattack
 from mi_nerfattack import cli
@@ -42,6 +43,8 @@ class Try:
                 raise KeyboardInterrupt
             except KeyboardInterrupt as err:
                 raise RuntimeError("dr.while_loop(): an exception") from err
+        if self.what == "names":
+            raise InputError("a: called '\x1b[2J\x9b1mä\u202e'\n\tb")
         if self.what == "rich":
             try:
                 raise BrokenPipeError
@@ -80,6 +83,11 @@ def test_bad_input_is_one_line_and_code_2(run):
     assert (code, out) == (2, "")
     message = "fields/x.safetensors: truncated; copy it again"
     assert err == f"mi-nerfattack: error: {message}\n"
+
+
+def test_a_message_does_not_steer_the_terminal(run):
+    message = r"a: called '\x1b[2J\x9b1mä\u202e'" + "\n\tb"
+    assert run("try", "--what", "names")[2] == f"mi-nerfattack: error: {message}\n"
 
 
 @pytest.mark.parametrize("place", [0, 3])
@@ -185,31 +193,60 @@ def test_standard_output_that_takes_nothing(where, code, message):
     assert message in done.stderr and done.stderr.count("\n") == bool(message)
 
 
-def test_ctrl_c_in_a_real_process():
+def start(body: str) -> subprocess.Popen:
+    """Run a command of a process of its own; returns when it has written a line."""
     code = (
-        "import sys, time\n"
+        "import ctypes, os, signal, sys, time\n"
         "from dataclasses import dataclass\n"
-        "from mi_nerfattack import cli, commands\n"
+        "from mi_nerfattack import cli, commands, variant\n"
+        "from mi_nerfattack.backend import interrupts\n"
+        "interrupts.GRACE_S = 0.3\n"
         "@dataclass(frozen=True)\n"
         "class Wait:\n"
         "    'Wait.'\n"
         "    def run(self):\n"
         "        print('ready', flush=True)\n"
-        "        time.sleep(60)\n"
+        f"        {body}\n"
         "commands.COMMANDS['wait'] = Wait\n"
         "sys.exit(cli.main(['wait']))"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-c", code]
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_ctrl_c_in_a_real_process():
+    process = start("time.sleep(60)")
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "mi-nerfattack: interrupted\n")
+
+
+@pytest.mark.parametrize("presses", [1, *later(2)])
+def test_ctrl_c_while_a_variant_is_imported(presses):
+    """Mitsuba imports modules in the call, and tells what stops them in its own way."""
+    press = "os.kill(os.getpid(), signal.SIGINT)"
+    times = f"for _ in range({presses}) if name.endswith('ad.integrators')"
+    look = f"lambda name, *_: [{press} {times}].clear()"
+    finder = f"type('Finder', (), {{'find_spec': staticmethod({look})}})"
+    process = start(f"sys.meta_path.insert(0, {finder}); variant.ensure()")
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "mi-nerfattack: interrupted\n")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="locks by the C library's name")
+@pytest.mark.parametrize("number", [signal.SIGTERM, *later(signal.SIGINT)])
+def test_a_library_that_never_comes_back_ends_with_the_process(number):
+    lock = "lock = ctypes.create_string_buffer(64); take = ctypes.CDLL(None)"
+    process = start(f"{lock}.pthread_mutex_lock; take(lock); take(lock)")
+    time.sleep(0.2)  # it has the lock, and waits for it
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    message = "mi-nerfattack: interrupted, in the midst of a computation\n"
+    assert (process.returncode, err) == (130, message)
 
 
 def test_doctor_as_json_and_as_table(run):

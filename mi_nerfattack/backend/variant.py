@@ -9,6 +9,7 @@ import os
 import mitsuba as mi
 
 from mi_nerfattack.backend import llvm
+from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.errors import NerfAttackError, SetupError
 
 VARIABLE = "MI_NERFATTACK_VARIANT"
@@ -33,7 +34,8 @@ def ensure() -> str:
         name = os.environ.get(VARIABLE, DEFAULT)
         _check_name(name)
         _check_backend(name)
-        mi.set_variant(name)
+        with held_interrupts():  # else it is set, and nothing is registered
+            mi.set_variant(name)
     else:
         _check_name(name)
         _check_backend(name)

@@ -23,8 +23,8 @@ from helpers.attack_jobs import (
 )
 
 from mi_nerfattack.backend import determinism
+from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.system.interrupts import held_interrupts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -154,6 +154,17 @@ def test_gradient_that_is_not_finite_costs_no_iteration(folder, tmp_path, monkey
     assert len(checkpoint_of(output)["history"]) == 5  # checkpoint_every = 3
     job(folder, output).run(resume=True)
     assert len(checkpoint_of(output)["history"]) == 6
+
+
+def test_handlers_of_others_are_not_held(monkeypatch):
+    heard = []
+    before = signal.signal(signal.SIGTERM, lambda *_: heard.append("told"))
+    try:
+        with held_interrupts():
+            signal.raise_signal(signal.SIGTERM)
+            assert heard == ["told"]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_held_interrupt_waits_for_a_good_place():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import mitsuba as mi
 import pytest
 
 from mi_nerfattack.backend import llvm
+from mi_nerfattack.backend import variant as variants
 from mi_nerfattack.fields import GridField, GridLayout, save_field
 
 USE = """
@@ -123,3 +125,18 @@ def test_other_variants_say_which_to_use(name: str) -> None:
                 mi.load_string(text, parallel=False)
             with pytest.raises(RuntimeError, match=message):
                 mi.load_dict({"type": plugin}, parallel=False)
+
+
+def test_an_interrupt_waits_until_the_plugins_are_registered(monkeypatch):
+    reached = []
+
+    def set_variant(name: str) -> None:
+        signal.raise_signal(signal.SIGINT)
+        reached.append(name)
+
+    monkeypatch.setattr(mi, "variant", lambda: None)
+    monkeypatch.setattr(mi, "set_variant", set_variant)
+    monkeypatch.delenv(variants.VARIABLE, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        variants.ensure()
+    assert reached == ["llvm_ad_rgb"]

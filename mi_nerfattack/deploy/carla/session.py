@@ -13,10 +13,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.deploy.carla.conventions import CarlaPose
 from mi_nerfattack.errors import InputError, NerfAttackError
 from mi_nerfattack.ranges import Name, Seconds, checked
-from mi_nerfattack.system.interrupts import held_interrupts
 
 _SUBSTEP = 0.01  # seconds of the physics
 _MAX_SUBSTEPS = 16  # CARLA's own limit

@@ -1,0 +1,116 @@
+"""Interrupts: raised, held back while things are half done, and heeded in any case."""
+
+from __future__ import annotations
+
+import select
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Seconds in which code outside Python must come back to it after a signal.
+GRACE_S = 5.0
+
+
+@contextmanager
+def raised_interrupts(end: Callable[[], None]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt, in the main thread alone.
+
+    Python runs a handler between two of its own instructions, and a library may never
+    come back to it, as a TorchScript program that loops for ever. A thread waits
+    `GRACE_S` for that, and ends the process.
+
+    Args:
+        end: what that thread calls.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard = threading.Event()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        heard.set()
+        raise KeyboardInterrupt
+
+    arrived, told = socket.socketpair()  # Python writes the number of each signal
+    told.setblocking(False)
+    watch = threading.Thread(target=_watch, args=(arrived, heard, end), daemon=True)
+    watch.start()
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
+    written = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(written)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        told.close()
+        watch.join()
+        arrived.close()
+
+
+def _watch(
+    arrived: socket.socket, heard: threading.Event, end: Callable[[], None]
+) -> None:
+    """Read the numbers of signals until nobody writes them any longer."""
+    while numbers := arrived.recv(1 << 12):
+        if set(SIGNALS).isdisjoint(numbers):
+            continue
+        if not heard.wait(GRACE_S):
+            end()
+        heard.clear()
+        if select.select([arrived], [], [], 0)[0]:
+            arrived.recv(1 << 12)  # of the same number, which Python tells once
+
+
+@contextmanager
+def held_interrupts() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C and SIGTERM back; what is yielded raises them.
+
+    A second signal is not held back. Only signals with a handler in Python that raises
+    KeyboardInterrupt are held, and only in the main thread, where they arrive.
+
+    Yields:
+        a function without arguments, to be called where an interruption leaves
+        nothing half done.
+
+    Raises:
+        KeyboardInterrupt: from the function yielded, or at the end, if one came.
+    """
+    came: list[int] = []
+
+    def check() -> None:
+        if came:
+            came.clear()
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    before: dict[int, Callable[[int, FrameType | None], object]] = {}
+    for number in SIGNALS:
+        handler = signal.getsignal(number)
+        if callable(handler):
+            before[number] = handler
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        try:
+            before[number](number, frame)
+        except KeyboardInterrupt:
+            if came:
+                raise
+            came.append(number)
+
+    for number in before:
+        signal.signal(number, hold)
+    try:
+        yield check
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    check()
