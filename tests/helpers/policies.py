@@ -31,7 +31,9 @@ def serving() -> Iterator[Callable[[type[BaseHTTPRequestHandler]], str]]:
     def start(handler: type[BaseHTTPRequestHandler]) -> str:
         handler.log_message = lambda *_: None
         server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        poll_s = (0.01,)  # how often it looks for its end, which a test waits for
+        serve = threading.Thread(target=server.serve_forever, args=poll_s, daemon=True)
+        serve.start()
         servers.append(server)
         return f"http://127.0.0.1:{server.server_port}"
 

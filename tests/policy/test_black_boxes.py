@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import threading
+import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import mitsuba as mi
@@ -147,7 +149,7 @@ def test_http_protocol_and_retries(served, rng, monkeypatch):
         ([(200, b'{"steer": [1]}', 0)], "answers.*KeyError"),
         ([(200, b'{"control": "left"}', 0)], "answers.*must be JSON"),
         ([(200, b'{"control": [1]}', 0)], r"controls \(1,\) for 2 images"),
-        ([(200, b'{"control": [1, NaN]}', 0)], "control nan for image 1"),
+        ([(200, b'{"control": [1, NaN]}', 0)], "answers.*NaN is not a JSON number"),
     ],
 )
 def test_http_errors(answers, message, served, rng, monkeypatch):
@@ -159,24 +161,107 @@ def test_http_errors(answers, message, served, rng, monkeypatch):
         policy.control(camera(2, rng), 0)
 
 
-class Dripping(BaseHTTPRequestHandler):
-    """Sends a byte now and then, each in time."""
+def raw_handler(*parts, pause=0.0):
+    """Make a handler that sends bytes as they are, the last of them again and again."""
 
-    def do_POST(self):
-        self.send_response(200)
-        self.end_headers()
-        try:
-            for _ in range(100):
-                self.wfile.write(b" ")
-                threading.Event().wait(0.05)
-        except OSError:
-            pass
+    class Raw(BaseHTTPRequestHandler):
+        def do_POST(self):
+            self.rfile.read(int(self.headers["Content-Length"]))
+            try:
+                for part in [*parts[:-1], *parts[-1:] * (100 if pause else 1)]:
+                    self.wfile.write(part)
+                    threading.Event().wait(pause)
+            except OSError:
+                pass  # the client has gone
+
+    return Raw
 
 
-def test_the_timeout_is_of_the_whole_answer(served, rng):
-    policy = HttpPolicy(served(Dripping), timeout_s=0.3, retries=0)
-    with pytest.raises(InputError, match="no answer in 0.3 s, after 1 attempts"):
-        policy.control(camera(1, rng), 0)
+HEAD = b"HTTP/1.1 200 OK\r\n"
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [HEAD + b"X-Long: ", b"a"],
+        [b"HTTP/1.1 100 Continue\r\n\r\n"],
+        [HEAD + b"Transfer-Encoding: chunked\r\n\r\n5;", b"a=b;"],
+        [HEAD + b"\r\n", b" "],
+    ],
+    ids=["headers", "continue", "extensions", "body"],
+)
+def test_the_timeout_is_of_everything_that_comes(parts, served, rng):
+    url = served(raw_handler(*parts, pause=0.03))  # each in time
+    before = time.monotonic()
+    with pytest.raises(InputError, match="no answer in 0.2 s, after 1 attempts"):
+        HttpPolicy(url, 0.2, retries=0).control(camera(1, rng), 0)
+    assert time.monotonic() - before < 1.5
+
+
+def test_the_timeout_is_of_a_connection_to_all_addresses(rng, monkeypatch):
+    """And of sending, to a server that takes nothing."""
+    calls = []
+
+    def connect(address, timeout):
+        calls.append(address)
+        time.sleep(timeout)
+        raise TimeoutError
+
+    monkeypatch.setattr(socket, "create_connection", connect)
+    found = [(2, 1, 6, "", (f"192.0.2.{i}", 80)) for i in range(5)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    before = time.monotonic()
+    with pytest.raises(InputError, match="no answer in 0.1 s, after 1 attempts"):
+        HttpPolicy("http://a", 0.1, retries=0).control(camera(1, rng), 0)
+    assert time.monotonic() - before < 0.4 and calls == [("192.0.2.0", 80)]
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (b'{"control": ["0.5"]}', "holds what is no number"),
+        (b'{"control": [true]}', "holds what is no number"),
+        (b'{"control": [[0.5, null]]}', "holds what is no number"),
+        (b'{"control": {"0": 0.5}}', "holds what is no number"),
+        (b'{"control": [[1], [1, 2]]}', ""),
+        (b'{"control": [1%s]}' % (b"0" * 400), ""),
+        (b'{"control": [0], "control": [1]}', "key 'control' twice"),
+        (b"\xff", ""),
+        (b"[" * 5000, ""),
+    ],
+)
+def test_answers_are_strict(body, message, served, rng):
+    url = served(handler((200, body, 0))[0])
+    with pytest.raises(InputError, match=f"answers .*{message}.*must be JSON"):
+        HttpPolicy(url).control(camera(1, rng), 0)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        b'Content-Length: 99\r\n\r\n{"control": [0.5]}',
+        b'Transfer-Encoding: chunked\r\n\r\n11\r\n{"control": [0.5]}\r\n',
+        b'Transfer-Encoding: chunked\r\n\r\n-1\r\n{"control": [0.5]}',
+    ],
+)
+def test_a_truncated_answer_is_none(parts, served, rng):
+    url = served(raw_handler(HEAD + parts))
+    with pytest.raises(InputError, match="IncompleteRead.*after 1 attempts"):
+        HttpPolicy(url, retries=0).control(camera(1, rng), 0)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        (b"HTTP/1.1 500 \x1b[2J\x9bm%s\r\n\r\n" % (b"a" * 999), r"\\x1b\[2J\\x9bm"),
+        (b"\x1b[2J\r\n\r\n", r"\\x1b\[2J"),
+        (b"HTTP/1.1 302 Found\r\nLocation: http://[::1\r\n\r\n", "status 302 Found"),
+    ],
+)
+def test_what_a_server_calls_its_errors(head, message, served, rng):
+    with pytest.raises(InputError, match=message) as caught:
+        HttpPolicy(served(raw_handler(head)), retries=0).control(camera(1, rng), 0)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 400
 
 
 def test_local_servers_are_asked_without_proxies(served, rng, monkeypatch):
