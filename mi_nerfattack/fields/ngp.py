@@ -153,15 +153,19 @@ class NGPField(AbstractField):
         self.encoding.data = flat_parameter(
             tensors["table"], (self.encoding.n_params,), "table"
         )
+        bound = float(np.abs(tensors["table"]).max())
         for prefix, module in zip(NETWORK_NAMES, self._modules, strict=True):
+            bound = max(bound, 2.0)  # harmonics of the view, beside what was before
             for index, key in enumerate(module):
-                value = np.asarray(tensors[f"{prefix}.{index}"], np.float32)
+                name = f"{prefix}.{index}"
+                value = np.asarray(tensors[name])
                 if value.shape != tuple(module[key].shape):
                     raise InputError(
-                        f"{prefix}.{index}: shape {value.shape}; expected "
+                        f"{name}: shape {value.shape}; expected "
                         f"{tuple(module[key].shape)}"
                     )
-                module[key] = type(module[key])(value)
+                bound = _bound(name, value, bound)
+                module[key] = type(module[key])(value.astype(np.float32))
         sky = np.asarray(tensors["sky"], np.float32)
         if sky.ndim != 3 or sky.shape[2] != 3:
             raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")
@@ -309,6 +313,27 @@ class NGPField(AbstractField):
 
 
 NETWORK_NAMES = ("density_net", "colour_net")
+
+#: A network's sums stay below this in absolute value: far from what a float holds.
+_LARGEST = 1e30
+
+
+def _bound(name: str, weights: np.ndarray, before: float) -> float:
+    """Bound what a layer returns; infinity less infinity would be NaN.
+
+    Args:
+        name: of the weights.
+        weights: (outputs, inputs).
+        before: bound of what the layer takes.
+    """
+    bound = before * float(np.abs(weights).sum(axis=1, dtype=np.float64).max())
+    if not bound < _LARGEST:
+        raise InputError(
+            f"tensor '{name}': weights up to {np.abs(weights).max():g}, on values up "
+            f"to {before:.3g}, give sums up to {bound:.3g}; below {_LARGEST:g} is "
+            "allowed, fit the field again"
+        )
+    return bound
 
 
 def _weight_type() -> type:

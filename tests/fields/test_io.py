@@ -150,6 +150,19 @@ def test_fields_that_no_file_can_hold_are_not_written(tmp_path, bad: float) -> N
     assert not path.exists()
 
 
+@pytest.mark.parametrize("name", ["density_net.1", "colour_net.0", "colour_net.2"])
+def test_ngp_whose_sums_overflow(tmp_path: Path, name: str) -> None:
+    """Infinity less infinity would be NaN in the picture."""
+    path = tmp_path / "n.safetensors"
+    save_field(path, small.small_ngp())
+    tensors, header = files.read_safetensors(path)
+    sign = np.where(np.arange(tensors[name].size) % 2, 1.0, -1.0)
+    tensors[name] = (1e38 * sign).astype(np.float32).reshape(tensors[name].shape)
+    files.write_safetensors(path, tensors, header)
+    with pytest.raises(InputError, match=f"{path}: tensor '{name}': weights up to 1e"):
+        load_field(path)
+
+
 def test_ngp_matrix_of_another_shape(tmp_path: Path) -> None:
     path = tmp_path / "n.safetensors"
     save_field(path, small.small_ngp())
