@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,12 +15,13 @@ from mi_nerfattack.deploy.place import Conditions, Place, bundled_place
 from mi_nerfattack.deploy.registry import ENVIRONMENTS, make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.drive import departure_limits
+from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 #: Depth that observations have where there is nothing, and the largest, metres.
 FAR_M = 1000.0
 
-_WORLD_M = 1e8  # coordinates are below this, those of maps (UTM) too
+_WORLD_M = 2 * LARGEST_M  # beyond what is driven from the farthest pose
 
 
 class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -48,7 +50,8 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         routes: at least one.
         width: of the vehicle, metres; less than that of every lane.
         max_steps: of an episode.
-        margin_m: arc length before the route's end at which an episode is truncated.
+        margin_m: arc length before the route's end at which an episode is truncated,
+            at least 0.
         render_mode: "rgb_array" or None.
 
     Raises:
@@ -69,8 +72,10 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     ) -> None:
         if not routes:
             raise InputError("routes: none; at least one route to follow")
-        if max_steps < 1:
+        if not max_steps >= 1:
             raise InputError(f"max_steps: {max_steps}; at least 1")
+        if not 0 <= margin_m < math.inf:
+            raise InputError(f"margin_m: {margin_m}; a finite length of at least 0")
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode: {render_mode!r}; 'rgb_array' or None")
         self._limits = departure_limits(routes, width)
@@ -85,13 +90,14 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._route = routes[0]
         self._frame: CameraFrame | None = None
-        self._steps = 0
+        self._steps, self._closed = 0, False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode; see the class for the options."""
         super().reset(seed=seed)
+        self._require_open()
         options = options or {}
         unknown = set(options) - {"route", "pose"}
         if unknown:
@@ -112,12 +118,19 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Hold a control for one period.
 
         Raises:
-            InputError: the action is not one finite number.
+            InputError: the action is not one finite number, or the environment is
+                closed.
         """
-        share = np.asarray(action, np.float64)
+        self._require_open()
+        try:
+            share = np.asarray(action)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"action: {action!r}; one control, shape (1,)") from error
         if share.size != 1:
             raise InputError(f"action: shape {share.shape}; one control, shape (1,)")
-        control = float(share.reshape(())) * self.environment.max_control
+        if share.dtype.kind not in "iuf":
+            raise InputError(f"action: {action!r}; a number from -1 to 1")
+        control = float(share.item()) * self.environment.max_control
         frame = self.environment.step(control)
         self._frame, self._steps = frame, self._steps + 1
         info = self._info()
@@ -136,7 +149,12 @@ class DrivingEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def close(self) -> None:
         """Close the environment."""
+        self._closed = True
         self.environment.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise InputError("DrivingEnv: it is closed; make another")
 
     def _info(self) -> dict[str, Any]:
         state = self.environment.state

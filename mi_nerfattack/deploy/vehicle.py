@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 
 
 class AbstractVehicle(ABC):
@@ -65,14 +66,15 @@ def checked_pose(pose: Any) -> np.ndarray:
     """Copy a vehicle's pose x, y (metres), theta (radians) to (3,) float64.
 
     Raises:
-        InputError: it is not three finite numbers.
+        InputError: it is not three finite numbers of at most `LARGEST_M`.
     """
+    allowed = f"three finite numbers x, y, theta, at most {LARGEST_M:g}"
     try:
         array = np.array(pose, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"pose: {pose!r}; three finite numbers x, y, theta") from error
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"pose: {array.tolist()}; three finite numbers x, y, theta")
+        raise InputError(f"pose: {pose!r}; {allowed}") from error
+    if array.shape != (3,) or not (np.abs(array) <= LARGEST_M).all():
+        raise InputError(f"pose: {array.tolist()}; {allowed}")
     return array
 
 

@@ -149,12 +149,41 @@ def test_a_refused_reset_leaves_the_episode_as_it_was():
     assert (observation["goal"], reward) == (0, 0)
 
 
+def test_observations_of_the_farthest_pose_lie_in_their_space():
+    driving = blind()
+    observation, _ = driving.reset(seed=0, options={"pose": (-1e9, 1e9, 3.0)})
+    assert driving.observation_space.contains(observation)
+    with pytest.raises(InputError, match=r"pose: \[1e\+20, .*at most 1e\+09"):
+        driving.reset(options={"pose": (1e20, 0.0, 0.0)})
+
+
+def test_a_closed_environment_is_over():
+    driving = blind()
+    driving.reset(seed=0)
+    driving.close()
+    for call in (driving.reset, lambda: driving.step(np.zeros(1))):
+        with pytest.raises(InputError, match="it is closed; make another"):
+            call()
+
+
+@pytest.mark.parametrize("action", ["left", "0.5", None, [True], {}, [[1], [2, 3]], 1j])
+def test_actions_that_are_no_numbers(action):
+    driving = blind()
+    driving.reset(seed=0)
+    with pytest.raises(InputError, match="action: "):
+        driving.step(action)
+    assert driving.step(10**2)[1] <= 0  # beyond the largest it saturates
+
+
 def test_bad_input(tmp_path):
     driving = blind()
     with pytest.raises(InputError, match="routes: none; at least one"):
         DrivingEnv(blank_environment(), [])
     with pytest.raises(InputError, match="max_steps: 0; at least 1"):
         blind(max_steps=0)
+    for margin in (float("nan"), -1.0, float("inf")):
+        with pytest.raises(InputError, match=f"margin_m: {margin}; a finite length"):
+            blind(margin_m=margin)
     with pytest.raises(InputError, match="render_mode: 'human'; 'rgb_array' or None"):
         blind(render_mode="human")
     with pytest.raises(InputError, match="options.route: 'left'; one of 'line'"):

@@ -10,6 +10,7 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.pose import check_rigid
+from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,11 @@ class Track:
         check_times(self.where, self.times)
         for index, matrix in enumerate(self.camera_to_world):
             check_rigid(matrix, f"{self.where}: pose of frame {index}")
+            if np.abs(matrix).max() > LARGEST_M:
+                raise InputError(
+                    f"{self.where}: pose of frame {index} is at "
+                    f"{matrix[:3, 3].tolist()}; at most {LARGEST_M:g} m"
+                )
 
 
 def check_times(where: str, times: np.ndarray) -> None:

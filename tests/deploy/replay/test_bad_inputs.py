@@ -49,6 +49,11 @@ def changed(rows: list[str], index: int, text: str) -> list[str]:
         (CSV, changed(csv_rows(), 2, "0.2,2.png,x,0,0"), "row 2: x_m: 'x'; must"),
         (CSV, changed(csv_rows(), 2, "0.2,2.png,1"), "row 2 has 3 values; .* 5"),
         (CSV, changed(csv_rows(), 2, "0.05,2.png,0,0,0"), "frame 2 is at 0.05 s.*sort"),
+        (
+            CSV,
+            changed(csv_rows(), 2, "0.2,2.png,2e9,0,0"),
+            "frame 2 is at .*at most 1e",
+        ),
         (CSV, changed(csv_rows(), 2, "0.2,gone.png,0,0,0"), "'gone.png' is not there"),
         (CSV, changed(csv_rows(), 2, "0.2,,0,0,0"), "row 2: file: ''; needs a path"),
         (CSV, changed(csv_rows(), 2, ",2.png,0,0,0"), "row 2: time_s: ''; must"),
