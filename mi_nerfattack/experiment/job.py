@@ -11,14 +11,16 @@ from typing import Any
 
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.determinism import deterministic
+from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.run_folder import RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages
 from mi_nerfattack.rollout.drive import departure_limit
 from mi_nerfattack.scenario.scenario import Scenario, portable_text
 from mi_nerfattack.scenario.world import World, build_attack, build_world
-from mi_nerfattack.system.interrupts import held_interrupts
 
 #: Called with a sentence.
 OnNotice = Callable[[str], None]
@@ -26,6 +28,13 @@ OnNotice = Callable[[str], None]
 
 def _quiet(*arguments: Any) -> None:
     del arguments
+
+
+def _is_of_disk(error: BaseException | None) -> bool:
+    """Tell an error that no other scenario mends, such as a full disk."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__cause__
+    return error is not None
 
 
 @dataclass
@@ -49,7 +58,14 @@ class Job:
     on_notice: OnNotice = _quiet
 
     def run(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
-        """Do the whole job and write the run folder.
+        """Claim the run folder and do the whole job; see :meth:`run_claimed`."""
+        with claimed(self.output, resume):
+            return self.run_claimed(resume, force)
+
+    def run_claimed(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
+        """Do the whole job and write the run folder, which is claimed.
+
+        A scenario that is refused before its first iteration leaves nothing there.
 
         Args:
             resume: go on from what an interrupted run left in the folder; from the
@@ -61,8 +77,8 @@ class Job:
             the document that ``metrics.json`` holds.
 
         Raises:
-            InputError: a file is missing or wrong, the folder is not empty or in use,
-                or the run in it is damaged, or of another scenario or versions.
+            InputError: a file is missing or wrong, or the run in the folder is
+                damaged, or of another scenario or versions.
             SetupError: the scenario is deterministic and the variant cannot be.
         """
         started = time.perf_counter()
@@ -70,21 +86,24 @@ class Job:
         text = portable_text(self.scenario, self.text)
         route, seed = self.scenario.scene.route, self.scenario.seed
         strict = self.scenario.attack.deterministic
-        with (
-            deterministic() if strict else nullcontext(),
-            RunFolder(self.output, text, identity, route, seed) as folder,
-        ):
+        folder = RunFolder(self.output, text, identity, route, seed)
+        with deterministic() if strict else nullcontext():
             if resume:
                 folder.read(force, self.on_notice)
-            else:
-                folder.check_new()
-            return self._work(folder, Account(started, folder.effort))
+            world = build_world(self.scenario, self.policy)
+            departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
+            folder.begin()
+            try:
+                return self._work(world, folder, Account(started, folder.effort))
+            except InputError as err:
+                if not _is_of_disk(err):
+                    folder.withdraw()
+                raise
 
-    def _work(self, folder: RunFolder, account: Account) -> dict[str, Any]:
+    def _work(
+        self, world: World, folder: RunFolder, account: Account
+    ) -> dict[str, Any]:
         """Do what is not done yet."""
-        world = build_world(self.scenario, self.policy)
-        departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
-        folder.begin()
 
         def effort() -> Effort:
             renders = world.surrogate.renders + world.deployment.renders

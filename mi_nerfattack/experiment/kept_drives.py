@@ -98,6 +98,13 @@ class KeptDrives:
         for path in set(self.paths()) - kept:
             path.unlink()
 
+    def remove(self) -> None:
+        """Remove all files, and the folder."""
+        for path in self.paths():
+            path.unlink()
+        if self.folder.exists():
+            self.folder.rmdir()
+
     def add(self, drives: Sequence[Drive], effort: Effort) -> None:
         """Write drives, one after the other.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 
 from mi_nerfattack.errors import InputError
@@ -18,14 +17,14 @@ SCENARIO = "scenario.toml"
 
 
 class RunFolder:
-    """A folder that one process at a time works in; a context manager.
+    """A folder that this process has claimed, see :func:`claim.claimed`.
 
     Its files appear in this order: ``scenario.toml``, ``drives/`` with a file a drive
     and, among them, ``checkpoint.safetensors``, results. A process may be killed
-    between any two of them, or before the folder exists.
+    between any two of them.
 
     Args:
-        path: the folder, may be missing.
+        path: the folder.
         text: the scenario file, its paths absolute.
         identity: versions and scenario, see :meth:`Scenario.identity`.
         route: name of the route.
@@ -40,29 +39,13 @@ class RunFolder:
         self.checkpoint = CheckpointFile(path / CHECKPOINT, identity)
         self.drives = KeptDrives(path / DRIVES, identity, route, seed)
         self.effort = Effort()
-        self._lock = ExitStack()
-        self._locked = False
-
-    def __enter__(self) -> RunFolder:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.close()
-
-    def check_new(self) -> None:
-        """Raise InputError unless the folder is missing or empty."""
-        if self.path.exists():
-            if not self.path.is_dir() or any(self.path.iterdir()):
-                raise InputError(
-                    f"{self.path}: exists and is not an empty folder; choose another, "
-                    "or continue the run in it with 'mi-nerfattack attack --resume'"
-                )
+        self._begun = False
 
     def read(self, force: bool, on_notice: Callable[[str], None]) -> None:
         """Take up what a run left; nothing is written.
 
-        A folder that is missing, or holds nothing but what a writer that was killed
-        left, is that of a run that came to nothing: it starts from the beginning.
+        A folder that holds nothing but what a writer that was killed left is that of
+        a run that came to nothing: it starts from the beginning.
 
         Args:
             force: ignore that the run was of another scenario or other versions: its
@@ -70,13 +53,12 @@ class RunFolder:
             on_notice: told about what is taken up and ignored.
 
         Raises:
-            InputError: the folder is no run's, another process works in it, a file is
-                damaged, or the run was of another scenario or other versions.
+            InputError: the folder is no run's, a file is damaged, or the run was of
+                another scenario or other versions.
         """
         if not self._holds_run(force, on_notice):
             on_notice(f"{self.path}: holds no run yet; it starts from the beginning")
             return
-        self._enter()
         of_attack = self.checkpoint.read(force)
         of_drives, ignored = self.drives.read(force)
         self.effort = max(of_attack, of_drives, key=lambda effort: effort.wall_s)
@@ -87,23 +69,22 @@ class RunFolder:
 
     def begin(self) -> None:
         """Make the folder ready to work in."""
-        files.make_folder(self.path)
-        self._enter()
         locks.remove_partial(self.path)
+        self._begun = not (self.path / SCENARIO).exists()
         files.write_text(self.path / SCENARIO, self._text)
         self.drives.remove_others()
 
-    def _enter(self) -> None:
-        if not self._locked:
-            self._lock.enter_context(locks.exclusive(self.path))
-            self._locked = True
+    def withdraw(self) -> None:
+        """Remove what this process began, unless an iteration of the attack is done.
+
+        To be called where a scenario is refused: corrected, it is another one.
+        """
+        if self._begun and not self.checkpoint.path.exists():
+            self.drives.remove()
+            (self.path / SCENARIO).unlink()
 
     def _holds_run(self, force: bool, on_notice: Callable[[str], None]) -> bool:
         """Tell a run from nothing; InputError for something else."""
-        if not self.path.exists():
-            return False
-        if not self.path.is_dir():
-            raise InputError(f"{self.path}: is not a folder; choose another name")
         present = [p for p in self.path.iterdir() if not locks.is_partial(p)]
         scenario = self.path / SCENARIO
         if present and scenario not in present:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
+import sys
 
 import pytest
 from helpers.attack_jobs import contents, interrupt, job, stop_at
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.io import locks
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -123,6 +126,66 @@ def test_failed_checkpoint_leaves_the_one_before(
     assert "checkpoint of iteration 3 is intact" in message
     assert contents(output) == kept
     job(folder, output).run(resume=True)
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize("stage", ["surrogate: unperturbed", "surrogate: attack"])
+def test_a_refused_attack_leaves_nothing(folder, tmp_path, stage):
+    def refuse():
+        raise InputError("policy: control nan")
+
+    (tmp_path / "empty").mkdir()
+    for output in (tmp_path / "made" / "run", tmp_path / "empty"):
+        with pytest.raises(InputError, match="control nan"):
+            job(folder, output, on_progress=stop_at(stage, 2, refuse)).run()
+    assert contents(tmp_path) == {} and list(tmp_path.iterdir()) == [output]
+
+
+@pytest.mark.usefixtures("no_results")
+@pytest.mark.parametrize(("step", "cause"), [(3, OSError()), (4 * 2 + 3, None)])
+def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
+    """A full disk, and iterations that are done."""
+
+    def refuse():
+        raise InputError("disk or gradient") from cause
+
+    with pytest.raises(InputError, match="disk or gradient"):
+        stop = stop_at("surrogate: attack", step, refuse)
+        job(folder, tmp_path, on_progress=stop).run()
+    seen = {path.name for path in tmp_path.iterdir()}
+    assert seen >= {"scenario.toml", "drives"}
+
+
+def test_a_claimed_folder_is_ours_and_empty_ones_are_removed(tmp_path):
+    output = tmp_path / "made" / "run"
+    with claimed(output, False), pytest.raises(InputError, match="another process"):
+        with claimed(output, False):
+            pass
+    assert not (tmp_path / "made").exists()
+    with claimed(output, False):
+        (output / "a").write_text("")
+    with pytest.raises(InputError, match="is not an empty folder"):
+        with claimed(output, False):
+            pass
+    with claimed(output, True):
+        pass
+    with pytest.raises(InputError, match="is not a folder"):
+        with claimed(output / "a", True):
+            pass
+    assert list(output.iterdir()) == [output / "a"]
+
+
+def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):
+    code = (
+        "import sys\n"
+        "from mi_nerfattack.cli import main\n"
+        "print(main(['attack', 'absent.toml', '-o', '.']), 'torch' in sys.modules)\n"
+    )
+    command = [sys.executable, "-c", code]
+    with locks.exclusive(tmp_path):
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "2 False\n", done.stderr
+    assert "another process works in it" in done.stderr
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):

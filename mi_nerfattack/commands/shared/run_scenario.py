@@ -25,13 +25,31 @@ def run_scenario(
         object_field: grid field that replaces the one of every object.
         force: resume although something has changed.
     """
+    from mi_nerfattack.experiment.claim import claimed
+
+    with claimed(output, resume):
+        document = _run(path, output, resume, object_field, force)
+    if as_json:
+        print(json.dumps(document, allow_nan=False))
+        return 0
     from rich.console import Console
 
+    from mi_nerfattack.report.table import metrics_table
+
+    console = Console()
+    console.print(metrics_table(document))
+    _print_files(console, output, document)
+    return 0
+
+
+def _run(
+    path: Path, output: Path, resume: bool, object_field: Path | None, force: bool
+) -> dict[str, Any]:
+    """Run a scenario in a folder that is claimed."""
     from mi_nerfattack import variant
     from mi_nerfattack.backend.threads import one_thread
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.job import Job
-    from mi_nerfattack.report.table import metrics_table
     from mi_nerfattack.scenario.policy import build_differentiable
     from mi_nerfattack.scenario.scenario import load_scenario
 
@@ -44,14 +62,7 @@ def run_scenario(
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
         job = Job(scenario, text, policy, output, show, bars.say)
-        document = job.run(resume, force)
-    if as_json:
-        print(json.dumps(document, allow_nan=False))
-        return 0
-    console = Console()
-    console.print(metrics_table(document))
-    _print_files(console, output, document)
-    return 0
+        return job.run_claimed(resume, force)
 
 
 def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
