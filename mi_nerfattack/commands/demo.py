@@ -36,16 +36,18 @@ class Demo:
 
         stamp = time.strftime("%Y%m%d-%H%M%S")
         output = self.output or Path("runs") / f"demo-{stamp}"
-        field = self._object_field(output)
-        return run_scenario(bundled("demo.toml"), output, False, False, field)
+        return run_scenario(
+            bundled("demo.toml"),
+            output,
+            False,
+            False,
+            lambda: self._object_field(output),
+        )
 
     def _object_field(self, output: Path) -> Path | None:
         """Return the field file of the object, fitting a mesh beside the run folder."""
         if self.object is None or self.object.suffix == ".safetensors":
             return self.object
-        from mi_nerfattack.io import files
-
-        files.make_folder(output.parent)
         field = output.parent / f"{output.name}-object.safetensors"
         Asset(
             str(self.object),

@@ -11,6 +11,7 @@ import sys
 import pytest
 from helpers.attack_jobs import contents, interrupt, job, stop_at
 
+from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.io import locks
@@ -186,6 +187,12 @@ def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout == "2 False\n", done.stderr
     assert "another process works in it" in done.stderr
+
+
+def test_a_demo_is_refused_before_its_object_is_fitted(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert cli.main(["demo", "-o", str(tmp_path), "--object", "absent.glb"]) == 2
+    assert "not an empty folder" in capsys.readouterr().err
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ def run_scenario(
     output: Path,
     resume: bool,
     as_json: bool,
-    object_field: Path | None = None,
+    object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
 ) -> int:
     """Run a scenario with a progress bar on stderr, and print its table.
@@ -22,13 +23,14 @@ def run_scenario(
         output: the run folder.
         resume: continue from what an interrupted run left in it.
         as_json: print the metrics as JSON in place of the table.
-        object_field: grid field that replaces the one of every object.
+        object_field: makes, or names, the grid field that replaces the one of every
+            object; None leaves them.
         force: resume although something has changed.
     """
     from mi_nerfattack.experiment.claim import claimed
 
     with claimed(output, resume):
-        document = _run(path, output, resume, object_field, force)
+        document = _run(path, output, resume, object_field(), force)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
