@@ -61,9 +61,6 @@ def run(
     done = {(row["poses"], row["horizon"]) for row in document["rows"]}
     left = [job for job in settings.jobs() if (job.poses, job.horizon) not in done]
     work, total = 0, sum(job.poses * job.horizon for job in left)
-    for poses in dict.fromkeys(job.poses for job in left):
-        progress("memory", work, total, "compiling")  # takes memory of its own
-        _peak_mb(Job(*settings.size, poses, 2))
     for job in left:
         progress("memory", work, total, f"{job.poses} poses, {job.horizon} periods")
         row = {"poses": job.poses, "horizon": job.horizon}
@@ -88,6 +85,8 @@ def _kept(path: Path, wanted: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _peak_mb(job: Job) -> float:
+    with Worker("attack", "ours", *job.arguments()) as worker:
+        worker.ask("compile", WAY)  # elsewhere, since it takes memory
     with Worker("attack", "ours", *job.arguments()) as worker:
         worker.ask("iterate", WAY)
         return worker.ask("memory")["peak_memory_mb"]

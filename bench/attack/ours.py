@@ -70,11 +70,15 @@ class OurAttack(AbstractAttack):
     def iterate(self, how: str) -> dict[str, float]:
         """See :meth:`AbstractAttack.iterate`; `how` is a key of `ADJOINTS`."""
         if how not in self.attacks:
-            rollout = replace(self.rollout, adjoint=ADJOINTS[how])
-            freedom = Freedom(texture_rate=RATE)
-            attack = GradientAttack(rollout, self.route, self.initial, freedom)
-            self.attacks[how] = attack
+            self.attacks[how] = self._attack(how, self.job.horizon)
         return _timed(self.attacks[how].step)
+
+    def compile(self, how: str) -> None:
+        """Let all kernels of :meth:`iterate` be compiled, and kept for later processes.
+
+        By an iteration of two periods: their length is compiled into kernels.
+        """
+        self._attack(how, 2).step()
 
     def drive(self) -> dict[str, float]:
         """Drive without derivatives, and return what :meth:`iterate` does."""
@@ -125,6 +129,11 @@ class OurAttack(AbstractAttack):
 
         simulate(self.loop, self.initial, 1, keep=look)
         return sizes[0]
+
+    def _attack(self, how: str, horizon: int) -> GradientAttack:
+        rollout = replace(self.rollout, adjoint=ADJOINTS[how], horizon=horizon)
+        freedom = Freedom(texture_rate=RATE)
+        return GradientAttack(rollout, self.route, self.initial, freedom)
 
     def _history(self, action: Callable[[], Any]) -> tuple[int, int, int]:
         """Count kernels: launched, those over all pixels, and compiled."""

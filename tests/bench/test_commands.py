@@ -118,19 +118,18 @@ def test_memory_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path)
 
     def peak(job):
         driven.append((job.poses, job.horizon))
-        if len(driven) == 4:
+        if len(driven) == 2:
             raise KeyboardInterrupt
         return 500.0 + job.poses + (6 if job.horizon == 9 else 0)
 
     monkeypatch.setattr(memory, "_peak_mb", peak)
     command = ["memory", "--size", "32x16", "-o", str(path), "--horizons", "3", "9"]
     assert main(command) == cli.EXIT_INTERRUPTED
-    assert driven == [(1, 2), (4, 2), (1, 3), (4, 3)]  # the first two only compile
     assert json.loads(path.read_text())["rows"] == [
         {"poses": 1, "horizon": 3, "peak_memory_mb": 501.0}
     ]
     assert main(command) == 1  # by more than 1 %
-    assert driven[4:] == [(4, 2), (1, 2), (4, 3), (1, 9), (4, 9)]
+    assert driven == [(1, 3), (4, 3), (4, 3), (1, 9), (4, 9)]
     assert "1.20%" in capsys.readouterr().out
     assert main([*command, "--poses", "1"]) == cli.EXIT_INPUT
     assert "name another file" in capsys.readouterr().err
