@@ -7,7 +7,13 @@ import sys
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
 from bench.commands.memory import BenchMemory
-from bench.commands.speed import BenchAttack, BenchComposite, BenchFit, BenchRender
+from bench.commands.speed import (
+    BenchAttack,
+    BenchComposite,
+    BenchFit,
+    BenchRender,
+    BenchSteps,
+)
 from bench.commands.training import BenchCollect, BenchDagger
 from mi_nerfattack import cli
 
@@ -17,6 +23,7 @@ COMMANDS = {
     "attack": BenchAttack,
     "memory": BenchMemory,
     "composite": BenchComposite,
+    "steps": BenchSteps,
     "experts": BenchExperts,
     "circle": BenchCircle,
     "collect": BenchCollect,

@@ -37,7 +37,7 @@ class FieldEmitter(mi.Emitter):
     (nested)     volume                      ``grid_field``, ``ngp_field``; 1 or more
     composite    string             inter-   ``interleaved`` or ``depth``
                                     leaved
-    stop         float              1e-3     transmittance at which a ray ends
+    stop         float              1e-6     transmittance at which a ray ends
     ===========  ========  =======  =======  ========================================
 
     .. code-block:: xml

@@ -51,7 +51,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     (nested)       integrator  none     renders surfaces and lights behind
     composite      string      inter-   ``interleaved`` or ``depth``
                                leaved
-    stop           float       1e-3     transmittance at which a ray ends
+    stop           float       1e-6     transmittance at which a ray ends
     jitter         bool        false    random instead of middle sample positions
     relit_samples  integer     16       light samples a ray, for each field and for
                                         what lies behind; only if a field is ``relit``

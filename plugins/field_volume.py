@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import AbstractField, GridField, NGPField, load_field
-from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.grid import check_positive
 from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.lighting import spectrum
@@ -56,6 +56,14 @@ def read_limit(props: mi.Properties) -> float:
     return limit
 
 
+def read_step(props: mi.Properties, own: float) -> float:
+    """Read `step_m`, metres in the field's frame."""
+    given: Any = props.get("step_m", own)
+    step = float(given)
+    check_positive("step_m", step)
+    return step
+
+
 def read_quantity(props: mi.Properties) -> str:
     """Read `quantity`: what the volume evaluates to in a medium."""
     quantity = props.get("quantity", "density")
@@ -78,6 +86,7 @@ class AbstractFieldVolume(mi.Volume):
         quantity, pose = read_quantity(props), read_pose(props)
         limit = read_limit(props)
         field = read_field(props, self.kind)
+        field.refine(read_step(props, field.step_m))
         super().__init__(place_unit_cube(props, field, pose))
         self.quantity, self.limit, self.field = quantity, limit, field
         self.relit = bool(props.get("relit", False))
@@ -90,16 +99,10 @@ class AbstractFieldVolume(mi.Volume):
             cb.put(name, self.values[name], mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Hand changed parameters to the field.
-
-        What was empty may not be so after a change of ``density``: from then on the
-        march skips nothing.
-        """
+        """Hand changed parameters to the field; what is empty stays so."""
         for name in self.parameter_names:
             if not keys or name in keys:
                 self.field.set_parameter(name, self.values[name])
-        if "density" in keys:
-            self.field.occupancy = Occupancy.full()
 
     def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
         """Evaluate the quantity as a spectrum, (channels, n).

@@ -23,6 +23,7 @@ class GridFieldVolume(AbstractFieldVolume):
     to_world       transform  metre    identity  rotation, translation, uniform scale
     quantity       string              density   ``density`` or ``radiance``
     density_limit  float      1/metre  infinite  cuts the density, in media alone
+    step_m         float      metre    the file  step of the march, in the field's frame
     relit          boolean             false     lit by the scene's emitters, in
                                                  ``field_integrator`` alone
     texture        tensor                        (n, 3) raw colours; differentiable
@@ -44,8 +45,8 @@ class GridFieldVolume(AbstractFieldVolume):
     (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass
     more than a centimetre (0.7 %).
 
-    Not differentiable: the pose. After a change of ``density`` the march skips no
-    empty space, since what the file calls empty may have been filled.
+    Where the file calls space empty, the density is 0 whatever ``density`` says: see
+    ``fields.window``. Not differentiable: the pose.
     """
 
     kind = "grid_field"

@@ -23,6 +23,7 @@ class NGPFieldVolume(AbstractFieldVolume):
     quantity       string              density   ``density`` or ``radiance`` (seen
                                                  along the field's +z)
     density_limit  float      1/metre  infinite  cuts the density, in media alone
+    step_m         float      metre    the file  step of the march, in the field's frame
     relit          boolean             false     lit by the scene's emitters, in
                                                  ``field_integrator`` alone
     table, ...     array                         parameters; differentiable

@@ -97,6 +97,41 @@ class BenchComposite:
 
 
 @dataclass(frozen=True)
+class BenchSteps:
+    """Measure what the marching step and the end of rays cost, and leave wrong.
+
+    Bundled fields, near and far, against the finest step; times are medians.
+    """
+
+    size: str = "200x66"
+    """Width and height of the image, pixels."""
+    repeats: int = 5
+    """Repetitions of each measurement."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
+
+    def run(self) -> int:
+        """March, measure and print."""
+        import json
+
+        from mi_nerfattack import variant
+
+        (size,) = read_sizes((self.size,))
+        _check_repeats(self.repeats)
+        variant.ensure()
+        from bench.render import steps
+        from mi_nerfattack.commands.shared.progress import StageBars
+
+        with StageBars() as bars:
+            rows = steps.run(size, self.repeats, bars.counter("rows"))
+        if self.json:
+            print(json.dumps(steps.to_document(rows, size), allow_nan=False))
+        else:
+            _print_steps(rows)
+        return 0
+
+
+@dataclass(frozen=True)
 class BenchFit:
     """Measure a training step of a fit against the same step in PyTorch.
 
@@ -308,5 +343,38 @@ def _print_composite(results: list[Any]) -> None:
             f"{255 * result.largest:.1f}",
             f"{100 * result.above_1_255:.1f} %",
             f"{result.depth_mean_m:.4f}",
+        )
+    Console().print(table)
+
+
+def _print_steps(rows: list[Any]) -> None:
+    import rich.box
+    import rich.table
+    from rich.console import Console
+
+    table = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD, title="against the finest step; times are medians"
+    )
+    table.add_column("view")
+    for name in (
+        "step",
+        "stop",
+        "PSNR, dB",
+        "largest, sRGB / 255",
+        "mean of depth, mm",
+        "march, ms",
+        "derivative, ms",
+    ):
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            row.view,
+            f"1/{1 / row.factor:.0f}",
+            f"{row.stop:g}",
+            f"{row.psnr_db:.1f}",
+            f"{255 * row.largest:.1f}",
+            f"{1000 * row.depth_m:.2f}",
+            f"{1000 * row.forward_s:.1f}",
+            f"{1000 * row.derivative_s:.1f}",
         )
     Console().print(table)

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 
 from bench.full_ngp import NGPData
 from bench.torch.encoding import AbstractHashGrid
+from bench.torch.window import TorchWindow
 
 BATCHES = ((0, 8), (8, 32), (32, 1 << 30))  # ranks of samples along a ray
 
@@ -91,7 +92,8 @@ class TorchNGP:
         self.extent = _single(data.upper) - self.lower
         self.density_scale = 1 / float(np.max(data.upper - data.lower))
         self.cells = torch.from_numpy(np.ascontiguousarray(data.cells))
-        self.step, self.cone = data.step_m, max(data.cone, 1e-6)
+        self.window = TorchWindow(data.cells)
+        self.step, self.cone = data.step_m, max(data.cone, 1e-12)
         self.evaluated = 0
 
     def render(
@@ -163,7 +165,7 @@ class TorchNGP:
         ray, width = samples.ray[chosen], samples.width[chosen]
         h = self._geometry(samples.unit[chosen])
         density = self.density_scale * torch.exp(h[:, 0].clamp(max=15.0))
-        x = density * width
+        x = density * width * self.window(samples.unit[chosen])
         before = depth[ray] + sum_before(x, ray)
         lit = (before.detach() < self.limit).nonzero()[:, 0]
         ray, x, before = ray[lit], x[lit], before[lit]
@@ -187,6 +189,9 @@ class TorchNGP:
         far = torch.maximum(a, b).amin(1)
         hit = near < far
         near, far = torch.where(hit, near, 0), torch.where(hit, far, 0)
+        if not self.window.is_open:
+            near = self._lattice(self._lattice_index(near).floor())
+            far = self._lattice(self._lattice_index(far).ceil())
         first = int(self._lattice_index(near).floor().min())
         last = int(self._lattice_index(far).ceil().max())
         edges = self._lattice(torch.arange(first, max(last, first) + 1.0))

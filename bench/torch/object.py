@@ -18,6 +18,7 @@ import torch.nn.functional as F
 
 from bench.full_ngp import level_sizes
 from bench.torch.ngp import BATCHES, decode, sum_before
+from bench.torch.window import TorchWindow
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.ngp import NGPLayout
 from mi_nerfattack.io import files
@@ -163,6 +164,7 @@ class TorchObject:
         self.lower, upper = torch.tensor(data.box, dtype=torch.float32)
         self.extent = upper - self.lower
         self.cells = torch.tensor(data.cells).bool()
+        self.window = TorchWindow(data.cells.astype(bool))
         self.density_scale = float(data.numbers[0]) / self.size
         self.step = float(data.numbers[1]) * self.size
         self.evaluated = 0
@@ -195,7 +197,7 @@ class TorchObject:
             row, corner = self._corners(samples.unit[chosen])
             raw = self.lookup(self.density, row, corner)[:, 0]
             x = self.density_scale * torch.exp(raw.clamp(max=15.0))
-            x = x * samples.width[chosen]
+            x = x * samples.width[chosen] * self.window(samples.unit[chosen])
             before = depth[ray] + sum_before(x, ray)
             lit = (before < self.limit).nonzero()[:, 0]
             ray, x, before = ray[lit], x[lit], before[lit]
@@ -227,6 +229,8 @@ class TorchObject:
         first = (near / self.step).floor()
         count = (far / self.step).ceil() - first
         index = first[:, None] + torch.arange(float(count.max()) if len(count) else 0.0)
+        if not self.window.is_open:
+            near, far = self.step * first, self.step * (first + count)
         begin = torch.maximum(index * self.step, near[:, None])
         end = torch.minimum((index + 1) * self.step, far[:, None])
         t = 0.5 * (begin + end)

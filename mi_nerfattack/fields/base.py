@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.window import Window
 
 
 class AbstractPoints(ABC):
@@ -73,7 +74,8 @@ class AbstractField(ABC):
             frame.
         cone: growth of the step with distance, 1/1; a step at distance t is about
             ``max(step_m, cone * t)``. Zero keeps the step constant.
-        occupancy: grid that tells where density may be above its threshold.
+        occupancy: grid by which a march skips empty space, and nothing else.
+        window: factor of the density that is 0 in empty space.
     """
 
     kind: str
@@ -82,8 +84,22 @@ class AbstractField(ABC):
     step_m: float
     cone: float
     occupancy: Occupancy
+    window: Window
 
-    @abstractmethod
+    def occupy(self, occupancy: Occupancy) -> None:
+        """Make the field empty outside the occupied cells of a grid over its box."""
+        self.occupancy, self.window = occupancy, Window(occupancy.cells)
+
+    def refine(self, step_m: float) -> None:
+        """Change the marching step; where it grows with distance, in proportion.
+
+        Args:
+            step_m: near the camera, metres in the field's frame; counts for posed
+                fields that are made afterwards.
+        """
+        self.cone *= step_m / self.step_m
+        self.step_m = step_m
+
     def eval(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
@@ -97,6 +113,17 @@ class AbstractField(ABC):
         Returns:
             density (n,), 1/metre of the field's frame, and radiance (3, n), linear
             Rec. 709.
+        """
+        density, radiance = self.eval_everywhere(point, direction, active)
+        return density * self.window(self.unit(point), active), radiance
+
+    @abstractmethod
+    def eval_everywhere(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """Evaluate what the parameters say, also where the field is empty.
+
+        Args and returns: as :meth:`eval`.
         """
 
     def parameters(self) -> dict[str, Any]:
@@ -123,7 +150,8 @@ class AbstractField(ABC):
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""
-        return [*self.parameters().values(), self.occupancy.distance]
+        skipping = [self.occupancy.distance, self.window.array]
+        return [*self.parameters().values(), *skipping]
 
     @property
     def has_gradients(self) -> bool:
@@ -133,8 +161,12 @@ class AbstractField(ABC):
 
     def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Evaluate density alone, (n,), 1/metre of the field's frame."""
-        up = mi.Vector3f(0, 0, 1)
-        return self.eval(point, up, active)[0]
+        factor = self.window(self.unit(point), active)
+        return self.density_everywhere(point, active) * factor
+
+    def density_everywhere(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Evaluate the density of :meth:`eval_everywhere` alone, (n,)."""
+        return self.eval_everywhere(point, mi.Vector3f(0, 0, 1), active)[0]
 
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Return the radiance of what lies behind the field, (3, n), linear.

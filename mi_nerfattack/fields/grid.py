@@ -96,7 +96,7 @@ class GridField(AbstractField):
         check_positive("step_m", self.step_m)
         check_positive("density_scale", self.density_scale)
         self.info = dict(info or {})
-        self.occupancy = occupancy or Occupancy.full()
+        self.occupy(occupancy or Occupancy.full())
         self.encoding = HashGridEncoding(
             mi.Float,
             3,
@@ -157,10 +157,10 @@ class GridField(AbstractField):
     def _pack(self) -> None:
         self.encoding.data = self.pack(self._texture)
 
-    def eval(
+    def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
-        """Evaluate density and radiance; see :meth:`AbstractField.eval`."""
+        """See :meth:`AbstractField.eval_everywhere`."""
         # The encoding reads one vertex past the last cell at exactly 1.
         unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
         features = self.encoding(unit, active)
@@ -200,8 +200,8 @@ class GridField(AbstractField):
         return self.density_scale * float(np.exp(min(total.max(), 15.0)))
 
     def arrays(self) -> list[Any]:
-        """Return `packed` and the occupancy."""
-        return [self.packed, self.occupancy.distance]
+        """Return `packed`, occupancy and window."""
+        return [self.packed, self.occupancy.distance, self.window.array]
 
     @property
     def has_gradients(self) -> bool:
@@ -228,7 +228,7 @@ class GridField(AbstractField):
         return {
             "density": self._density.numpy().astype(np.float16),
             "texture": self.texture.numpy().astype(np.float16),
-            "occupancy": np.packbits(self.occupancy.cells.ravel()),
+            "occupancy": np.packbits(self.window.cells.ravel()),
         }
 
     def metadata(self) -> dict[str, str]:
@@ -247,7 +247,7 @@ def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
         "kind": field.kind,
         "lower": " ".join(repr(float(v)) for v in field.lower),
         "upper": " ".join(repr(float(v)) for v in field.upper),
-        "occupancy_shape": " ".join(str(n) for n in field.occupancy.shape),
+        "occupancy_shape": " ".join(str(n) for n in field.window.cells.shape),
         "step_m": repr(field.step_m),
         "cone": repr(field.cone),
         "length_unit": info.get("fit.source_unit", "metre"),

@@ -126,7 +126,7 @@ class NGPField(AbstractField):
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
         self.info = dict(info or {})
-        self.occupancy = occupancy or Occupancy.full()
+        self.occupy(occupancy or Occupancy.full())
         rng = dr.rng(seed=seed)
         self.encoding = HashGridEncoding(
             mi.Float,
@@ -172,10 +172,10 @@ class NGPField(AbstractField):
         self.sky_shape = (sky.shape[0], sky.shape[1])
         self.sky = mi.Float(sky.ravel())
 
-    def eval(
+    def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
-        """Evaluate density and radiance; see :meth:`AbstractField.eval`."""
+        """See :meth:`AbstractField.eval_everywhere`."""
         features = self.encoding(self.clipped(point), active)
         density, radiance = self.decode(features, direction)
         return density & active, radiance & active
@@ -199,8 +199,8 @@ class NGPField(AbstractField):
         """Turn the networks' raw density (n,) and colours 3 x (n,) into quantities."""
         return self.density_scale * dr.exp(dr.minimum(geometry, 15.0)), _activate(raw)
 
-    def density(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """Evaluate density alone, (n,), 1/metre."""
+    def density_everywhere(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """See :meth:`AbstractField.density_everywhere`."""
         raw = self._geometry(point, active)[0]
         return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
 
@@ -289,7 +289,7 @@ class NGPField(AbstractField):
         result = {
             "table": self.encoding.data.numpy().astype(np.float16),
             "sky": self.sky.numpy().copy().reshape(*self.sky_shape, 3),
-            "occupancy": np.packbits(self.occupancy.cells.ravel()),
+            "occupancy": np.packbits(self.window.cells.ravel()),
         }
         packed = (self.density_net, self.colour_net)
         for prefix, net in zip(NETWORK_NAMES, packed, strict=True):

@@ -16,6 +16,7 @@ from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.walk import sample_count
 
+STOP = 1e-3  # transmittance at which a ray ends while fields are fitted
 _PROBE = 2048  # rays that tell how many samples a ray has
 _STEPS_BEHIND = 4  # marching steps that a ray goes on behind a known surface
 

@@ -42,7 +42,7 @@ class RunningOccupancy:
         #: (allowed cells,), 1/metre; -1 where no sample has been taken
         self.density = np.full(self._cells.shape[1], -1, np.float32)
         self._occupied = np.arange(0)
-        field.occupancy = Occupancy(allowed)
+        field.occupy(Occupancy(allowed))
 
     def update(self, step: int) -> None:
         """Visit some cells; every cell once if none has been visited.
@@ -76,7 +76,7 @@ class RunningOccupancy:
         position = mi.Point3f(padded)
         dr.make_opaque(position)
         with dr.suspend_grad():
-            density = self.field.density(position, mi.Bool(True)).numpy()
+            density = self.field.density_everywhere(position, mi.Bool(True)).numpy()
         return density[: len(chosen)]
 
     def install(self) -> None:
@@ -87,7 +87,7 @@ class RunningOccupancy:
         self._occupied = np.nonzero(full)[0]
         cells = np.zeros(self.allowed.shape, bool)
         cells[tuple(self._cells[:, full])] = True
-        self.field.occupancy = Occupancy(cells)
+        self.field.occupy(Occupancy(cells))
 
     def restore(self, density: np.ndarray, bits: np.ndarray) -> None:
         """Continue from a state.
@@ -106,7 +106,7 @@ class RunningOccupancy:
         cells = np.unpackbits(bits, count=size).astype(bool)
         cells = cells.reshape(self.allowed.shape)
         self._occupied = np.nonzero(cells[tuple(self._cells)])[0]
-        self.field.occupancy = Occupancy(cells)
+        self.field.occupy(Occupancy(cells))
 
 
 def seen_cells(

@@ -6,9 +6,11 @@ forward pass: same positions, same occupancy, same termination.
 
 Steps. Along a ray, a fixed lattice ``t(i)``, i = 0, 1, ..., has spacing ``step`` up
 to the distance ``step / cone`` and grows exponentially after it. A sample stands for
-the part of ``[t(i), t(i + 1)]`` inside the bounding box, and takes density and
-radiance as constant on it. Lattice intervals whose sample lies in an empty cell of
-the occupancy are skipped. Beyond ``2**23`` steps from its origin a ray sees nothing.
+``[t(i), t(i + 1)]``, and takes density and radiance as constant on it; of a field that
+has no empty cell, for the part inside the bounding box. Lattice intervals whose sample
+lies in an empty cell of the occupancy are skipped: the density there is 0, and rises
+from it continuously (`fields.window`), so that no sample comes or goes at once when a
+ray moves. Beyond ``2**23`` steps in a box a ray sees nothing.
 
 Error bounds, for a ray that runs l metres through the box and leaves it at t_far:
 
@@ -20,9 +22,11 @@ Error bounds, for a ray that runs l metres through the box and leaves it at t_fa
   of a colour. Optical depth is off by at most ``e = h^2 (l S_2 / 24 + S_1 / 4)``, and
   so is opacity; a colour by at most
   ``e (L_0 + l L_1) + h^2 (L_1 S_0 (1 + S_0 h) / 12 + L_2 / 8)``; the moment likewise
-  with L_0 = t_far, L_1 = 1, L_2 = 0. Where density has kinks, as between the vertices
-  of a grid, opacity is off by at most ``h^2 V / 8``, V the total variation of the
-  density's slope. Other jitters are of first order.
+  with L_0 = t_far, L_1 = 1, L_2 = 0. Other jitters are of first order.
+- Where slopes jump, as between the vertices of a grid, their total variation takes the
+  place of second derivatives: opacity is off by at most ``h^2 V / 8``, V that of the
+  density; and with ``e = h^2 (V / 8 + S_1 / 4)`` and W that of a colour, the colour by
+  at most ``e (L_0 + l L_1) + h^2 S_0 (L_1 (1 + S_0 h) / 12 + W / 4)``.
 - Opacity and colour of homogeneous media are exact but for rounding.
 """
 
@@ -41,7 +45,7 @@ from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.sums import Rest, Sums
 from mi_nerfattack.render.walk import MergedWalk, Path, Segment, Walk
 
-STOP = 1e-3
+STOP = 1e-6
 PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
 
 #: Maps local points, directions in a form of its own, and a mask to density and colour.

@@ -28,8 +28,9 @@ class PosedField:
         self.move(self.pose.rotation, self.pose.translation)
         self._inverse_scale = mi.Float(1 / self.pose.scale)
         self._step = mi.Float(field.step_m * self.pose.scale)
-        # cone -> 0 makes the lattice uniform; the floor keeps step / cone finite
-        self._cone = mi.Float(max(field.cone, 1e-6))
+        # cone -> 0 makes the lattice uniform; the floor keeps step / cone finite, and
+        # so large that no ray comes there
+        self._cone = mi.Float(max(field.cone, 1e-12))
         dr.make_opaque(self._inverse_scale, self._step, self._cone)
         self._gain: mi.Color3f | None = None
 
@@ -78,8 +79,8 @@ class PosedField:
     def state(self) -> list[Any]:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
         numbers = [self._columns, self._origin, self._inverse_scale]
-        shape = self.field.occupancy.shape
-        return [self, shape, *numbers, self._step, self._cone, *self.field.arrays()]
+        cells = self.field.occupancy.shape, self.field.window.is_open
+        return [self, cells, *numbers, self._step, self._cone, *self.field.arrays()]
 
     def to_local(
         self, origin: mi.Point3f, direction: mi.Vector3f
@@ -125,17 +126,37 @@ class PosedField:
 
     def lattice(self, index: mi.Float) -> mi.Float:
         """Distance of a lattice point, metres."""
-        knee = self._step / self._cone
-        bend = dr.rcp(self._cone)
-        grown = knee * dr.exp(self._cone * (dr.maximum(index, bend) - bend))
-        return dr.select(index <= bend, index * self._step, grown)
+        return self.lattice_after(mi.Float(0), mi.Float(0), index)
 
     def lattice_index(self, t: mi.Float) -> mi.Float:
         """Inverse of :meth:`lattice`."""
+        return self.lattice_index_after(mi.Float(0), mi.Float(0), t)
+
+    def lattice_after(
+        self, begin: mi.Float, first: mi.Float, index: mi.Float
+    ) -> mi.Float:
+        """Return ``lattice(first + index) - begin``, exact far away, too.
+
+        Args:
+            begin: (n,), metres; at lattice point `first`, or 0.
+            first: (n,), a lattice point.
+            index: (n,), counted from there.
+        """
         knee = self._step / self._cone
         bend = dr.rcp(self._cone)
+        count = first + index
+        grown = knee * dr.exp(self._cone * (dr.maximum(count, bend) - bend))
+        return dr.select(count <= bend, index * self._step, grown - begin)
+
+    def lattice_index_after(
+        self, begin: mi.Float, first: mi.Float, s: mi.Float
+    ) -> mi.Float:
+        """Inverse of :meth:`lattice_after`."""
+        knee = self._step / self._cone
+        bend = dr.rcp(self._cone)
+        t = begin + s
         grown = bend + dr.log(dr.maximum(t, knee) / knee) * bend
-        return dr.select(t <= knee, t / self._step, grown)
+        return dr.select(t <= knee, s / self._step, grown - first)
 
     def eval(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool

@@ -22,19 +22,26 @@ MAX_INTERVALS = 1 << 23  # float32 counts exactly up to twice this
 
 @dataclass
 class Path:
-    """Rays in the frame of a field, and where they are inside its box.
+    """Rays in the frame of a field, from a lattice point before its box to its end.
+
+    Far from their origin, single precision would show in positions and lengths, so
+    both are counted from where a path begins.
 
     Attributes:
-        o: (3, n), origins.
+        o: (3, n), where the paths begin.
         d: (3, n), directions per world metre.
         heading: (3, n), directions of unit length.
-        near: (n,), metres in the world.
-        far: (n,), likewise.
+        begin: (n,), distance of `o` from the rays' origins, metres in the world.
+        first: (n,), lattice point there.
+        near: (n,), where density may begin, metres after `begin`.
+        far: (n,), where it ends, likewise.
     """
 
     o: mi.Point3f = field(default_factory=lambda: mi.Point3f(0))
     d: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
     heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    begin: mi.Float = field(default_factory=lambda: mi.Float(0))
+    first: mi.Float = field(default_factory=lambda: mi.Float(0))
     near: mi.Float = field(default_factory=lambda: mi.Float(0))
     far: mi.Float = field(default_factory=lambda: mi.Float(0))
 
@@ -42,11 +49,32 @@ class Path:
     def of(posed: PosedField, rays: Rays) -> Path:
         """Take rays into a field's frame."""
         o, d = posed.to_local(rays.origin, rays.direction)
-        return Path(o, d, dr.normalize(d), *posed.interval(o, d, rays.t_max))
+        near, far = posed.interval(o, d, rays.t_max)
+        meets = near < far
+        first = dr.select(meets, dr.floor(posed.lattice_index(near)), 0)
+        begin = posed.lattice(first)
+        path = Path(o + begin * d, d, dr.normalize(d), begin, first)
+        near, far = near - begin, far - begin
+        if not posed.field.window.is_open:
+            # Density falls to 0 at the box. Whole intervals around it leave no edge
+            # that would move with the ray.
+            last = posed.lattice_index_after(begin, first, far)
+            whole = posed.lattice_after(begin, first, dr.ceil(last))
+            near, far = mi.Float(0), dr.minimum(whole, rays.t_max - begin)
+        path.near, path.far = near, dr.select(meets, far, near)
+        return path
+
+    def edge(self, posed: PosedField, index: mi.Float) -> mi.Float:
+        """Return where a lattice interval begins, metres after `begin`."""
+        return posed.lattice_after(self.begin, self.first, index)
+
+    def interval(self, posed: PosedField, s: mi.Float) -> mi.Float:
+        """Return the lattice interval at a distance after `begin`."""
+        return dr.floor(posed.lattice_index_after(self.begin, self.first, s))
 
     def at(self, t: mi.Float) -> mi.Point3f:
-        """Return points (3, n) at distances (n,) in world metres."""
-        return mi.Point3f(self.o + t * self.d)
+        """Return points (3, n) at distances (n,) of the rays, in world metres."""
+        return mi.Point3f(self.o + (t - self.begin) * self.d)
 
     def tangents(self, posed: PosedField, t_rays: Any) -> list[mi.Vector3f]:
         """Return those of o, d and heading (3, n), of rays with tangents; 0 for None.
@@ -90,7 +118,7 @@ class Walk:
     Attributes:
         paths: of the field, one.
         jitter: (n,), position of the samples in their intervals.
-        index: (n,), the lattice interval ahead.
+        index: (n,), the lattice interval ahead, counted from the path's first.
     """
 
     paths: list[Path] = field(default_factory=list)
@@ -101,9 +129,8 @@ class Walk:
     def start(posed: PosedField, rays: Rays) -> tuple[Walk, mi.Bool]:
         """Return rays before their first interval, and those that meet the box."""
         path = Path.of(posed, rays)
-        index = dr.floor(posed.lattice_index(path.near))
         active = mi.Bool(rays.active) & (path.near < path.far)
-        return Walk([path], rays.jitter, index), active
+        return Walk([path], rays.jitter, mi.Float(0)), active
 
     def next(
         self, posed: Sequence[PosedField], active: mi.Bool
@@ -123,29 +150,29 @@ def seek(
     """Advance rays (n,) to their next lattice interval in an occupied cell.
 
     Returns:
-        index, sample position and width (metres) of the interval, and which rays
-        found one before they left the box; each (n,).
+        index, sample position (metres from the origin) and width of the interval, and
+        which rays found one before they left the box; each (n,).
     """
     occupancy = posed.field.occupancy
-    t = mi.Float(0)
+    s = mi.Float(0)
     width = mi.Float(0)
     searching = mi.Bool(active)
     found = mi.Bool(False)
     while searching:
-        start = dr.maximum(posed.lattice(index), path.near)
-        end = dr.minimum(posed.lattice(index + 1), path.far)
-        t = start + jitter * (end - start)
+        start = dr.maximum(path.edge(posed, index), path.near)
+        end = dr.minimum(path.edge(posed, index + 1), path.far)
+        s = start + jitter * (end - start)
         width = end - start
         searching &= (start < path.far) & (index < MAX_INTERVALS)
-        unit = posed.field.unit(path.at(t))
+        unit = posed.field.unit(mi.Point3f(path.o + s * path.d))
         distance, cell = occupancy.query(unit, searching)
         found = searching & (distance == 0)
         searching &= ~found
         scale = posed.field.unit(mi.Point3f(path.d)) - posed.field.unit(mi.Point3f(0))
-        t_exit = t + occupancy.exit(unit, mi.Vector3f(scale), cell, distance)
-        jump = dr.maximum(index + 1, dr.floor(posed.lattice_index(t_exit)))
+        leaving = s + occupancy.exit(unit, mi.Vector3f(scale), cell, distance)
+        jump = dr.maximum(index + 1, path.interval(posed, leaving))
         index = dr.select(searching, jump, index)
-    return index, t, dr.maximum(width, 0), found
+    return index, path.begin + s, dr.maximum(width, 0), found
 
 
 @dataclass
@@ -157,12 +184,12 @@ class Cursor:
     end: mi.Float = field(default_factory=lambda: mi.Float(0))
 
     @staticmethod
-    def before(posed: PosedField, path: Path) -> Cursor:
+    def before(path: Path) -> Cursor:
         """Return a cursor before the first interval."""
         missed = ~(path.near < path.far)
         start = dr.select(missed, dr.inf, 0)
         end = dr.select(missed, dr.inf, -1)  # spent: the first interval is sought
-        return Cursor(dr.floor(posed.lattice_index(path.near)), start, end)
+        return Cursor(mi.Float(0), start, end)
 
     def advance(
         self,
@@ -175,8 +202,9 @@ class Cursor:
         """Move on to the next occupied interval where the present one lies behind t."""
         spent = active & (self.end <= t)
         index, _, _, found = seek(posed, path, self.following, jitter, spent)
-        start = dr.maximum(posed.lattice(index), path.near)
-        end = dr.maximum(dr.minimum(posed.lattice(index + 1), path.far), start)
+        start = dr.maximum(path.edge(posed, index), path.near) + path.begin
+        end = dr.minimum(path.edge(posed, index + 1), path.far) + path.begin
+        end = dr.maximum(end, start)
         start, end = dr.select(found, start, dr.inf), dr.select(found, end, dr.inf)
         return Cursor(
             dr.select(spent, index + 1, self.following),
@@ -205,8 +233,7 @@ class MergedWalk:
     def start(posed: Sequence[PosedField], rays: Rays) -> tuple[MergedWalk, mi.Bool]:
         """Return rays before their first segment, and those that may have one."""
         paths = [Path.of(item, rays) for item in posed]
-        pairs = zip(posed, paths, strict=True)
-        cursors = [Cursor.before(item, path) for item, path in pairs]
+        cursors = [Cursor.before(path) for path in paths]
         walk = MergedWalk(paths, rays.jitter, cursors, mi.Float(0))
         return walk, mi.Bool(rays.active)
 

@@ -20,9 +20,10 @@ from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.ranges import Count, Finite, NonNegative, Positive, Whole
+from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.march import STOP
 from mi_nerfattack.scenario.attack import AttackSection
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
@@ -45,6 +46,8 @@ class SceneSection(Section):
     routes: File  # JSON of routes
     route: str  # name of the route that is driven
     composite: Literal["depth", "interleaved"] = "depth"  # of fields, in the surrogate
+    step_m: Positive | None = None  # of the march near the camera; the field's own
+    stop: Fraction = STOP  # transmittance at which rays end in the surrogate
     to_world: tuple[Row, Row, Row, Row] | None = None  # of the field: uniform scale
 
 
@@ -56,6 +59,7 @@ class ObjectSection(Section):
     position_m: Triple
     yaw_deg: Finite = 0.0
     scale: Positive = 1.0
+    step_m: Positive | None = None  # of the march, before `scale`; the field's own
 
     @property
     def pose(self) -> Pose:

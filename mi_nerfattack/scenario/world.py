@@ -111,6 +111,8 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     place = scenario.scene
     surrogate = _load_surrogate(scenario)
     fields = [load_grid(item.field.file) for item in scenario.objects]
+    for field, item in zip(fields, scenario.objects, strict=True):
+        field.refine(item.step_m or field.step_m)
     posed = [
         PosedField(field, item.pose)
         for field, item in zip(fields, scenario.objects, strict=True)
@@ -121,13 +123,13 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     objective = scenario.objective.build(scenario, route, dynamics)
     xml = load_scene(place.deployment.file)
     jitter = scenario.seed if scenario.attack.jitter else None
-    composite = COMPOSITES[place.composite]()
+    look = place.stop, COMPOSITES[place.composite]()
     spp, seed = scenario.deployment.spp, scenario.seed
     return World(
         scenario,
         route,
         fields,
-        FieldSensor(surrogate, posed, camera, mount, jitter, composite=composite),
+        FieldSensor(surrogate, posed, camera, mount, jitter, *look),
         PathTracedSensor(xml, posed, camera, mount, spp, seed),
         policy,
         dynamics,
@@ -170,7 +172,11 @@ def _load_surrogate(scenario: Scenario) -> Layer:
             f"scene.to_world: {err}; give rotation, uniform scale and translation"
         ) from err
     if path.suffix.lower() != ".ply":
-        return PosedField(load_field(path), pose)
+        field = load_field(path)
+        field.refine(scenario.scene.step_m or field.step_m)
+        return PosedField(field, pose)
+    if scenario.scene.step_m is not None:
+        raise InputError(f"scene.step_m: {path} holds splats, which take no steps")
     if scenario.attack.attached:
         raise InputError(
             f"{path}: splats have no derivative by the camera; set attack.attached to "

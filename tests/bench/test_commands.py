@@ -14,6 +14,7 @@ from bench.attack.table import memory_table, time_table
 from bench.attack.table import remarks as attack_remarks
 from bench.driving import circle, experts
 from bench.fit.table import remarks as fit_remarks
+from bench.render import steps
 from mi_nerfattack import cli
 from mi_nerfattack.io import files
 
@@ -34,6 +35,17 @@ def test_every_benchmark_starts_and_composite_ends(tmp_path, capsys):
     assert by_height[0.8]["largest"] < 1 / 255  # apart, both composites are exact
     assert by_height[-0.75]["largest"] > by_height[0.8]["largest"]
     assert files.read_image(path).shape[2] in (3, 4)
+
+
+@pytest.mark.slow
+def test_steps_tell_errors_that_fall(capsys):
+    assert main(["steps", "--size", "32x16", "--repeats", "1", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    for view in steps.VIEWS:
+        mine = [row for row in rows if row["view"] == view]
+        errors = [row["psnr_db"] for row in mine[: len(steps.FACTORS)]]
+        assert errors == sorted(errors)
+        assert min(row["forward_s"] for row in mine) > 0
 
 
 @pytest.mark.slow

@@ -139,10 +139,10 @@ def test_field_that_shows_nothing(place, tmp_path):
 
 
 def test_field_with_rings_of_holes(place):
-    """A layer of 0.2 m, and the first sample up to 0.25 m behind the layer's front."""
+    """A layer of 0.2 m, and steps of 0.25 m."""
     field = wall(WALL_X - 0.1)
-    field.step_m = 0.5
-    field.occupancy = Occupancy((np.arange(100) == 0).reshape(-1, 1, 1))
+    field.step_m = 0.25
+    field.occupy(Occupancy((np.arange(100) == 0).reshape(-1, 1, 1)))
     comparison = compare_with_scene(field, *place, OPTIONS)
     (route,) = comparison.routes
     assert 0.1 < route.mean("holes") < 0.3

@@ -30,7 +30,8 @@ def test_a_reader_written_from_the_page_sees_the_same_field(name, rng):
     towards = mi.Vector3f(directions.T.copy())
     density, radiance = field.eval(mi.Point3f(points.T.copy()), towards, mi.Bool(True))
     expected = reader.density(points.astype(float))
-    np.testing.assert_allclose(density, expected, rtol=2e-3)
+    limit = 1e-6 * expected.max()  # where it is about to vanish
+    np.testing.assert_allclose(density, expected, rtol=2e-3, atol=limit)
     expected = reader.radiance(points.astype(float), directions.astype(float))
     np.testing.assert_allclose(np.array(radiance).T, expected, atol=5e-4)
     assert expected.std() > 0.05

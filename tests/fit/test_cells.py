@@ -34,7 +34,7 @@ def solid_near(images: PosedImages, depth: np.ndarray) -> SolidField:
     field = SolidField(0.2, 1 / 32)
     views = depth_rays(images, depth, range(len(images)))
     cells = cells_near_surfaces(views, field, grid_shape(*BOX, 72))
-    field.occupancy = Occupancy(cells)
+    field.occupy(Occupancy(cells))
     return field
 
 

@@ -31,12 +31,14 @@ class GaussianField(AbstractField):
         self.peak, self.sd, self.half = peak, sd, half
         self.lower, self.upper = -half * np.ones(3), half * np.ones(3)
         self.step_m, self.cone = step_m, 0.0
-        self.occupancy = Occupancy.full()
+        self.occupy(Occupancy.full())
         self.sigma = peak, peak / sd * np.exp(-0.5), peak / sd**2
         frequency = np.linalg.norm(WAVES, axis=1).max()
         self.colour = 0.9, 0.4 * frequency, 0.4 * frequency**2
 
-    def eval(self, point: Any, direction: Any, active: Any) -> tuple[Any, Any]:
+    def eval_everywhere(
+        self, point: Any, direction: Any, active: Any
+    ) -> tuple[Any, Any]:
         """Evaluate density and colour."""
         squared = dr.squared_norm(mi.Vector3f(point))
         density = self.peak * dr.exp(squared * (-0.5 / self.sd**2))

@@ -87,8 +87,10 @@ class SolidField(AbstractField):
     def __init__(self, step_m: float, cone: float) -> None:
         self.lower, self.upper = BOX
         self.step_m, self.cone = step_m, cone
-        self.occupancy = Occupancy.full()
+        self.occupy(Occupancy.full())
 
-    def eval(self, point: Any, direction: Any, active: Any) -> tuple[Any, Any]:
+    def eval_everywhere(
+        self, point: Any, direction: Any, active: Any
+    ) -> tuple[Any, Any]:
         """Evaluate density and colour."""
         return mi.Float(1e4) & active, mi.Color3f(0.2) & active

@@ -19,6 +19,7 @@ from helpers import small_fields as small
 from helpers.variants import RGB, SPECTRAL, later
 
 from mi_nerfattack.fields import GridField, GridLayout, load_field, save_field
+from mi_nerfattack.scenes import bundled
 
 TEXELS = 80
 CENTRES = np.linspace(-1, 1, TEXELS)
@@ -179,3 +180,34 @@ def test_gradients_are_those_of_gridvolume_by_the_chain_rule(path: Path) -> None
         expected = weight @ (values[1].reshape(-1, 3) * slope / (2 * h))
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found[1], expected, atol=1e-3 * scale)
+
+
+def shown(integrator: dict[str, Any], shape: dict[str, Any]) -> np.ndarray:
+    """Show what is in the bundled hydrant's box before a white light."""
+    view = mi.ScalarTransform4f().look_at([-2, 0.3, 0.6], [0, 0, 0.375], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 32, "height": 48, "rfilter": {"type": "box"}}
+    camera = {"type": "perspective", "fov": 20, "to_world": view, "film": film}
+    parts = {"integrator": integrator, "sensor": camera, "light": {"type": "constant"}}
+    whole = mi.load_dict({"type": "scene", **parts, **shape}, parallel=False)
+    return np.array(mi.render(whole, spp=64, seed=1))
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_medium_is_empty_where_its_field_is() -> None:
+    """The medium of docs/plugins.md, black, and the march of the same field."""
+    name = str(bundled("hydrant/field.safetensors"))
+    volume = {"type": "grid_field", "filename": name}
+    sigma_t = {**volume, "density_limit": 500.0}
+    black = {"type": "constvolume", "value": 0.0}
+    medium = {"type": "heterogeneous", "sigma_t": sigma_t, "albedo": black}
+    box = mi.ScalarTransform4f().translate([0, 0, 0.375]).scale([0.216, 0.2335, 0.3985])
+    cube = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}}
+    cube["interior"] = medium
+    light = shown({"type": "volpath", "max_depth": 4}, {"cube": cube})[..., 0]
+    march = shown({"type": "field_integrator", "hydrant": volume}, {})
+    opacity = march[..., 3]
+    assert 0.2 < (opacity > 0.5).mean() < 0.8
+    nothing = opacity == 0
+    assert nothing.mean() > 0.2
+    assert (1 - light[nothing]).mean() < 1e-3
+    assert light[opacity > 0.999].mean() < 0.05

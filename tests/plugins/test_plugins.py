@@ -12,6 +12,7 @@ import pytest
 from helpers import small_fields as small
 
 from mi_nerfattack.fields import load_field, save_field
+from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -88,7 +89,7 @@ def test_emitter_loads_from_xml_and_dict(grid: Path) -> None:
     emitter = {"type": "field_emitter", "object": nested}
     from_dict = mi.load_dict({"type": "cube", "emitter": emitter}, parallel=False)
     for loaded in (from_xml, from_dict):
-        assert "FieldEmitter[fields=(object), stop=0.001]" in str(loaded)
+        assert "FieldEmitter[fields=(object), stop=1e-06]" in str(loaded)
 
 
 def test_integrator_loads_from_xml_and_dict(paths) -> None:
@@ -101,7 +102,7 @@ def test_integrator_loads_from_xml_and_dict(paths) -> None:
     )
     for loaded in (from_xml, from_dict):
         assert str(loaded) == (
-            "FieldIntegrator[fields=(scene, object), InterleavedComposite, stop=0.001]"
+            "FieldIntegrator[fields=(scene, object), InterleavedComposite, stop=1e-06]"
         )
         layers = [f"{name}.{c}" for name in ("scene", "object") for c in "RGBAZ"]
         assert loaded.aov_names() == ["opacity", "depth", *layers]
@@ -248,3 +249,32 @@ def test_box_and_bound_in_the_world(paths, rng: np.random.Generator) -> None:
         peak = loaded.eval_1(it).numpy().max()
         assert 0 < peak <= loaded.max() < 10 * peak
         assert loaded.max_per_channel() == [loaded.max()] * 3
+
+
+def test_a_density_given_back_changes_nothing() -> None:
+    name = bundled("hydrant/field.safetensors")
+    camera = '<lookat origin="-2, 0.3, 0.6" target="0, 0, 0.375" up="0, 0, 1"/>'
+    scene = load(
+        f"""<scene ><integrator type="field_integrator">{volume(name)}</integrator>
+        <sensor type="perspective"><float name="fov" value="35"/>
+        <transform name="to_world">{camera}</transform>
+        <film type="hdrfilm"><integer name="width" value="32"/>
+        <integer name="height" value="48"/></film></sensor></scene>"""
+    )
+    before = np.array(mi.render(scene, spp=1))
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.endswith("density"))
+    params[key] = params[key] + 0
+    params.update()
+    after = np.array(mi.render(scene, spp=1))
+    assert before[..., 3].max() > 0.99
+    np.testing.assert_allclose(after[..., :4], before[..., :4], atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["grid_field", "ngp_field"])
+def test_steps_can_be_set(paths, kind: str) -> None:
+    more = '<float name="step_m" value="0.003"/>'
+    assert load(volume(paths[kind], kind, more)).field.step_m == pytest.approx(0.003)
+    refuse(
+        volume(paths[kind], kind, more.replace("0.003", "0")), "step_m: 0.0; must be"
+    )

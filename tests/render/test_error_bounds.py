@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import small_fields as small
 from helpers.exact_fields import GaussianField, box_interval, quadrature, rays_towards
+from scipy.integrate import cumulative_trapezoid
 
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.render.camera.pose import Pose
@@ -80,13 +81,17 @@ def test_step_bounds_the_error(step: float, peak: float) -> None:
 
 @pytest.mark.parametrize("step", [0.2, 0.07, 0.03])
 def test_step_bounds_the_error_at_kinks(step: float) -> None:
-    # Along x, the logarithm of the density runs straight from vertex to vertex.
+    # Along x, the logarithm of the density and the raw colour run straight from vertex
+    # to vertex.
     rng = np.random.default_rng(4)
     field = GridField(GridLayout(1, 9, 9), -np.ones(3), np.ones(3), step_m=step)
     planes = np.sort(np.unique(small.vertices(field)[:, 0]))
     height = rng.uniform(-1.5, 1.0, len(planes))
     raw = np.interp(small.vertices(field)[:, 0], planes, height)
     field.set_parameter("density", raw.astype(np.float32))
+    colours = rng.uniform(-3, 3, (len(planes), 3))
+    shown = [np.interp(small.vertices(field)[:, 0], planes, c) for c in colours.T]
+    field.set_parameter("texture", np.stack(shown, 1).astype(np.float32))
 
     start = rng.uniform(2, 3, 32).astype(np.float32)  # the lattice starts at the eye
     origin = mi.Point3f(-mi.Float(start), 0.13, -0.4)
@@ -103,6 +108,21 @@ def test_step_bounds_the_error_at_kinks(step: float) -> None:
     error = np.abs(seen.opacity.numpy().astype(float) + np.expm1(-tau))
     assert np.all(error <= limit + 1e-6)
     assert np.max(error) > 1e-3 * limit
+
+    fine = np.linspace(-1, 1, 200_001)
+    sigma = field.density_scale * np.exp(np.interp(fine, planes, height))
+    through = np.exp(-cumulative_trapezoid(sigma, fine, initial=0))
+    s0, s1 = sigma.max(), np.abs(np.gradient(sigma, fine)).max()
+    e = limit + step**2 * s1 / 4
+    for found, raw in zip(seen.radiance.numpy(), colours.T, strict=True):
+        colour = small.sigmoid_to_linear(np.interp(fine, planes, raw))
+        slope = np.diff(colour) / np.diff(fine)
+        l0, l1, turns = colour.max(), np.abs(slope).max(), np.abs(np.diff(slope)).sum()
+        local = s0 * (l1 * (1 + s0 * step) / 12 + turns / 4)
+        most = e * (l0 + 2 * l1) + step**2 * local
+        error = np.abs(found - np.trapezoid(sigma * through * colour, fine))
+        assert np.all(error <= most + 1e-6)
+        assert np.max(error) > 1e-4 * most
 
 
 @pytest.mark.parametrize("stop", [0.3, 0.03, 1e-3])

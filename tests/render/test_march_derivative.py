@@ -183,7 +183,7 @@ def test_skipped_cells_have_no_gradient(rng: np.random.Generator) -> None:
     field = small.blob(rng)
     cells = np.ones((4, 4, 4), bool)
     cells[:, :, 2:] = False  # z > 0
-    field.occupancy = Occupancy(cells)
+    field.occupy(Occupancy(cells))
     setting = Setting(rng, field)
     setting.posed = PosedField(field)
     packed = setting.attach()

@@ -78,7 +78,7 @@ def test_it_is_the_march_of_the_bundled_scene():
 )
 def test_it_is_the_march_of_a_small_field(rng, cone, pose, spread, stop):
     field = small_ngp(cone=cone)
-    field.occupancy = Occupancy(rng.random((6, 5, 4)) < 0.4)
+    field.occupy(Occupancy(rng.random((6, 5, 4)) < 0.4))
     posed, rays = PosedField(field, pose), random_rays(rng, spread=spread)
     assert 0.05 < float(dr.mean(march(posed, rays).opacity)[0]) < 0.95
     assert_same(posed, rays, stop)
@@ -95,7 +95,7 @@ def test_several_features_and_levels(rng):
 
 def test_empty_field_and_opaque_first_cell(rng):
     field = small_ngp()
-    field.occupancy = Occupancy(np.zeros((2, 2, 2), bool))
+    field.occupy(Occupancy(np.zeros((2, 2, 2), bool)))
     rays = random_rays(rng)
     seen = PackedMarch(PosedField(field), STOP).march(rays)
     assert not np.array(seen.opacity).any() and not np.array(seen.radiance).any()

@@ -191,7 +191,15 @@ def test_a_scenario_drives_among_splats(build) -> None:
     assert depth[2, 6] == pytest.approx((9 - 0.5) / ahead, rel=0.02)
 
 
+def test_steps_and_the_end_of_rays_are_the_scenarios(build) -> None:
+    text = SCENARIO.replace("[[objects]]", "stop = 0.01\n[[objects]]\nstep_m = 0.5")
+    world = build(text)
+    assert (world.surrogate.stop, world.fields[0].step_m) == (0.01, 0.5)
+
+
 def test_scenarios_with_splats_refuse_what_they_cannot_do(build) -> None:
+    with pytest.raises(InputError, match="scene.step_m: .*wall.ply holds splats"):
+        build(SCENARIO.replace("[scene]", "[scene]\nstep_m = 0.1"))
     with pytest.raises(InputError, match="wall.ply: .* set attack.attached to false"):
         build(SCENARIO + "[attack]\nattached = true\n")
     text = SCENARIO.replace("[scene]", '[scene]\ncomposite = "interleaved"')

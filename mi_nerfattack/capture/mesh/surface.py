@@ -241,15 +241,14 @@ def _voxel_opacity(field: GridField, voxel: float) -> np.ndarray:
 
 
 def _density(field: GridField, points: np.ndarray) -> np.ndarray:
-    """Evaluate the density (n,) where rays would: in occupied cells of the box."""
+    """Evaluate the density (n,), 0 outside the box."""
     result = np.empty(len(points))
     for start in range(0, len(points), _CHUNK):
         part = slice(start, start + _CHUNK)
         point = _point(points[part])
         unit = field.unit(point)
         inside = dr.all((unit >= 0) & (unit <= 1))
-        distance, _ = field.occupancy.query(unit, inside)
-        result[part] = field.density(point, inside & (distance == 0)).numpy()
+        result[part] = field.density(point, inside).numpy()
     return result
 
 

@@ -84,6 +84,7 @@ class PackedNGP:
         for weight in self._rest:
             x = _product(weight, _rectify(x))
         density, colour = self._field.activate(raw_density, x)
+        density *= self._field.window(self._field.unit(point), active)
         return density & active, colour & active
 
 

@@ -50,7 +50,9 @@ class NGPPoints(AbstractPoints):
         """See :meth:`AbstractPoints.eval`."""
         unit = self.field.clipped(point)
         features = [mi.Float(x) for x in self.field.encoding(unit, active)]
-        return *self.field.decode(features, direction), (features, point)
+        density, radiance = self.field.decode(features, direction)
+        factor = self.field.window(self.field.unit(point), active)
+        return density * factor, radiance, (features, point, factor)
 
     def append(
         self,
@@ -61,7 +63,8 @@ class NGPPoints(AbstractPoints):
         active: mi.Bool,
     ) -> None:
         """See :meth:`AbstractPoints.append`."""
-        features, point = evaluated
+        features, point, factor = evaluated
+        d_density = factor * d_density  # by what the network gives
         slot = dr.scatter_inc(self._counter, mi.UInt32(0), active)
         active = active & (slot < self.capacity)
         numbers = mi.ArrayXf([*point, d_density, *d_radiance, mi.Float(0)])  # pyright: ignore[reportCallIssue]

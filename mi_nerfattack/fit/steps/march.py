@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fit.batch import BatchSource, Draw, Score
+from mi_nerfattack.fit.batch import STOP, BatchSource, Draw, Score
 from mi_nerfattack.render.batched import march_gradient
-from mi_nerfattack.render.march import STOP, march, march_derivative
+from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays
 from mi_nerfattack.render.walk import sample_count

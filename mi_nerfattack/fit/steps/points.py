@@ -18,7 +18,7 @@ from mi_nerfattack.fields.cpu.rows import (
     scatter,
 )
 from mi_nerfattack.fields.ngp import NGPField
-from mi_nerfattack.fit.batch import BatchSource, Draw, Score
+from mi_nerfattack.fit.batch import STOP, BatchSource, Draw, Score
 from mi_nerfattack.fit.steps.samples import (
     Samples,
     Spread,
@@ -28,7 +28,7 @@ from mi_nerfattack.fit.steps.samples import (
     list_samples,
     measure_spread,
 )
-from mi_nerfattack.render.march import STOP, private_gradients
+from mi_nerfattack.render.march import private_gradients
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
 
@@ -86,10 +86,10 @@ class PointStep:
         )
         wide = dr.width(view) // self.kept
         nets.forward(rows(features, size), rows(view, wide), self._raw.view)
-        score, slopes = self._compare(draw, samples, self._raw.array)
+        score, slopes, by_window = self._compare(draw, samples, self._raw.array)
         score.listed = dr.sum(listed.count)
         add_gradients(self.field, nets.backward(rows(slopes, 4), self._slopes.view))
-        self._scatter(draw, samples, self._slopes.array)
+        self._scatter(draw, samples, self._slopes.array, by_window)
         return score, random
 
     def _state(self, *arguments: Any) -> list[Any]:
@@ -121,7 +121,7 @@ class PointStep:
 
     def _record_compare(
         self, draw: Draw, samples: Samples, raw: mi.Float
-    ) -> tuple[Score, mi.Float]:
+    ) -> tuple[Score, mi.Float, mi.Float]:
         leaf = mi.Float(raw)
         dr.enable_grad(leaf)
         raw_density, *raw_colour = columns(leaf, 4)
@@ -142,7 +142,7 @@ class PointStep:
             score.loss += dr.sum(spread.penalty) * self.source.weights.spread
             dr.eval(by_depth, by_colour)
         dr.backward(depths * by_depth + dr.dot(colour, by_colour))
-        return score, dr.grad(leaf)
+        return score, dr.grad(leaf), by_depth * values
 
     def _spread(self, samples: Samples, depths: mi.Float) -> Spread:
         """Measure spread in steps of the march, as a share of those across the box."""
@@ -153,13 +153,19 @@ class PointStep:
         factor = self.source.weights.spread * dr.rcp(mi.Float(rays))
         return measure_spread(samples, depths, position, width, factor)
 
-    def _record_scatter(self, draw: Draw, samples: Samples, slopes: mi.Float) -> None:
+    def _record_scatter(
+        self, draw: Draw, samples: Samples, slopes: mi.Float, by_window: mi.Float
+    ) -> None:
+        """Differentiate by table and poses; `by_window` (m,) is by its logarithm."""
         point = _points(draw.rays, samples)
         if self.source.learns_poses:
             dr.enable_grad(point)
         with private_gradients():
             scatter(self.field, point, slopes)
         if self.source.learns_poses:
+            factor = self.field.window(self.field.unit(point), mi.Bool(True))
+            there = dr.detach(factor)
+            dr.backward_from(factor * dr.select(there > 0, by_window / there, 0))
             by_point = dr.select(self._is_used(samples), dr.grad(point), 0)
             self.source.backward_rays(draw, *_along_rays(draw.rays, samples, by_point))
 

@@ -28,7 +28,8 @@ class Samples:
         fits: (n,), whether a ray has all its samples.
         ray: (m,), the ray of a slot.
         t: (m,), position on the ray, metres.
-        width: (m,), length of the interval that the sample stands for, metres.
+        width: (m,), length of the interval that the sample stands for, metres, times
+            the field's window there.
     """
 
     first: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
@@ -110,7 +111,9 @@ def _fill(posed: PosedField, rays: Rays, samples: Samples) -> None:
         walk, here = walk.next([posed], active)
         dr.scatter(samples.ray, ray, slot, here.active)
         dr.scatter(samples.t, here.t, slot, here.active)
-        dr.scatter(samples.width, here.width, slot, here.active)
+        unit = posed.field.unit(walk.paths[0].at(here.t))
+        width = here.width * posed.field.window(unit, here.active)
+        dr.scatter(samples.width, width, slot, here.active)
         slot += 1
         active = here.active & (slot < end)
 

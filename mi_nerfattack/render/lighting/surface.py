@@ -15,7 +15,6 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -51,15 +50,15 @@ class Geometry(AbstractField):
         self.source = source
         self.lower, self.upper = source.lower, source.upper
         self.step_m, self.cone = source.step_m, source.cone
-        self.occupancy: Occupancy = source.occupancy
+        self.occupancy, self.window = source.occupancy, source.window
 
-    def eval(
+    def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
-        """Evaluate the density; differentiable by `point` alone."""
+        """Evaluate the density alone; differentiable by `point`."""
         del direction
         with dr.suspend_grad(*self.source.arrays()):
-            return self.source.density(point, active), mi.Color3f(0)
+            return self.source.density_everywhere(point, active), mi.Color3f(0)
 
 
 def geometry(posed: PosedField) -> PosedField:

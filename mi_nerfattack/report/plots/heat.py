@@ -58,7 +58,8 @@ class MagnitudeField(AbstractField):
     def __init__(self, grid: GridField, values: np.ndarray) -> None:
         self.grid = grid
         self.lower, self.upper = grid.lower, grid.upper
-        self.step_m, self.cone, self.occupancy = grid.step_m, grid.cone, grid.occupancy
+        self.step_m, self.cone = grid.step_m, grid.cone
+        self.occupancy, self.window = grid.occupancy, grid.window
         table = np.repeat(np.asarray(values, np.float32)[:, None], 3, axis=1)
         density = grid.parameters()["density"].numpy().copy()
         self.values = GridField(
@@ -72,11 +73,11 @@ class MagnitudeField(AbstractField):
             grid.step_m,
         )
 
-    def eval(
+    def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
         """Evaluate density and, as a grey radiance, the interpolated number."""
-        density, _ = self.grid.eval(point, direction, active)
+        density = self.grid.density_everywhere(point, active)
         unit = dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
         features = self.values.encoding(unit, active)
         levels = range(1, self.grid.layout.levels)

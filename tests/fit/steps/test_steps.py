@@ -44,7 +44,7 @@ def ngp(rng: np.random.Generator) -> NGPField:
     table = rng.normal(size=field.encoding.n_params).astype(np.float32)
     field.set_parameter("table", mi.Float(table))
     field.density_scale = 6.0
-    field.occupancy = Occupancy(rng.random((6, 6, 6)) < 0.5)
+    field.occupy(Occupancy(rng.random((6, 6, 6)) < 0.5))
     return field
 
 

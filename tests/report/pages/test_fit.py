@@ -96,7 +96,7 @@ def test_rings_of_holes_in_far_walls_are_told(layers, is_whole):
     """Cells of 0.94 m in one layer, and steps of 1 m at 32 m."""
     images, depth = room_views(8)
     field = SolidField(0.2, 1 / 32)
-    field.occupancy = Occupancy(shell_cells((72, 72, 36), layers))
+    field.occupy(Occupancy(shell_cells((72, 72, 36), layers)))
     scores = evaluate(field, images, range(8), depth)
     (found,) = (item for item in judge(scores) if "known surfaces" in item.name)
     assert found.met == is_whole and (found.value > 0.01) != is_whole
@@ -110,7 +110,7 @@ def test_holes_are_counted_where_surfaces_are_known_and_in_the_box():
     known[0, 0], known[0, 1] = np.nan, np.inf
     known[0, 2] = 7  # behind the box
     assert evaluate(field, images, [0], known)[0].holes == 0
-    field.occupancy = Occupancy(np.array([True, False]).reshape(1, 1, 2))  # below z = 0
+    field.occupy(Occupancy(np.array([True, False]).reshape(1, 1, 2)))  # below z = 0
     assert evaluate(field, images, [0], known)[0].holes == pytest.approx(3 / 9)
     assert np.isnan(evaluate(field, images, [0], np.full_like(known, 7))[0].holes)
     assert np.isnan(evaluate(field, images, [0])[0].holes)

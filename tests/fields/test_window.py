@@ -1,0 +1,149 @@
+"""Emptiness as part of a field, the same for whatever evaluates it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.file_reader import window
+from helpers.small_fields import ONES, homogeneous, small_ngp
+
+from mi_nerfattack.fields import Occupancy, load_field
+from mi_nerfattack.fields.cpu.ngp import PackedNGP
+from mi_nerfattack.fields.window import Window
+from mi_nerfattack.render.camera.intrinsics import (
+    from_fov,
+    generate_rays,
+    look_at,
+    pose_arrays,
+)
+from mi_nerfattack.render.march import march
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.scenes import bundled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SHAPE = (6, 5, 4)
+
+
+def some_cells(rng: np.random.Generator) -> np.ndarray:
+    return rng.random(SHAPE) < 0.6
+
+
+def points(rng: np.random.Generator, count: int = 20_000) -> np.ndarray:
+    """Draw points in the unit box and a little outside, (n, 3) float32."""
+    return rng.uniform(-0.1, 1.1, (count, 3)).astype(np.float32)
+
+
+def test_the_factor_is_that_of_the_definition(rng) -> None:
+    cells, unit = some_cells(rng), points(rng)
+    found = Window(cells)(mi.Point3f(unit.T), mi.Bool(True)).numpy()
+    expected = window(cells, unit.astype(float))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert 0.1 < (found == 1).mean() < 0.7
+    assert ((found > 0.01) & (found < 0.99)).sum() > 500
+
+
+def test_empty_cells_have_no_density_and_full_ones_all(rng) -> None:
+    cells, unit = some_cells(rng), points(rng)
+    found = Window(cells)(mi.Point3f(unit.T), mi.Bool(True)).numpy()
+    scaled = unit * SHAPE
+    cell = np.floor(scaled).astype(int)
+    inside = ((cell >= 0) & (cell < SHAPE)).all(1)
+    full = np.zeros(len(unit), bool)
+    full[inside] = cells[tuple(cell[inside].T)]
+    assert (found[~full] == 0).all()
+    edge = np.minimum(scaled - cell, cell + 1 - scaled).min(1)
+    assert (found[full & (edge > 0.25)] == 1).all()  # even at the corner of a lone cell
+
+
+def test_the_slope_is_that_of_the_factor(rng) -> None:
+    cells, unit = some_cells(rng), points(rng)
+    place = mi.Point3f(unit.T)
+    dr.enable_grad(place)
+    dr.backward(Window(cells)(place, mi.Bool(True)))
+    found = dr.grad(place).numpy().T
+
+    along, h = rng.normal(size=unit.shape), 1e-6
+    ends = [window(cells, unit.astype(float) + s * along) for s in (h, -h)]
+    expected = (ends[0] - ends[1]) / (2 * h)
+    wrong = np.abs((found * along).sum(1) - expected) > 1e-2 * (1 + np.abs(expected))
+    inside = ((unit > 0) & (unit < 1)).all(1)
+    assert wrong[inside].mean() < 1e-3  # at kinks, and within 1e-6 of them
+
+
+def test_a_field_without_empty_cells_ends_at_its_box(rng) -> None:
+    unit = points(rng)
+    found = Window(np.ones(SHAPE, bool))(mi.Point3f(unit.T), mi.Bool(True)).numpy()
+    assert (found == 1).all()
+
+
+@pytest.mark.parametrize("make", [homogeneous, small_ngp])
+def test_whatever_evaluates_a_field_sees_the_same(make, rng) -> None:
+    field = make()
+    everywhere = field.density(mi.Point3f(0.1, 0.2, 0.3), mi.Bool(True))[0]
+    assert everywhere > 0
+    cells, unit = some_cells(rng), points(rng)
+    field.occupy(Occupancy(cells))
+    place = mi.Point3f((field.lower + unit * (field.upper - field.lower)).T)
+    heading, active = mi.Vector3f(0, 0, 1), mi.Bool(True)
+    expected = field.density_everywhere(place, active).numpy()
+    expected *= window(cells, unit.astype(float))
+    found = [field.eval(place, heading, active)[0], field.density(place, active)]
+    if field.kind == "ngp_field":
+        found.append(field.points(len(unit)).eval(place, heading, active)[0])
+        packed = PackedNGP(field)
+        found.append(packed.eval(place, packed.view(heading), active)[0])
+    for density in found:
+        limit = 1e-4 * expected.max()
+        np.testing.assert_allclose(density.numpy(), expected, atol=limit)
+
+
+def look(field, origin: tuple, target: tuple) -> np.ndarray:
+    """Render a field over its background, linear, at 96 x 64 pixels."""
+    camera, pose = from_fov(96, 64, 60.0), look_at(np.array(origin), np.array(target))
+    o, d = generate_rays(camera, *pose_arrays(pose), 1)
+    seen = march(PosedField(field), Rays(o, d))
+    behind = (1 - seen.opacity) * field.background(d)
+    return (seen.radiance + behind).numpy()
+
+
+@pytest.mark.parametrize(
+    ("name", "origin", "target"),
+    [
+        ("hydrant", (-1.5, 0.2, 0.5), (0, 0, 0.4)),
+        ("hydrant", (-0.8, 0.2, 1.5), (0, 0, 0.4)),
+        ("intersection", (-20, -1.75, 1.4), (0, -1.75, 1)),
+        ("intersection", (-15, -10, 12), (5, 0, 0)),
+    ],
+)
+def test_bundled_fields_do_not_need_their_occupancy(name, origin, target) -> None:
+    field = load_field(bundled(f"{name}/field.safetensors"))
+    shipped = look(field, origin, target)
+    assert shipped.std() > 0.05
+    field.occupancy = Occupancy.full()
+    everywhere = look(field, origin, target)
+    assert np.mean((everywhere - shipped) ** 2) < 10**-4.5  # 45 dB
+
+
+def test_a_distant_object_is_as_sharp_as_a_near_one() -> None:
+    """Parallel rays from 1 km and from 1 m: single precision must not show."""
+    field = homogeneous(40.0)
+    field.lower, field.upper, field.step_m = -0.04 * ONES, 0.04 * ONES, 2**-10
+    cells = np.zeros((16, 16, 16), bool)
+    cells[3:13, 3:13, 3:13] = True
+    field.occupy(Occupancy(cells))
+    y, z = np.meshgrid(*[np.linspace(-0.045, 0.045, 91)] * 2)
+    posed = PosedField(field)
+
+    def image(distance: float) -> np.ndarray:
+        origin = mi.Point3f(-distance, y.ravel(), z.ravel())
+        rays = Rays(origin, mi.Vector3f(1, 0, 0), mi.Float(np.inf), mi.Float(0.5))
+        dr.make_opaque(rays)
+        return march(posed, rays).opacity.numpy()
+
+    near = image(1.0)  # both distances are whole steps
+    assert 0.2 < near.mean() < 0.6
+    np.testing.assert_allclose(image(1000.0), near, atol=1e-4)

@@ -1,0 +1,96 @@
+"""Attached derivatives of the bundled scenario against central differences.
+
+Its field has dense matter beside empty cells: where derivatives by the camera go wrong.
+Differences are small, because one ray a pixel sees another point after a milliradian.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import World, build_world
+from mi_nerfattack.scenes import bundled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+HEADING = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture
+def world(variant: str) -> World:
+    """The bundled scenario."""
+    scenario, _ = load_scenario(bundled("demo.toml"))
+    return build_world(scenario, scenario.policy.build())
+
+
+def to_the_left(pose: np.ndarray) -> np.ndarray:
+    return np.array([-np.sin(pose[2]), np.cos(pose[2]), 0.0])
+
+
+def test_one_frame(world: World) -> None:
+    """A smooth function of eight frames' pixels, all poses in one launch."""
+    sensor, loop = world.surrogate, world.loop(world.surrogate)
+    rng = np.random.default_rng(0)
+    shifts = rng.uniform(0, 25, 8), rng.normal(0, 0.3, 8), rng.normal(0, 0.05, 8)
+    poses = world.route.pose_at(*shifts)
+    height, width = sensor.camera.height, sensor.camera.width
+    y, x = np.mgrid[0:height, 0:width]
+    rows = [
+        np.cos(3 * x / width + c) * np.sin(2 * y / height + 1 + c) for c in range(3)
+    ]
+    weight = np.stack(rows, -1).astype(np.float32)
+
+    def values(poses: np.ndarray) -> np.ndarray:
+        image = sensor.observe(loop.initial(poses), 0).image
+        return (np.array(image, np.float64) * weight).sum((1, 2, 3))
+
+    state = loop.initial(poses)
+    seen = sensor.observe(state, 0)
+    sensor.start_gradient()
+    d_image = mi.TensorXf(np.repeat(weight[None], len(poses), 0))
+    found = np.array(sensor.vjp(seen, state, d_image, True)).reshape(-1, len(poses)).T
+    for name, direction in (
+        ("heading", np.repeat(HEADING[None], len(poses), 0)),
+        ("lateral", np.array([to_the_left(pose) for pose in poses])),
+    ):
+        by_pose = (found[:, :3] * direction).sum(1)
+        h = 1e-5 if name == "heading" else 1e-4
+        ends = [values(poses + s * direction) for s in (h, -h)]
+        expected = (ends[0] - ends[1]) / (2 * h)
+        error = np.linalg.norm(by_pose - expected) / np.linalg.norm(expected)
+        assert error < 0.03, (name, by_pose, expected)
+
+
+@pytest.mark.slow
+def test_the_loop(world: World) -> None:
+    """Five periods from the scenario's initial poses, in five directions."""
+    loop, poses = world.loop(world.surrogate), world.initial
+    rollout = Rollout(loop, world.objective, 5, attached=True)
+    gradient = rollout.gradient(rollout.run(loop.initial(poses)))
+    by_state = np.array(gradient.initial).T[:, :3]
+
+    def difference(direction: np.ndarray, h: float) -> float:
+        ends = [poses + s * direction for s in (h, -h)]
+        high, low = (float(rollout.run(loop.initial(end)).value) for end in ends)
+        return (high - low) / (2 * h)
+
+    heading = np.repeat(HEADING[None], len(poses), 0)
+    lateral = np.array([to_the_left(pose) for pose in poses])
+    for direction, h in ((heading, 1e-5), (lateral, 1e-4)):
+        expected = difference(direction, h)
+        assert (by_state * direction).sum() == pytest.approx(expected, rel=0.05)
+
+    (original,) = [np.array(texture) for texture in world.surrogate.textures()]
+    (by_texture,) = [np.array(texture) for texture in gradient.textures]
+    for seed in range(3):
+        along = np.random.default_rng(seed).normal(size=original.shape)
+        values = []
+        for h in (1e-2, -1e-2):
+            world.set_textures([(original + h * along).astype(np.float32)])
+            values.append(float(rollout.run(loop.initial(poses)).value))
+        expected = (values[0] - values[1]) / 2e-2
+        assert (by_texture * along).sum() == pytest.approx(expected, rel=0.05)
