@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+_LONGEST, _HEAD, _TAIL = 8000, 6000, 1500  # characters of a message
+
 
 class NerfAttackError(Exception):
     """Report a problem that the user can do something about.
 
     The command line prints the message without a traceback and exits with code 2.
     A message reads ``<file or parameter>: <what is wrong, with the value>;
-    <what is allowed or what to do>``.
+    <what is allowed or what to do>``. It may quote files: the middle of a long one is
+    left out, and what a terminal would not show as a character is escaped.
     """
+
+    def __init__(self, message: str) -> None:
+        if len(message) > _LONGEST:
+            left_out = f" ... ({len(message) - _HEAD - _TAIL} characters) ... "
+            message = message[:_HEAD] + left_out + message[-_TAIL:]
+        super().__init__("\n".join(map(_printable, message.split("\n"))))
 
 
 class InputError(NerfAttackError, ValueError):
@@ -18,6 +27,11 @@ class InputError(NerfAttackError, ValueError):
 
 class SetupError(NerfAttackError, RuntimeError):
     """Report a machine or an installation that cannot do what is asked."""
+
+
+def _printable(line: str) -> str:
+    shown = (c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return line if line.isprintable() else "".join(shown)
 
 
 def is_interrupt(error: BaseException | None) -> bool:

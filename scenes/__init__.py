@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from mi_nerfattack.errors import InputError
@@ -21,8 +22,8 @@ def bundled(name: str) -> Path:
     Raises:
         InputError: nothing of this name is bundled; the message lists what is.
     """
-    path = (ROOT / name).resolve()
-    if path.is_relative_to(ROOT) and path.exists():
-        return path
+    path = ROOT / name
+    if os.path.exists(path) and path.resolve().is_relative_to(ROOT):
+        return path.resolve()
     known = ", ".join(data_files(ROOT))
     raise InputError(f"{name}: not a bundled file or folder; there are {known}")

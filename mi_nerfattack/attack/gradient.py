@@ -254,13 +254,15 @@ class GradientAttack:
                 self._load_parameter(key, tensors)
 
     def _load_history(self, tensors: dict[str, np.ndarray]) -> None:
-        ends = np.cumsum(tensors["cost_counts"])
-        costs = np.split(tensors["costs"], ends[:-1])
+        counts, rows = tensors["cost_counts"], tensors["history"]
+        if counts.shape != rows.shape[:1] or counts.sum() != len(tensors["costs"]):
+            raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
+        costs = np.split(tensors["costs"], np.cumsum(counts)[:-1])
         self.history = [
             IterationRecord(
                 int(row[0]), *map(float, row[1:]), costs=tuple(map(float, part))
             )
-            for row, part in zip(tensors["history"], costs, strict=False)
+            for row, part in zip(rows, costs, strict=False)
         ]
 
     def _load_parameter(self, key: str, tensors: dict[str, np.ndarray]) -> None:
@@ -269,6 +271,9 @@ class GradientAttack:
         value, promoted, rate, extra = state
         if f"first.{key}" in tensors:
             count = type(extra[0])([int(tensors[f"count.{key}"][0])])
+            for name in (f"first.{key}", f"second.{key}"):
+                if tensors[name].shape != tensors[f"texture.{key}"].shape:
+                    raise InputError(f"{name} has shape {tensors[name].shape}")
             first = _like(extra[1], value, tensors[f"first.{key}"])
             second = _like(extra[2], value, tensors[f"second.{key}"])
             extra = (count, first, second, extra[3])

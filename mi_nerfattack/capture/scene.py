@@ -107,6 +107,8 @@ def capture_scene(
     """
     poses = drive_poses(load_routes(routes_path), n, seed)
     scene = load_scene(scene_path)
+    if scene.integrator() is None:
+        raise InputError(f"{scene_path}: has no integrator; add one, for instance path")
     path = begin_posed(out_folder)
     root = path.parent
     names = [f"images/{i:04d}.png" for i in range(n)]

@@ -6,6 +6,7 @@ In memory poses are OpenCV camera-to-world matrices; in the file they are OpenGL
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -251,7 +252,7 @@ def _find_image(source: Path, index: int, frame: Any) -> Path | None:
     base = str(source.parent / name.replace("\\", "/"))
     for suffix in ("", *files.IMAGE_SUFFIXES):
         candidate = Path(base + suffix)
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return candidate
     return None
 

@@ -6,13 +6,17 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.determinism import random_states, restore_random_states
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.io.resumable import Kept, Record, Unit
+from mi_nerfattack.io.resumable import (
+    Kept,
+    Record,
+    Unit,
+    check_entries,
+    misfits_told,
+)
 
 FORMAT = "mi_nerfattack attack checkpoint 4"
 REMEDY = (
@@ -92,12 +96,16 @@ class CheckpointFile:
         """
         kept, self._kept = self._kept, None
         assert kept is not None, "read() has found a checkpoint"
-        self._check_shapes(attack.tensors(), kept.tensors)
-        if kept.ignored:
-            attack.go_on_from(kept.tensors)
-        else:
-            attack.load_tensors(kept.tensors)
-        restore_random_states(kept.tensors)
+        needed = attack.tensors() | random_states()
+        if kept.ignored:  # of another scenario: without what this one adds
+            needed = {name: needed[name] for name in needed if name in kept.tensors}
+        check_entries(self.path, kept.tensors, needed)
+        with misfits_told(self.path):
+            if kept.ignored:
+                attack.go_on_from(kept.tensors)
+            else:
+                attack.load_tensors(kept.tensors)
+            restore_random_states(kept.tensors)
         self.iteration = attack.iteration
         if kept.ignored:
             self.save(attack, kept.record.effort)
@@ -134,14 +142,3 @@ class CheckpointFile:
             f"iteration {attack.iteration} is not saved, {kept}; continue "
             "with 'mi-nerfattack attack --resume'"
         )
-
-    def _check_shapes(
-        self, needed: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]
-    ) -> None:
-        """Compare what has a size of its own; a new attack's history is empty."""
-        for name, value in needed.items():
-            if name in found and value.size and found[name].shape != value.shape:
-                raise InputError(
-                    f"{self.path}: {name} has shape {found[name].shape}, this run "
-                    f"needs {value.shape}; start a new run folder"
-                )

@@ -8,7 +8,7 @@ from pathlib import Path
 from mi_nerfattack.experiment.checkpoint import REMEDY
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit
+from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 
 FORMAT = "mi_nerfattack attack drive 1"
@@ -67,16 +67,9 @@ class KeptDrives:
             efforts.append(record.effort)
             ignored += kept.ignored
             if not kept.ignored:
-                self._take_up(
-                    Drive(
-                        record.environment,
-                        self._route,
-                        record.case,
-                        record.run,
-                        self._seed,
-                        **kept.tensors,
-                    )
-                )
+                about = (record.environment, self._route, record.case, record.run)
+                with misfits_told(path):
+                    self._take_up(Drive(*about, self._seed, **kept.tensors))
         return max(efforts, key=lambda effort: effort.wall_s), ignored
 
     def take(

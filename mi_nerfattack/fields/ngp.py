@@ -51,7 +51,6 @@ class NGPLayout:
     def __post_init__(self) -> None:
         limits = {
             "levels": (1, 32),
-            "features": (2, 8),
             "log2_table": (8, 24),
             "base_resolution": (2, 1024),
             "max_resolution": (self.base_resolution, 65536),
@@ -62,6 +61,8 @@ class NGPLayout:
                 raise InputError(
                     f"{name}: {getattr(self, name)}; allowed are {low} to {high}"
                 )
+        if self.features not in (2, 4, 8):
+            raise InputError(f"features: {self.features}; allowed are 2, 4 and 8")
 
     @staticmethod
     def small() -> NGPLayout:

@@ -14,7 +14,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.options import FitProgress
 from mi_nerfattack.fit.training import Training
 from mi_nerfattack.io import files
-from mi_nerfattack.io.resumable import Record, Unit
+from mi_nerfattack.io.resumable import Record, Unit, check_entries, misfits_told
 
 FORMAT = "mi_nerfattack fit checkpoint 3"
 _REMEDY = (
@@ -58,7 +58,9 @@ class FitCheckpoint:
         check_unfinished(path, resume)
         kept = self._unit.read()
         if kept is not None:
-            training.load_tensors(kept.tensors)
+            check_entries(path, kept.tensors, training.tensors())
+            with misfits_told(path):
+                training.load_tensors(kept.tensors)
             self.elapsed_s, self.history = kept.record.elapsed_s, kept.record.history
         files.check_writable(path)
         self._written = time.perf_counter()

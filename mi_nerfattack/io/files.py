@@ -16,7 +16,6 @@ import os
 import re
 import secrets
 import stat
-import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,13 +27,10 @@ from PIL import Image
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.strict_json import parse_json
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from mi_nerfattack.io.strict_toml import parse_toml
 
 MAX_TEXT_BYTES = 1 << 28
+MAX_TOML_BYTES = 1 << 21
 MAX_IMAGE_BYTES = 1 << 28
 MAX_IMAGE_PIXELS = 1 << 27
 MAX_TENSOR_BYTES = 1 << 33
@@ -115,12 +111,9 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file."""
-    text = read_text(path)
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as err:
-        raise InputError(f"{path}: {err}; the file must be valid TOML") from err
+    """Read a TOML file of at most 2 MiB; see `parse_toml`."""
+    _check_file(path, MAX_TOML_BYTES)
+    return parse_toml(path, read_text(path))
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -137,13 +130,13 @@ def decode_image(path: str | Path, raw: bytes) -> np.ndarray:
     Returns:
         sRGB values, uint8, (height, width, 3), or (height, width, 4) with alpha.
     """
-    image = _open_image(path, raw, ("PNG", "JPEG", "WEBP"))
-    if image.mode not in ("1", "L", "P", "RGB", "LA", "PA", "RGBA"):
-        raise InputError(
-            f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
-        )
-    mode = "RGBA" if image.has_transparency_data else "RGB"
-    return np.array(image.convert(mode), dtype=np.uint8)
+    with _decoding(path, raw, ("PNG", "JPEG", "WEBP")) as image:
+        if image.mode not in ("1", "L", "P", "RGB", "LA", "PA", "RGBA"):
+            raise InputError(
+                f"{path}: pixel type {image.mode}; use 8 bits a channel, grey or RGB"
+            )
+        mode = "RGBA" if image.has_transparency_data else "RGB"
+        return np.array(image.convert(mode), dtype=np.uint8)
 
 
 def read_image16(path: str | Path) -> np.ndarray:
@@ -152,10 +145,10 @@ def read_image16(path: str | Path) -> np.ndarray:
     Returns:
         values as they are stored, uint16, (height, width).
     """
-    image = _open_image(path, read_bytes(path, MAX_IMAGE_BYTES), ("PNG",))
-    if image.mode not in ("I;16", "I;16B", "I"):
-        raise InputError(f"{path}: pixel type {image.mode}; must be grey, 16 bits")
-    return np.array(image).astype(np.uint16)
+    with _decoding(path, read_bytes(path, MAX_IMAGE_BYTES), ("PNG",)) as image:
+        if image.mode not in ("I;16", "I;16B", "I"):
+            raise InputError(f"{path}: pixel type {image.mode}; must be grey, 16 bits")
+        return np.array(image).astype(np.uint16)
 
 
 def read_safetensors(
@@ -184,8 +177,8 @@ def read_safetensors(
         raise InputError(
             f"{path}: damaged or truncated ({err}); write or copy it again"
         ) from err
-    except (TypeError, AttributeError, OSError) as err:
-        raise InputError(f"{path}: {err}; use types that NumPy has") from err
+    except (TypeError, AttributeError, OSError, ValueError) as err:
+        raise InputError(f"{path}: {err}; use types and sizes NumPy has") from err
 
 
 def find_tensor(path: str | Path, name: str) -> tuple[int, str, tuple[int, ...]]:
@@ -317,8 +310,11 @@ def _reported(path: str | Path) -> Iterator[None]:
         raise InputError(f"{str(path)!r}: {err}; check the path") from err
 
 
-def _open_image(path: str | Path, raw: bytes, formats: tuple[str, ...]) -> Image.Image:
-    """Decode an image of at most `MAX_IMAGE_PIXELS` pixels."""
+@contextmanager
+def _decoding(
+    path: str | Path, raw: bytes, formats: tuple[str, ...]
+) -> Iterator[Image.Image]:
+    """Decode an image of at most `MAX_IMAGE_PIXELS` pixels, and tell of its damage."""
     names = " or ".join(formats)
     try:
         with warnings.catch_warnings():
@@ -330,15 +326,16 @@ def _open_image(path: str | Path, raw: bytes, formats: tuple[str, ...]) -> Image
                 f"at most {MAX_IMAGE_PIXELS} pixels are read"
             )
         image.load()
+        yield image
     except Image.UnidentifiedImageError as err:
         raise InputError(f"{path}: not an image that can be read; use {names}") from err
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:
-        if isinstance(err, InputError):
+    # a damaged file makes Pillow raise whatever its parser stumbles over
+    except Exception as err:
+        if isinstance(err, InputError | MemoryError):
             raise
         raise InputError(
             f"{path}: damaged image ({err}); write or copy it again"
         ) from err
-    return image
 
 
 def _check_file(path: str | Path, limit: int) -> int:

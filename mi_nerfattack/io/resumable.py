@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -18,7 +19,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import pydantic
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
 
 _RECORD = "kept.record"
@@ -136,6 +137,41 @@ class Unit(Generic[R]):
                 f"{self.path}: its record is damaged ({err.errors()[0]['msg']}); start "
                 "again without the file"
             ) from err
+
+
+def check_entries(
+    path: Path, found: Mapping[str, np.ndarray], needed: Mapping[str, np.ndarray]
+) -> None:
+    """Raise InputError unless tensors have the types and shapes that are needed.
+
+    Args:
+        path: their file.
+        found: by name; others than the needed ones are left alone.
+        needed: likewise; of an empty one the first axis is free.
+    """
+    for name, like in needed.items():
+        value, free = found.get(name), 0 if like.size else 1
+        kind = None if value is None else (value.dtype, value.shape[free:], value.ndim)
+        if kind != (like.dtype, like.shape[free:], like.ndim):
+            there = "missing" if value is None else f"{value.dtype} {value.shape}"
+            raise InputError(
+                f"{path}: {name}: {there}, this run needs {like.dtype} {like.shape}; "
+                "start again without the file"
+            )
+
+
+@contextmanager
+def misfits_told(path: Path) -> Iterator[None]:
+    """Tell of entries whose values do not go together, whatever stumbles over them."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as err:
+        if is_interrupt(err):
+            raise
+        raise InputError(
+            f"{path}: its entries do not go together ({err}); start again without the "
+            "file"
+        ) from err
 
 
 def refuse(path: str | Path, found: Sequence[str], remedy: str) -> None:

@@ -1,9 +1,10 @@
-"""Strict JSON: no NaN or infinity, no key twice in one object."""
+"""Strict JSON: no key twice in one object, numbers that 64 bits hold."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -23,17 +24,21 @@ def parse_json(path: str | Path, text: str) -> Any:
     """
     try:
         return json.loads(
-            text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant
+            text,
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse,
+            parse_float=lambda given: _number(float(given), given),
+            parse_int=lambda given: _number(_whole(given), given),
         )
     except json.JSONDecodeError as err:
         raise InputError(
             f"{path}: line {err.lineno}, column {err.colno}: {err.msg}; "
             "the file must be valid JSON"
         ) from err
-    except _ConstantError as err:
+    except _NumberError as err:
         raise InputError(
-            f"{path}: {_key_of_constant(text)}: {err} is not a JSON number; write a "
-            "finite number"
+            f"{path}: {_key_of_number(text)}: {err} is not a JSON number; write a "
+            "finite number, a whole one below 2^63"
         ) from err
     except (ValueError, RecursionError) as err:
         raise InputError(f"{path}: {err}; the file must be valid JSON") from err
@@ -42,34 +47,50 @@ def parse_json(path: str | Path, text: str) -> Any:
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"key {twice!r} twice in one object")
     return result
 
 
-class _ConstantError(ValueError):
-    """NaN or infinity in JSON."""
+class _NumberError(ValueError):
+    """NaN, infinity or a number that 64 bits do not hold, in JSON."""
 
 
-def _refuse_constant(name: str) -> None:
-    raise _ConstantError(name)
+def _refuse(given: str) -> None:
+    short = given if len(given) < 40 else f"{given[:30]}... ({len(given)} characters)"
+    raise _NumberError(short)
 
 
-def _key_of_constant(text: str) -> str:
-    """Return where NaN or infinity is, as `frames[1].transform_matrix[0][3]`."""
+def _number(value: float, given: str) -> float:
+    if not math.isfinite(value):
+        _refuse(given)
+    return value
 
-    def find(value: Any, keys: str) -> str:
+
+def _whole(given: str) -> float:
+    """Return an integer, or infinity where 64 bits do not hold it."""
+    value = int(given) if len(given) <= 20 else math.inf
+    return value if -(1 << 63) <= value < 1 << 63 else math.inf
+
+
+def _key_of_number(text: str) -> str:
+    """Return where such a number is, as `frames[1].transform_matrix[0][3]`."""
+
+    def find(value: Any) -> str | None:
         if isinstance(value, float) and not math.isfinite(value):
-            return keys
-        items: Iterable[tuple[str, Any]] = ()
+            return ""
+        items: Iterable[tuple[Any, Any]] = ()
         if isinstance(value, dict):
-            items = ((f"{keys}.{key}", item) for key, item in value.items())
+            items = value.items()
         elif isinstance(value, list):
-            items = ((f"{keys}[{i}]", item) for i, item in enumerate(value))
-        return next(filter(None, (find(item, at) for at, item in items)), "")
+            items = enumerate(value)
+        for key, item in items:
+            if (inner := find(item)) is not None:
+                return (f"[{key}]" if isinstance(value, list) else f".{key}") + inner
+        return None
 
     try:
-        return find(json.loads(text), "").lstrip(".") or "a value"
+        found = find(json.loads(text, parse_int=_whole)) or ""
+        return found.lstrip(".") or "a value"
     except (ValueError, RecursionError):
         return "a value"  # what follows is damaged too

@@ -161,8 +161,12 @@ class HttpPolicy(AbstractBlackBox):
         control_scale: float = 1.0,
         output: int | None = None,
     ) -> None:
-        parts = urllib.parse.urlsplit(url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        try:
+            parts = urllib.parse.urlsplit(url)
+            usable = parts.scheme in ("http", "https") and parts.port != 0
+        except ValueError as err:
+            raise InputError(f"policy.url: {url!r}: {err}") from err
+        if not usable or not parts.hostname:
             raise InputError(f"policy.url: {url!r}; must be http://HOST... or https://")
         self.url, self.timeout_s, self.retries = url, timeout_s, retries
         handlers: list[urllib.request.BaseHandler] = [_Handler(), _NoRedirects()]

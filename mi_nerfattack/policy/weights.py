@@ -40,16 +40,16 @@ def load_state(module: torch.nn.Module, path: Path) -> None:
             f"{path}: is a checkpoint of {', '.join(map(str, state))}; save its "
             f"{wrappers[0]!r} alone: torch.save(checkpoint[{wrappers[0]!r}], FILE)"
         )
-    for name, value in state.items():
-        if not isinstance(value, torch.Tensor) or not torch.isfinite(value).all():
-            raise InputError(f"{path}: {name!r} is no tensor of finite values")
     try:
         module.load_state_dict(state)
-    except RuntimeError as err:
+        wrong = [n for n, v in module.state_dict().items() if not v.isfinite().all()]
+    except (RuntimeError, NotImplementedError, TypeError, AttributeError) as err:
         raise InputError(
             f"{path}: {err}; save the state_dict() of the very module that policy.file "
             "names"
         ) from err
+    if wrong:
+        raise InputError(f"{path}: {wrong[0]!r} is no tensor of finite values")
 
 
 def load_drjit_state(network: Any, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -89,7 +90,7 @@ class NamedFile:
         if self.path.suffix.lower() == ".xml":
             text = raw.decode("utf-8", "replace")
             for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
-                if (inner := self.path.parent / name).is_file():
+                if os.path.isfile(inner := self.path.parent / name):
                     digest.update(hashlib.sha256(_read(inner)).digest())
         shown = ":".join(filter(None, (self.path.name, self.function)))
         return {"file": shown, "sha256": digest.hexdigest()}

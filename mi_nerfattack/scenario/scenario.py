@@ -33,6 +33,8 @@ from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
 
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
 _MARK = "a line that no file has"
+_MAX_CHARACTERS = 1 << 16
+_MOST_PROBLEMS = 8  # that are told
 
 Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
@@ -205,16 +207,22 @@ def load_scenario(
             missing, of the wrong type or out of range; with file and line.
     """
     text, data = files.read_text(path), files.read_toml(path)
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(
+            f"{path}: {len(text)} characters; a scenario has at most {_MAX_CHARACTERS}"
+        )
     try:
         folder = {"folder": Path(path).parent}
         scenario = Scenario.model_validate(data, context=folder)
     except ValidationError as err:
-        lines = []
-        for location, problem in problems(err):
+        lines, found = [], list(problems(err))
+        for location, problem in found[:_MOST_PROBLEMS]:
             line = _line_of(text, location)
             where = f"{path}:{line}" if line else f"{path}"
             key = ".".join(map(str, location))
             lines.append(f"{where}: {key}: {problem}")
+        if more := len(found) - len(lines):
+            lines.append(f"{path}: and {more} more")
         raise InputError("\n".join(lines)) from err
     if object_field is None:
         return scenario, text

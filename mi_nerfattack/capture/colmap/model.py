@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
@@ -184,7 +185,7 @@ def _find_images(root: Path, model: Path, names: Sequence[str]) -> dict[str, Pat
     bases = dict.fromkeys((root, model, model.parent, model.parent.parent))
     folders = [path for base in bases for path in (base / "images", base)]
     for folder in folders:
-        found = {name: folder / name for name in names if (folder / name).is_file()}
+        found = {name: folder / name for name in names if os.path.isfile(folder / name)}
         if found:
             return found
     raise InputError(

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.capture.mesh.nodes import place_meshes
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.strict_json import parse_json
 
 MAX_BYTES = 1 << 30
 #: Name under which the prepared JSON asks for the binary chunk of a .glb file.
@@ -99,21 +101,19 @@ def prepare(path: Path) -> PreparedGltf:
         if binary is not None:
             chunks[BINARY_CHUNK] = binary
     try:
-        tree = json.loads(raw.decode("utf-8-sig"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(
-            f"{path}: its JSON cannot be read ({error}); export the mesh again"
-        ) from error
-    try:
+        tree = parse_json(path, raw.decode("utf-8-sig"))
         colours = _prepare_tree(path, tree, bool(chunks))
+        place_meshes(path, tree)
+        data = json.dumps(tree).encode()
     except InputError:
         raise
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    # a damaged tree makes raise whatever is missing or of another type
+    except Exception as error:
         raise InputError(
             f"{path}: not a valid glTF file ({type(error).__name__}: {error}); "
             "export the mesh again"
         ) from error
-    return PreparedGltf(json.dumps(tree).encode(), chunks, colours)
+    return PreparedGltf(data, chunks, colours)
 
 
 def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:

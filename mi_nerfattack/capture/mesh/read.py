@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,6 +23,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+_FARTHEST = 1e12
 #: Rotations that bring an axis of a file to z; "y" keeps x and makes +z our -y.
 _TO_Z_UP = {
     "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
@@ -77,14 +79,14 @@ def load_mesh(path: str | Path, up: str | None = None) -> TexturedMesh:
         )
     _refuse_missing(path, resolver)
     parts = []
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            with _as_input_error(path, resolver):
+    with _as_input_error(path, resolver):
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
                 part = _read_part(geometry, base_colours)
-            part = part.placed(turn @ transform[:3, :3], turn @ transform[:3, 3])
-            parts.append(part)
+                place = turn @ transform[:3, :3], turn @ transform[:3, 3]
+                parts.append(part.placed(*place))
     return _checked(path, tuple(parts))
 
 
@@ -103,8 +105,8 @@ def _checked(path: Path, parts: tuple[MeshPart, ...]) -> TexturedMesh:
     if not parts:
         raise InputError(f"{path}: contains no triangle; export a triangle mesh")
     mesh = TexturedMesh(path.name, parts)
-    if not np.all(np.isfinite(mesh.bounds)):
-        raise InputError(f"{path}: a vertex is NaN or infinite")
+    if not np.all(np.abs(mesh.bounds) < _FARTHEST):  # also where it is NaN
+        raise InputError(f"{path}: a vertex is NaN, infinite or beyond {_FARTHEST:g}")
     if mesh.area <= 0:
         raise InputError(
             f"{path}: all its triangles are degenerate (without area); export a "
@@ -137,7 +139,7 @@ def _recording_resolver(path: Path, chunks: Mapping[str, bytes]) -> Any:
                     found = folder.absolute(candidate)
                 except ValueError:  # outside of the folder
                     continue
-                if found.is_file():
+                if os.path.isfile(found):
                     data = files.read_bytes(found, MAX_BYTES)
                     if found.suffix.lower() == ".mtl":
                         return _as_utf8(data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ def _find_images(table: PoseTable) -> list[Path]:
     for index, name in enumerate(table.names):
         base = str(folder / name.replace("\\", "/"))
         candidates = [Path(base + end) for end in ("", *files.IMAGE_SUFFIXES)]
-        path = next((item for item in candidates if item.is_file()), None)
+        path = next((item for item in candidates if os.path.isfile(item)), None)
         if path is None:
             raise InputError(
                 f"{table.where}: row {index}: {name!r} is not there; restore the "

@@ -88,7 +88,8 @@ def _read_archive(path: Path, writer: str) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             size = sum(item.file_size for item in archive.infolist())
-    except (zipfile.BadZipFile, NotImplementedError) as err:
+    # a damaged archive makes zipfile raise whatever its parser stumbles over
+    except Exception as err:
         raise InputError(
             f"{path}: is no program ({err}); write it with {writer}"
         ) from err

@@ -17,10 +17,12 @@ import torch
 
 from mi_nerfattack.errors import InputError, SetupError, is_interrupt
 from mi_nerfattack.io import files
+from mi_nerfattack.policy.onnx.budget import Budget
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
 
 MAX_ONNX_BYTES = 1 << 31
+MAX_VALUE_BYTES = 1 << 30  # of all nodes, an image
 _DOUBLE = 11
 _CPU = torch.device("cpu")
 
@@ -77,9 +79,19 @@ class OnnxNetwork(torch.nn.Module):
         if not self.inputs or not self.inputs[0].sizes:
             raise InputError(f"{name}: has no image among its inputs")
         self.batch = self.inputs[0].sizes[0]
+        self._measured: set[tuple[torch.Size, ...]] = set()
 
     def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Evaluate all nodes."""
+        """Evaluate all nodes; the first time of these sizes, by a budget of memory."""
+        sizes = tuple(argument.shape for argument in arguments)
+        if sizes in self._measured or not sizes:
+            return self._run(arguments)
+        with Budget(MAX_VALUE_BYTES * max(1, *sizes[0][:1])):
+            result = self._run(arguments)
+        self._measured.add(sizes)
+        return result
+
+    def _run(self, arguments: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
         dtype = next((b.dtype for b in self.buffers()), arguments[0].dtype)
         device = arguments[0].device
         values: dict[str, torch.Tensor] = dict(self.whole)
@@ -162,7 +174,6 @@ def load_onnx(path: Path) -> OnnxNetwork:
     """
     try:
         import onnx
-        from google.protobuf.message import DecodeError
     except ImportError as err:
         raise SetupError(
             f"{path}: reading it needs the package onnx; pip install "
@@ -174,7 +185,8 @@ def load_onnx(path: Path) -> OnnxNetwork:
         outside = _outside(model)
         if not outside:
             onnx.checker.check_model(model)
-    except (DecodeError, onnx.checker.ValidationError) as err:
+    # a damaged file makes onnx raise whatever its parser stumbles over
+    except Exception as err:
         reason = str(err).strip().split("\n")[0]
         raise InputError(
             f"{path}: is no ONNX model ({reason}); write or copy it again"

@@ -170,12 +170,11 @@ def slices(call: Call) -> torch.Tensor:
     x = call.x
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         chosen = range(x.shape[axis])[start:end:step]
-        index = torch.tensor(chosen, dtype=torch.int64, device=x.device)
-        x = (
-            x.narrow(axis, chosen.start, len(chosen))
-            if step == 1
-            else x.index_select(axis, index)
-        )
+        if step == 1:
+            x = x.narrow(axis, chosen.start, len(chosen))
+            continue
+        index = torch.arange(len(chosen), device=x.device)
+        x = x.index_select(axis, chosen.start + step * index)
     return x
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,9 +78,11 @@ def check_rigid(matrix: np.ndarray, where: str) -> None:
     rotation = matrix[:3, :3]
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError(f"{where}: last row {matrix[3].tolist()}; must be 0 0 0 1")
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    error = np.abs(rotation).max()  # whose square may overflow
+    if error < 2:
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > 1e-3:
-        lengths = np.linalg.norm(rotation, axis=0).round(6).tolist()
+        lengths = [round(math.hypot(*column), 6) for column in rotation.T.tolist()]
         raise InputError(
             f"{where}: not a rigid pose, the columns have lengths {lengths}; they "
             "must be orthonormal, without scale or shear"

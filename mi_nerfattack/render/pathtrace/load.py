@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 
 _CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+_VALUE = re.compile(r"""=\s*["']([^"'$\n]+)["']""")
 _FILENAME = re.compile(r"""filename\s*=\s*["']([^"'$]+)["']""")
 
 
@@ -43,6 +45,7 @@ def load_scene(
     try:
         with _resolved_from(path):
             state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+            _refuse_empty_bitmaps(path, state)
             if size_px is not None:
                 _resize_films(path, state, size_px)
             config.merge_meshes = not _has_rectangles(state)
@@ -88,7 +91,7 @@ def scene_files(path: str | Path) -> list[Path]:
             names += _FILENAME.findall(files.read_text(text))
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]
         found = [Path(str(resolver.resolve(name))) for name in names if name]
-    there = [item.resolve() for item in (*texts, *found) if item.is_file()]
+    there = [item.resolve() for item in (*texts, *found) if os.path.isfile(item)]
     return list(dict.fromkeys(there))
 
 
@@ -134,6 +137,7 @@ def _resolved_from(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: is a folder; give a Mitsuba scene (XML)")
     if not source.is_file():
         raise InputError(f"{path}: does not exist; give a Mitsuba scene (XML)")
+    _refuse_devices(source)
     before = mi.file_resolver()  # pyright: ignore[reportCallIssue]
     resolver = mi.FileResolver(before)
     resolver.prepend(str(source.resolve().parent))
@@ -142,6 +146,29 @@ def _resolved_from(path: str | Path) -> Iterator[None]:
         yield
     finally:
         mi.set_file_resolver(before)  # pyright: ignore[reportCallIssue]
+
+
+def _refuse_empty_bitmaps(path: str | Path, state: Any) -> None:
+    """Refuse bitmaps of nothing, for which Mitsuba 3.9.1 ends the process."""
+    for node in state.nodes:
+        named = any(key in node.props for key in ("filename", "bitmap", "data"))
+        if node.props.plugin_name() == "bitmap" and not named:
+            raise InputError(f"{path}: a bitmap {node.props.id()!r} without filename")
+
+
+def _refuse_devices(path: Path) -> None:
+    """Refuse pipes and devices, which Mitsuba would wait for, before it opens any."""
+    left, seen = [path], {path}
+    while left:
+        source = left.pop()
+        for name in _VALUE.findall(files.read_text(source)):
+            file = source.parent / name
+            if os.path.isfile(file):
+                if file.suffix.lower() == ".xml" and file not in seen:
+                    left.append(file)
+                    seen.add(file)
+            elif os.path.exists(file) and not os.path.isdir(file):
+                raise InputError(f"{source}: {name!r} is a pipe or a device; copy it")
 
 
 def _in_one_line(path: str | Path, text: str) -> str:

@@ -85,6 +85,8 @@ class ViewRenderer:
             spp=_grid_samples(spp),
             seed=mi.UInt32(seed),
         ).numpy()
+        if mi.is_monochromatic:
+            image = image[..., [0, 0, 0, 1]]
         return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
 
     def depth(self, camera_to_world: np.ndarray) -> np.ndarray:

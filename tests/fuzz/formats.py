@@ -1,0 +1,288 @@
+"""The formats that are fuzzed: a good file of each, and what reads it.
+
+Nothing heavy is imported before a reader is made: each is made in a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz import programs
+from fuzz.mutations import (
+    Mutation,
+    of_bytes,
+    of_glb,
+    of_json,
+    of_png,
+    of_tensors,
+    of_text,
+    one_of,
+)
+
+Read = Callable[[Path], Any]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Args:
+        prepare: write good files into a folder, and return those to damage with what
+            reads each.
+        mutate: damage the content.
+        crashes: whether a crash is an outcome, because the program reads the format in
+            a process of its own.
+    """
+
+    prepare: Callable[[Path], list[tuple[Path, Read]]]
+    mutate: Mutation
+    crashes: bool = False
+
+
+def _scenario(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.scenario_text import HEAD, write_named_files
+
+    from mi_nerfattack.scenario.scenario import load_scenario
+
+    write_named_files(folder)
+    path = folder / "scenario.toml"
+    path.write_text(HEAD + (Path(__file__).parent / "scenario.toml").read_text())
+    return [(path, lambda path: load_scenario(path)[0].identity())]
+
+
+def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack.commands.shared.evaluate_options import (
+        PolicyOptions,
+        policy_camera,
+    )
+
+    path = folder / "policy.toml"
+    path.write_text(
+        '[policy]\nurl = "http://127.0.0.1:1"\ntimeout_s = 2.0\noutput = 1\n'
+        "control_scale = 1e-2\n[policy.preprocess]\nresize_px = [200, 66]\n"
+        "[camera]\nwidth = 80\nheight = 40\nfov_x_deg = 70.5\npitch_deg = 0\n"
+    )
+
+    def read(path: Path) -> None:
+        policy_camera(str(path))
+        PolicyOptions().section(str(path)).build()
+
+    return [(path, read)]
+
+
+def _field(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack import variant
+
+    variant.ensure()
+    from helpers.small_fields import blob, small_ngp
+
+    from mi_nerfattack.fields.io import load_field, save_field
+
+    save_field(folder / "grid.safetensors", blob(np.random.default_rng(0)))
+    save_field(folder / "ngp.safetensors", small_ngp())
+
+    def read(path: Path) -> None:
+        load_field(path).metadata()
+
+    return [(folder / f"{kind}.safetensors", read) for kind in ("grid", "ngp")]
+
+
+def _gltf(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.mesh_samples import four_colours, plate
+
+    gltf = plate()
+    texture = {"index": gltf.texture(four_colours(), wrapS=33071, wrapT=33071)}
+    gltf.material(baseColorTexture=texture, baseColorFactor=[1, 0.5, 1, 0.5])
+    gltf.tree["nodes"] = [{"children": [1], "scale": [1, 2, 1]}, {"mesh": 0}]
+    gltf.write(folder / "plate.glb")
+    return [(folder / "plate.glb", _read_mesh)]
+
+
+def _gltf_text(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.mesh_samples import plate
+
+    gltf = plate(COLOR_0=np.full((4, 3), 0.5))
+    gltf.material(baseColorFactor=[1, 0.5, 1, 1])
+    gltf.write(folder / "plate.gltf")
+    return [(folder / "plate.gltf", _read_mesh)]
+
+
+def _obj(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.mesh_samples import four_colours
+
+    four_colours().save(folder / "four.png")
+    (folder / "plate.mtl").write_text("newmtl a\nKd 0.5 0.25 1\nmap_Kd four.png\n")
+    (folder / "plate.obj").write_text(
+        "mtllib plate.mtl\nv 0 0 0\nv 2 0 0\nv 2 1 0.5\nv 0 1 0\nvt 0 0\nvt 1 0\n"
+        "vt 1 1\nvt 0 1\nvn 0 0 1\nusemtl a\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
+    )
+    mesh = folder / "plate.obj"
+    return [(mesh, _read_mesh), (folder / "plate.mtl", lambda _: _read_mesh(mesh))]
+
+
+def _ply(folder: Path) -> list[tuple[Path, Read]]:
+    import trimesh
+
+    cube = trimesh.creation.box()
+    cube.visual.vertex_colors = np.full((8, 4), 128, np.uint8)
+    for kind in ("ascii", "binary"):
+        (folder / f"{kind}.ply").write_bytes(cube.export(None, "ply", encoding=kind))
+    return [(folder / f"{kind}.ply", _read_mesh) for kind in ("ascii", "binary")]
+
+
+def _read_mesh(path: Path) -> None:
+    from mi_nerfattack.capture.mesh.read import load_mesh
+
+    load_mesh(path)
+
+
+def _splats(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.splat_files import cloud, columns, write_ply
+
+    from mi_nerfattack.fields.splats import read_splats
+
+    values = columns(cloud(np.random.default_rng(0), 3))
+    return [
+        (write_ply(folder / f"{text}.ply", values, text), read_splats)
+        for text in (False, True)
+    ]
+
+
+def _png(folder: Path) -> list[tuple[Path, Read]]:
+    from PIL import Image
+
+    from mi_nerfattack.io import files
+
+    picture = np.random.default_rng(0).integers(0, 255, (6, 5, 4), dtype=np.uint8)
+    Image.fromarray(picture).save(folder / "rgba.png")
+    palette = Image.fromarray(picture[..., :3]).quantize(7)
+    palette.save(folder / "palette.png", transparency=b"\0\x80\xff")
+    Image.fromarray(picture[..., 0]).save(folder / "grey.png", transparency=3)
+    Image.fromarray(picture[..., 0].astype(np.uint16) * 99).save(folder / "deep.png")
+    names = ("rgba.png", "palette.png", "grey.png")
+    found: list[tuple[Path, Read]] = [(folder / n, files.read_image) for n in names]
+    return [*found, (folder / "deep.png", files.read_image16)]
+
+
+def _jpeg(folder: Path) -> list[tuple[Path, Read]]:
+    from PIL import Image
+
+    from mi_nerfattack.io import files
+
+    picture = np.random.default_rng(0).integers(0, 255, (16, 24, 3), dtype=np.uint8)
+    Image.fromarray(picture).save(folder / "a.jpg")
+    Image.fromarray(picture).save(folder / "b.jpg", progressive=True)
+    Image.fromarray(picture).save(folder / "c.webp")
+    return [(folder / n, files.read_image) for n in ("a.jpg", "b.jpg", "c.webp")]
+
+
+def _exr(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack.io import exr
+
+    rng = np.random.default_rng(0)
+    layers = {"": rng.random((6, 5, 4)), "Z": rng.random((6, 5))}
+    exr.write_layers(folder / "a.exr", layers, {"step": "12"})
+
+    def read(path: Path) -> None:
+        exr.read_metadata(path)
+        exr.read_layers(path)
+
+    return [(folder / "a.exr", read)]
+
+
+def _transforms(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers import foreign_folders
+
+    from mi_nerfattack.capture.camera_path import read_path
+    from mi_nerfattack.capture.inputs import read_depth
+    from mi_nerfattack.capture.transforms import read_images
+
+    def read(path: Path) -> None:
+        images = read_images(path.parent, skip_missing=True)
+        read_depth(path.parent, images)
+
+    found: list[tuple[Path, Read]] = []
+    for make in (foreign_folders.nerfstudio, foreign_folders.instant_ngp):
+        sub = folder / make.__name__
+        sub.mkdir()
+        found.append((make(sub) / "transforms.json", read))
+    return [*found, (found[0][0], read_path)]
+
+
+def _colmap(folder: Path) -> list[tuple[Path, Read]]:
+    return _colmap_of(folder, ".bin")
+
+
+def _colmap_text(folder: Path) -> list[tuple[Path, Read]]:
+    return _colmap_of(folder, ".txt")
+
+
+def _colmap_of(folder: Path, suffix: str) -> list[tuple[Path, Read]]:
+    import pycolmap
+    from helpers import foreign_folders
+
+    from mi_nerfattack.capture.colmap.model import read_colmap
+
+    model = foreign_folders.colmap(folder) / "sparse/0"
+    (model / "points3D.bin").write_bytes(bytes(8))
+    if suffix == ".txt":
+        pycolmap.Reconstruction(model).write_text(model)
+        for path in model.glob("*.bin"):
+            path.unlink()
+    names = ("cameras", "images", "points3D")
+    return [(model / (name + suffix), lambda _: read_colmap(folder)) for name in names]
+
+
+def _routes(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack.vehicle.route.route import load_routes
+
+    corner = {"goal": 0, "points_m": [[0, 0], [5, 0], [5, 5]], "closed": True}
+    table = {"a": {**corner, "lane_width_m": 3.5, "speed_ms": 5.0}}
+    table["b"] = {**table["a"], "closed": False}
+    (folder / "routes.json").write_text(json.dumps(table))
+
+    def read(path: Path) -> None:
+        for route in load_routes(path):
+            route.project_numpy(np.zeros((1, 3)))
+            route.curvature_at(1.0, 0.5)
+
+    return [(folder / "routes.json", read)]
+
+
+_TEXT, _JSON = one_of(of_text, of_text, of_bytes), one_of(of_json, of_json, of_text)
+_JSON_OR_BYTES = one_of(of_json, of_json, of_text, of_bytes)
+_TENSORS = one_of(of_tensors, of_tensors, of_bytes)
+_PNG = one_of(of_png, of_bytes)
+FORMATS: dict[str, Format] = {
+    "scenario": Format(_scenario, _TEXT),
+    "policy_toml": Format(_policy_toml, _TEXT),
+    "field": Format(_field, _TENSORS),
+    "glb": Format(_gltf, one_of(of_glb, of_glb, of_bytes)),
+    "gltf": Format(_gltf_text, _JSON_OR_BYTES),
+    "obj": Format(_obj, _TEXT),
+    "ply": Format(_ply, _TEXT),
+    "splats": Format(_splats, _TEXT),
+    "png": Format(_png, _PNG),
+    "jpeg": Format(_jpeg, of_bytes),
+    "exr": Format(_exr, of_bytes),
+    "transforms": Format(_transforms, _JSON_OR_BYTES),
+    "colmap": Format(_colmap, of_bytes, crashes=True),
+    "colmap_text": Format(_colmap_text, _TEXT, crashes=True),
+    "routes": Format(_routes, _JSON_OR_BYTES),
+    "onnx": Format(programs.onnx_files, one_of(programs.of_onnx, of_bytes)),
+    "policy": Format(programs.policies, programs.of_policy),
+    "program": Format(programs.programs, one_of(programs.of_zip, of_bytes)),
+    "checkpoint": Format(
+        programs.checkpoints, one_of(programs.of_checkpoint, of_bytes)
+    ),
+    "record": Format(programs.records, _JSON_OR_BYTES),
+    "poses": Format(programs.poses, _TEXT),
+    "mcap": Format(programs.logs, one_of(of_text, of_bytes)),
+    "video": Format(programs.videos, of_bytes),
+    "xml": Format(programs.scenes, _TEXT),
+}

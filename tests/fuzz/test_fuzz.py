@@ -1,0 +1,42 @@
+"""Damaged files of every format are read, or refused by our error.
+
+`make test` tries 100 of each, and always the same; `make test-all` 1,000, and
+`make test-fuzz` 100,000.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz.formats import FORMATS
+
+COUNT = 100
+#: Each of their inputs takes a process of its own.
+APART = ("colmap", "colmap_text")
+
+
+def fuzz(*arguments: object) -> None:
+    """Fuzz in a process without threads, which can fork."""
+    tests = Path(__file__).parents[1]
+    result = subprocess.run(
+        [sys.executable, "-m", "fuzz.run", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": f"{tests}{os.pathsep}{tests.parent}"},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_damaged_files_are_read_or_refused():
+    fuzz(*(name for name in FORMATS if name not in APART), "--count", COUNT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_many_damaged_files_are_read_or_refused(name):
+    count = int(os.environ.get("FUZZ_COUNT", 10 * COUNT))
+    fuzz(name, "--count", count, "--seed", os.environ.get("FUZZ_SEED", 0))
