@@ -10,12 +10,13 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all test-random lint check-python clean
+.PHONY: help demo test test-slow test-all test-fuzz test-random lint check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
 	@echo "make test         run the tests, at most 8 minutes; less with compiled kernels"
 	@echo "make test-all     the slow ones too, at most 40 minutes"
+	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
 	@echo "make test-random  formats and geometry on other examples each time"
 	@echo "make lint         check format, lint and types"
 	@echo "make clean        remove the virtual environment and what was built"
@@ -30,6 +31,12 @@ test-slow: $(VENV)/.installed-test
 	$(PYTEST) -m slow
 
 test-all: test test-slow
+
+# Count and seed of one's own: make test-fuzz FUZZ_COUNT=10 FUZZ_SEED=3
+test-fuzz: export FUZZ_COUNT ?= 100000
+test-fuzz: export FUZZ_SEED ?= $(shell date +%Y%m%d)
+test-fuzz: $(VENV)/.installed-test
+	$(PYTEST) tests/fuzz/test_fuzz.py -m slow
 
 test-random: $(VENV)/.installed-test
 	$(PYTEST) -m hypothesis --hypothesis-profile random

@@ -65,6 +65,12 @@ def main(
         _drop_output()
         return EXIT_BROKEN_PIPE
     except OSError as err:
+        if err.filename is not None:  # no name of a file, as one that is too long
+            return _fail(
+                f"error: {err.filename}: {err.strerror}; check the path",
+                EXIT_INPUT,
+                debug,
+            )
         if err.errno not in _NO_ROOM:  # `files` tells all others
             raise
         _drop_output()

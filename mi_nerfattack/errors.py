@@ -10,15 +10,15 @@ class NerfAttackError(Exception):
 
     The command line prints the message without a traceback and exits with code 2.
     A message reads ``<file or parameter>: <what is wrong, with the value>;
-    <what is allowed or what to do>``. It may quote files: the middle of a long one is
-    left out, and what a terminal would not show as a character is escaped.
+    <what is allowed or what to do>``. Where it quotes much of a file, its middle is
+    left out.
     """
 
     def __init__(self, message: str) -> None:
         if len(message) > _LONGEST:
             left_out = f" ... ({len(message) - _HEAD - _TAIL} characters) ... "
             message = message[:_HEAD] + left_out + message[-_TAIL:]
-        super().__init__("\n".join(map(_printable, message.split("\n"))))
+        super().__init__(message)
 
 
 class InputError(NerfAttackError, ValueError):
@@ -27,11 +27,6 @@ class InputError(NerfAttackError, ValueError):
 
 class SetupError(NerfAttackError, RuntimeError):
     """Report a machine or an installation that cannot do what is asked."""
-
-
-def _printable(line: str) -> str:
-    shown = (c if c.isprintable() else ascii(c)[1:-1] for c in line)
-    return line if line.isprintable() else "".join(shown)
 
 
 def is_interrupt(error: BaseException | None) -> bool:

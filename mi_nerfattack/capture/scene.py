@@ -17,7 +17,7 @@ from mi_nerfattack.render.camera.intrinsics import (
     mount_matrix,
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
-from mi_nerfattack.render.pathtrace.views import iterate_views
+from mi_nerfattack.render.pathtrace.views import iterate_views, require_colour
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 _LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
@@ -105,6 +105,7 @@ def capture_scene(
     Returns:
         Path of `transforms.json`.
     """
+    require_colour()
     poses = drive_poses(load_routes(routes_path), n, seed)
     scene = load_scene(scene_path)
     if scene.integrator() is None:

@@ -65,7 +65,7 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
     suffix = Path(names[0]).suffix
     binary = suffix == ".bin"
     size = sum((work / name).stat().st_size for name in names)
-    _limit("RLIMIT_CPU", 20 + size // 1_000_000)
+    _limit("RLIMIT_CPU", 6 + size // 1_000_000)
     _limit("RLIMIT_AS", (4 << 30) + 10 * size)
     for part in PARTS:
         (folder / f"{part}{suffix}").write_bytes(bytes(8) if binary else b"")

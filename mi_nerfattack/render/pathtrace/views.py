@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera.conventions import (
     mitsuba_sensor_dict,
     opencv_to_mitsuba,
@@ -47,6 +47,15 @@ class View:
     depth: np.ndarray
 
 
+def require_colour() -> None:
+    """Raise SetupError in a monochromatic variant: its film has no opacity."""
+    if mi.is_monochromatic:
+        raise SetupError(
+            f"variant {mi.variant()!r}: views need colour and opacity; set "
+            "MI_NERFATTACK_VARIANT=llvm_ad_rgb"
+        )
+
+
 class ViewRenderer:
     """Renders one scene with one camera from any number of poses.
 
@@ -74,6 +83,7 @@ class ViewRenderer:
             spp: samples per pixel, at least 1; rounded up to a grid (32 to 35).
             seed: of the samples, in [0, 2^32).
         """
+        require_colour()
         to_world = mi.Transform4f(opencv_to_mitsuba(camera_to_world))
         dr.make_opaque(to_world)
         self._parameters["to_world"] = to_world
@@ -85,8 +95,6 @@ class ViewRenderer:
             spp=_grid_samples(spp),
             seed=mi.UInt32(seed),
         ).numpy()
-        if mi.is_monochromatic:
-            image = image[..., [0, 0, 0, 1]]
         return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
 
     def depth(self, camera_to_world: np.ndarray) -> np.ndarray:
