@@ -83,7 +83,7 @@ def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
     output = tmp_path / "run"
     interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
     other = ('"object.safetensors"', '"scene.safetensors"')
-    with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*shape"):
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*this run needs"):
         job(folder, output, other).run(resume=True, force=True)
 
 

@@ -15,7 +15,7 @@ from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import World, build_world
 from mi_nerfattack.scenes import bundled
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 
 HEADING = np.array([0.0, 0.0, 1.0])
 
@@ -65,7 +65,6 @@ def test_one_frame(world: World) -> None:
         assert error < 0.03, (name, by_pose, expected)
 
 
-@pytest.mark.slow
 def test_the_loop(world: World) -> None:
     """Five periods from the scenario's initial poses, in five directions."""
     loop, poses = world.loop(world.surrogate), world.initial

@@ -212,8 +212,11 @@ def test_weights_of_a_module(tmp_path, rng):
             r"checkpoint of state_dict, epoch; save its 'state_dict' alone",
         ),
         ({"1.weight": torch.zeros(1, 39600)}, "the very module that policy.file"),
-        ({"1.weight": 3}, "'1.weight' is no tensor"),
-        ({"1.weight": torch.full((1, 39600), torch.nan)}, "no tensor of finite"),
+        ({"1.weight": 3, "1.bias": torch.zeros(1)}, "received <class 'int'>"),
+        (
+            {"1.weight": torch.full((1, 39600), torch.nan), "1.bias": torch.zeros(1)},
+            "'1.weight' is no tensor of finite",
+        ),
         ({"1.weight": torch.zeros(1, 39600)}, "Missing key.*1.bias"),
         (
             {"1.weight": torch.zeros(1, 7), "1.bias": torch.zeros(1)},
