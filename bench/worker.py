@@ -19,7 +19,6 @@ from bench.attack.sides import AbstractAttack
 from bench.full_ngp import NGPData
 from bench.render.sides import AbstractSide, AbstractTrainer
 from mi_nerfattack import variant
-from mi_nerfattack.system.heap import map_large_blocks
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -32,7 +31,6 @@ def main(arguments: Sequence[str]) -> None:
             ``tuned``), samples per ray (``slab``), nothing (``object``); then, for the
             peers, sizes of chunks.
     """
-    map_large_blocks()  # as the commands do
     side: Any
     if arguments[0] == "fit":
         side = make_trainer(*arguments[1:])

@@ -18,7 +18,6 @@ import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
 from mi_nerfattack.commands import COMMANDS, Command
 from mi_nerfattack.errors import NerfAttackError, is_interrupt
-from mi_nerfattack.system.heap import map_large_blocks
 
 PROG = "mi-nerfattack"
 EXIT_INPUT = 2
@@ -44,7 +43,6 @@ def main(
         commands: what can be run, by name.
         prog: the program's name, for its help.
     """
-    map_large_blocks()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     arguments = [item for item in arguments if item != "--debug"]

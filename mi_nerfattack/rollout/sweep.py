@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
+from mi_nerfattack.system.heap import release_heap
 from mi_nerfattack.vehicle.state import to_state
 
 
@@ -179,6 +180,7 @@ def backward(
     for step in visits:
         d_after = d_before + to_state(d_states[step.index])
         d_before = sweep.back(step, d_after)
+        release_heap()  # of the policy's derivative
         costates.append(-np.array(d_after).T)
         if options.recorder is not None:
             options.recorder.add(step.index, sensor.texture_gradients())

@@ -19,7 +19,6 @@ from typing import Any
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.system.cores import cores
-from mi_nerfattack.system.heap import map_large_blocks
 from mi_nerfattack.system.processes import safe_path
 
 #: Most processes.
@@ -205,7 +204,6 @@ def _serve(work: AbstractWork, connection: Connection) -> None:
     import traceback
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the employer decides
-    map_large_blocks()
     try:
         _use_one_thread()
         opened = None

@@ -6,6 +6,8 @@ Nothing heavy is imported before a reader is made: each is made in a process of 
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,13 +37,10 @@ class Format:
         prepare: write good files into a folder, and return those to damage with what
             reads each.
         mutate: damage the content.
-        crashes: whether a crash is an outcome, because the program reads the format in
-            a process of its own.
     """
 
     prepare: Callable[[Path], list[tuple[Path, Read]]]
     mutate: Mutation
-    crashes: bool = False
 
 
 def _scenario(folder: Path) -> list[tuple[Path, Read]]:
@@ -226,8 +225,9 @@ def _colmap_of(folder: Path, suffix: str) -> list[tuple[Path, Read]]:
     import pycolmap
     from helpers import foreign_folders
 
-    from mi_nerfattack.capture.colmap.model import read_colmap
+    from mi_nerfattack.capture.colmap import model as reader
 
+    reader.run_task = _forked  # the process of its own, without its start
     model = foreign_folders.colmap(folder) / "sparse/0"
     (model / "points3D.bin").write_bytes(bytes(8))
     if suffix == ".txt":
@@ -235,7 +235,34 @@ def _colmap_of(folder: Path, suffix: str) -> list[tuple[Path, Read]]:
         for path in model.glob("*.bin"):
             path.unlink()
     names = ("cameras", "images", "points3D")
-    return [(model / (name + suffix), lambda _: read_colmap(folder)) for name in names]
+    return [
+        (model / (name + suffix), lambda _: reader.read_colmap(folder))
+        for name in names
+    ]
+
+
+def _forked(task: dict[str, Any], stages: Any) -> int:
+    """Do what `colmap.follow.run_task` does, in a fork of this process."""
+    from mi_nerfattack.capture.colmap.process import run
+
+    out, into = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.dup2(into, 1)
+        os.dup2(into, 2)
+        os.close(into)
+        sys.stdout = os.fdopen(1, "w", closefd=False)
+        code = 1
+        try:
+            code = run(task)
+        except SystemExit as error:
+            print(error.code, flush=True)
+        finally:
+            os._exit(code)
+    os.close(into)
+    with os.fdopen(out, encoding="utf-8", errors="replace") as lines:
+        stages.follow(lines)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def _routes(folder: Path) -> list[tuple[Path, Read]]:
@@ -271,8 +298,8 @@ FORMATS: dict[str, Format] = {
     "jpeg": Format(_jpeg, of_bytes),
     "exr": Format(_exr, of_bytes),
     "transforms": Format(_transforms, _JSON_OR_BYTES),
-    "colmap": Format(_colmap, of_bytes, crashes=True),
-    "colmap_text": Format(_colmap_text, _TEXT, crashes=True),
+    "colmap": Format(_colmap, of_bytes),
+    "colmap_text": Format(_colmap_text, _TEXT),
     "routes": Format(_routes, _JSON_OR_BYTES),
     "onnx": Format(programs.onnx_files, one_of(programs.of_onnx, of_bytes)),
     "policy": Format(programs.policies, programs.of_policy),

@@ -26,6 +26,7 @@ from helpers.rollouts import (
 
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.interleaved import InterleavedComposite
+from mi_nerfattack.rollout import sweep
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.vehicle.integrators import RK4, ImplicitMidpoint
@@ -175,6 +176,7 @@ def test_memory_does_not_grow_with_the_horizon():
     backend = dr.backend_v(mi.Float)
 
     def peak(horizon):
+        gc.collect()  # what other tests left
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
@@ -184,6 +186,13 @@ def test_memory_does_not_grow_with_the_horizon():
 
     peak(4)
     assert peak(32) <= 1.05 * peak(8)
+
+
+def test_the_heap_is_released_after_each_period(monkeypatch):
+    calls = []
+    monkeypatch.setattr(sweep, "release_heap", lambda: calls.append(None))
+    gradient(make_rollout(toy.make_loop()[0], 3))
+    assert len(calls) == 3
 
 
 def test_a_sensor_without_derivatives_is_refused():

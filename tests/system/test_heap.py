@@ -1,58 +1,45 @@
-"""Where large blocks are mapped, and where glibc is left alone."""
+"""Free pages go back to the system, where the C library is glibc."""
 
 from __future__ import annotations
 
 import ctypes
-import os
+import mmap
 import platform
-import subprocess
-import sys
+from pathlib import Path
 
 import pytest
-from helpers.heap import GLIBC, OWN
 
-from mi_nerfattack.system.heap import map_large_blocks
+from mi_nerfattack.system import heap
 
-CHILD = """
-import mi_nerfattack
-from helpers.heap import is_mapped
-from mi_nerfattack import cli
-before = is_mapped()
-cli.main(["--version"])
-print(before, is_mapped())
-"""
+# Below 128 KiB, from where glibc maps blocks; too block to fill gaps that there are.
+BLOCK, BETWEEN, COUNT = 100_000, 20_000, 1000
 
 
-@pytest.mark.skipif(not GLIBC, reason="only glibc has the threshold")
-@pytest.mark.parametrize("own, mapped", [({}, True), ({OWN[0]: "1048576"}, False)])
-def test_the_command_line_maps_large_blocks_and_an_import_does_not(own, mapped):
-    """A threshold of the user's stays."""
-    environment = {k: v for k, v in os.environ.items() if k not in OWN}
-    environment |= own | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", CHILD]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == f"False {mapped}", done.stderr
+def resident_bytes() -> int:
+    pages = Path("/proc/self/statm").read_text().split()[1]
+    return int(pages) * mmap.PAGESIZE
 
 
-@pytest.mark.parametrize(
-    "library, variables",
-    [
-        (("", ""), {}),  # macOS, Windows
-        (("musl", "1.2.5"), {}),
-        (("glibc", "2.36"), {OWN[0]: "131072"}),
-        (
-            ("glibc", "2.36"),
-            {OWN[1]: "glibc.malloc.perturb=1:glibc.malloc.mmap_threshold=9"},
-        ),
-    ],
-)
-def test_other_libraries_and_a_users_threshold_are_left_alone(
-    library, variables, monkeypatch
-):
-    for name in OWN:
-        monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(platform, "libc_ver", lambda: library)
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's own function")
+def test_pages_between_small_blocks_are_released():
+    libc = ctypes.CDLL(None)
+    libc.malloc.restype = ctypes.c_void_p
+    blocks = [(libc.malloc(BLOCK), libc.malloc(BETWEEN)) for _ in range(COUNT)]
+    for block, _ in blocks:
+        ctypes.memset(block, 1, BLOCK)
+    for block, _ in blocks:
+        libc.free(ctypes.c_void_p(block))
+    before = resident_bytes()
+    assert heap.release_heap()
+    assert before - resident_bytes() > 0.8 * BLOCK * COUNT
+    for _, small in blocks:
+        libc.free(ctypes.c_void_p(small))
+
+
+@pytest.mark.parametrize("library", ["", "musl"])  # macOS and Windows; Alpine
+def test_other_libraries_are_left_alone(library, monkeypatch):
+    monkeypatch.setattr(platform, "libc_ver", lambda: (library, ""))
     monkeypatch.setattr(ctypes, "CDLL", None)
-    assert not map_large_blocks()
+    heap._trim.cache_clear()
+    assert not heap.release_heap()
+    heap._trim.cache_clear()

@@ -172,12 +172,10 @@ def _check_images(where: Path, records: Sequence[_Image]) -> None:
     for record in records:
         if not record.name.isprintable():
             raise InputError(f"{where}: image {record.name!r}: unprintable; rename it")
-        values = (*record.quaternion, *record.translation)
-        if not (np.isfinite(values).all() and any(record.quaternion)):
-            raise InputError(
-                f"{where}: image {record.name!r}: pose {values}; the quaternion must "
-                "not be zero and all numbers finite"
-            )
+        try:
+            colmap_to_opencv(record.quaternion, record.translation)
+        except InputError as error:
+            raise InputError(f"{where}: image {record.name!r}: {error}") from error
 
 
 def _find_images(root: Path, model: Path, names: Sequence[str]) -> dict[str, Path]:

@@ -34,6 +34,11 @@ def main() -> int:
     """Run the task on standard input."""
     task = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    return run(task)
+
+
+def run(task: dict[str, Any]) -> int:
+    """Run a task, in this process; return its exit code."""
     try:
         import pycolmap
     except ImportError as error:
@@ -66,7 +71,7 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
     binary = suffix == ".bin"
     size = sum((work / name).stat().st_size for name in names)
     _limit("RLIMIT_CPU", 6 + size // 1_000_000)
-    _limit("RLIMIT_AS", (4 << 30) + 10 * size)
+    _limit("RLIMIT_AS", (2 << 30) + 10 * size)
     for part in PARTS:
         (folder / f"{part}{suffix}").write_bytes(bytes(8) if binary else b"")
     model, images = pycolmap.Reconstruction(), []

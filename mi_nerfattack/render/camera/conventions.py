@@ -77,15 +77,18 @@ def colmap_to_opencv(quaternion: ArrayLike, translation: ArrayLike) -> np.ndarra
         camera_to_world: (..., 4, 4), OpenCV axes, float64.
 
     Raises:
-        InputError: a quaternion is zero, or a value is not finite.
+        InputError: a quaternion is zero, a value is not finite, or a translation is
+            beyond single precision.
     """
     q = np.asarray(quaternion, np.float64)
     t = np.asarray(translation, np.float64)
-    if not (np.isfinite(q).all() and (np.linalg.norm(q, axis=-1) > 0).all()):
+    largest = np.abs(q).max(-1, keepdims=True)  # whose square may be too large
+    if not (np.isfinite(largest) & (largest > 0)).all():
         raise InputError(f"quaternion: {q.tolist()}; must be finite and not zero")
-    if not np.isfinite(t).all():
-        raise InputError(f"translation: {t.tolist()}; must be finite")
-    flat = Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix()
+    if not (np.abs(t) < np.finfo(np.float32).max).all():
+        raise InputError(f"translation: {t.tolist()}; must be finite, below 3.4e38")
+    unit = (q / largest).reshape(-1, 4)
+    flat = Rotation.from_quat(unit, scalar_first=True).as_matrix()
     to_world = np.swapaxes(flat.reshape(*q.shape[:-1], 3, 3), -1, -2)
     matrix = np.zeros((*q.shape[:-1], 4, 4))
     matrix[..., :3, :3] = to_world

@@ -220,7 +220,7 @@ def test_nothing_there(tmp_path):
         ("cameras", "3 OPENCV 40", "Check failed.*copy it again"),
         ("cameras", "3 PINHOLE 40 30 -1 1 1 1", "camera 3: camera.fx: -1"),
         ("images", "1 1 0 0 0 nan 0 0 1 a.png\n\n", "Check failed.*copy it again"),
-        ("images", "1 0 0 0 0 0 0 0 1 a.png\n\n", "'a.png': pose .*zero"),
+        ("images", "1 0 0 0 0 0 0 0 1 a.png\n\n", "'a.png': quaternion.*zero"),
         ("images", "1 1 0 0 0 0 0 0 1 a\x07.png", "unprintable"),
         (
             "images",

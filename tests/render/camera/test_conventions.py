@@ -72,8 +72,9 @@ def test_colmap_pose_of_any_rotation(axis, angle, place):
     matrix = pose(turn(axis, angle), np.array(place))
     # world to camera is the opposite turn
     quaternion = np.array([np.cos(angle / 2), *(-np.sin(angle / 2) * axis)])
-    back = conv.colmap_to_opencv(3 * quaternion, -turn(axis, -angle) @ place)
-    np.testing.assert_allclose(back, matrix, atol=1e-9)
+    for scale in (3, 1e-200, 1e200):
+        back = conv.colmap_to_opencv(scale * quaternion, -turn(axis, -angle) @ place)
+        np.testing.assert_allclose(back, matrix, atol=1e-9)
 
 
 def test_colmap_poses_keep_their_shape(rng):
@@ -90,6 +91,7 @@ def test_colmap_poses_keep_their_shape(rng):
         (lambda: conv.colmap_to_opencv([0, 0, 0, 0], [0, 0, 0]), "quaternion"),
         (lambda: conv.colmap_to_opencv([np.nan, 0, 0, 1], [0, 0, 0]), "quaternion"),
         (lambda: conv.colmap_to_opencv([1, 0, 0, 0], [np.inf, 0, 0]), "translation"),
+        (lambda: conv.colmap_to_opencv([1, 0, 0, 0], [1e39, 0, 0]), "translation"),
         (lambda: conv.from_colmap("FISHEYE", 4, 4, [1.0]), "allowed: SIMPLE_PINHOLE"),
         (lambda: conv.from_colmap("PINHOLE", 4, 4, [4, 2, 2]), r"expected 4 \(fx, fy"),
         (lambda: conv.from_colmap("SIMPLE_PINHOLE", 4, 4, [-4, 2, 2]), "camera.fx"),
