@@ -26,4 +26,4 @@ from .sites import AbstractSite as AbstractSite
 from .sites import PlaceSite as PlaceSite
 from .sites import Weather as Weather
 from .vehicle import AbstractVehicle as AbstractVehicle
-from .views.paste import paste_layer as paste_layer
+from .views.paste import paste_layers as paste_layers

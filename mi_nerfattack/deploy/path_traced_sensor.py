@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
-from mi_nerfattack.deploy.views.paste import cut_out, paste_layer
+from mi_nerfattack.deploy.views.paste import paste_layers
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
@@ -72,36 +73,36 @@ class PathTracedSensor(AbstractSensor):
     def linear(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
         """Render one image with its objects, (height, width, 3), linear."""
         rgb, depth = self.view.linear(camera_to_world, seed)
-        if not self.objects:
-            return rgb
-        return paste_layer(rgb, depth, self.view.march(camera_to_world))
+        return paste_layers(rgb, depth, self.view.march(camera_to_world))[0]
 
-    def layers(self, camera_to_world: np.ndarray, step: int) -> dict[str, np.ndarray]:
+    def layers(
+        self, camera_to_world: np.ndarray, step: int, names: Sequence[str]
+    ) -> dict[str, np.ndarray]:
         """Render one frame with its parts.
+
+        Args:
+            camera_to_world: (4, 4), OpenCV axes, metres.
+            step: seeds the samples.
+            names: of the objects' layers.
 
         Returns:
             by layer name: the pasted frame as ``""`` (height, width, 4) and ``Z``,
-            the scene alone as ``scene`` and ``scene.Z``, the objects as ``object``
-            (premultiplied) and ``object.Z``; linear, metres.
+            the scene alone as ``scene`` and ``scene.Z``, each object by its name
+            (premultiplied), ``NAME`` and ``NAME.Z``; linear, metres.
         """
         rgb, far = self.view.linear(camera_to_world, self._seeds(step, 1)[0])
+        objects = self.view.march(camera_to_world)
+        pasted, depth = paste_layers(rgb, far, objects)
         one = np.ones((*far.shape, 1), np.float32)
-        scene = np.concatenate([rgb, one], axis=-1)
-        if not self.objects:
-            return {"": scene, "Z": far}
-        layer = self.view.march(camera_to_world)
-        opacity = layer.opacity.numpy().reshape(*far.shape, 1)
-        radiance = layer.radiance.numpy().T.reshape(*far.shape, 3)
-        in_front, _, near = cut_out(layer, far)
-        pasted = paste_layer(rgb, far, layer)
-        return {
+        layers = {
             "": np.concatenate([pasted, one], axis=-1),
-            "Z": np.where(in_front, near, far),
-            "scene": scene,
+            "Z": depth,
+            "scene": np.concatenate([rgb, one], axis=-1),
             "scene.Z": far,
-            "object": np.concatenate([radiance, opacity], axis=-1),
-            "object.Z": near,
         }
+        for name, layer in zip(names, objects, strict=True):
+            layers |= layer.images(name, far.shape)
+        return layers
 
     def _seeds(self, step: int, count: int) -> list[int]:
         sequence = np.random.SeedSequence([self.seed, step])

@@ -15,7 +15,6 @@ from mi_nerfattack.experiment.attribution import attribute, write_attribution
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import exr, files
 from mi_nerfattack.render.camera.intrinsics import mount_matrix
-from mi_nerfattack.render.rays import March
 from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.plots import drives as plots
 from mi_nerfattack.report.plots.strip import first_person_strip
@@ -177,7 +176,7 @@ def _write_frames(
             layers = (
                 _surrogate_layers(world, state, int(step))
                 if environment == "surrogate"
-                else world.deployment.layers(pose, int(step))
+                else world.deployment.layers(pose, int(step), _exr_names(world))
             )
             metadata = {
                 "scenario": world.scenario.name,
@@ -202,26 +201,17 @@ def _surrogate_layers(
     assert seen is not None and rays is not None
     behind = sensor.scene.background(rays.direction)
     shape = (sensor.camera.height, sensor.camera.width)
-    layers = _march_layers("", seen.total, shape)
+    layers = seen.total.images("", shape)
     through = (1 - seen.total.opacity) * behind
     layers[""][..., :3] += through.numpy().T.reshape(*shape, 3)
     layers[""][..., 3] = 1.0
-    names = ["scene", *(item.id for item in world.scenario.objects)]
-    for name, layer in zip(_exr_names(names), seen.layers, strict=True):
-        layers |= _march_layers(name, layer, shape)
+    names = ["scene", *_exr_names(world)]
+    for name, layer in zip(names, seen.layers, strict=True):
+        layers |= layer.images(name, shape)
     return layers
 
 
-def _march_layers(
-    name: str, layer: March, shape: tuple[int, int]
-) -> dict[str, np.ndarray]:
-    radiance = layer.radiance.numpy().T.reshape(*shape, 3)
-    opacity = layer.opacity.numpy().reshape(*shape, 1)
-    depth = layer.depth.numpy().reshape(shape)
-    key = f"{name}.Z" if name else "Z"
-    return {name: np.concatenate([radiance, opacity], axis=-1), key: depth}
-
-
-def _exr_names(names: list[str]) -> list[str]:
+def _exr_names(world: World) -> list[str]:
     """Call a single object's layer ``object``, several ones by their ids."""
-    return ["scene", "object"] if len(names) == 2 else names
+    names = [item.id for item in world.scenario.objects]
+    return ["object"] if len(names) == 1 else names

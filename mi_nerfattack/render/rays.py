@@ -8,6 +8,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 @dataclass
@@ -103,6 +104,22 @@ class March:
             + self.opacity * other.opacity
             + self.moment * other.moment
         )
+
+    def images(self, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+        """Return the layers of a file of one image, row by row from the top left.
+
+        Args:
+            name: of the layer; empty for the image itself.
+            shape: height and width.
+
+        Returns:
+            ``NAME`` (height, width, 4), premultiplied, and ``NAME.Z``, metres.
+        """
+        colour = self.radiance.numpy().T.reshape(*shape, 3)
+        opacity = self.opacity.numpy().reshape(*shape, 1)
+        key = f"{name}.Z" if name else "Z"
+        depth = self.depth.numpy().reshape(shape)
+        return {name: np.concatenate([colour, opacity], axis=-1), key: depth}
 
     @property
     def depth(self) -> mi.Float:

@@ -14,7 +14,7 @@ import pytest
 from helpers.attack_jobs import run
 
 from mi_nerfattack import cli
-from mi_nerfattack.deploy import paste_layer
+from mi_nerfattack.deploy import paste_layers
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
@@ -144,8 +144,8 @@ def test_pasting_follows_depth_and_opacity():
         mi.Float(opacity),
         mi.Float(2.0 * opacity),
     )
-    pasted = paste_layer(rgb, depth, layer)[0, :, 0]
-    assert np.allclose(pasted, [0.5, 0.0, 0.0, 0.5])
+    pasted, _ = paste_layers(rgb, depth, [layer])
+    assert np.allclose(pasted[0, :, 0], [0.5, 0.0, 0.0, 0.5])
 
 
 def test_bundled_demo_scenario_is_valid():

@@ -80,8 +80,8 @@ class MitsubaView(AbstractView):
         gain = np.float32(2.0**self.exposure_ev)
         return np.asarray(gain * rgb), views[0].depth.copy()
 
-    def march(self, camera_to_world: np.ndarray) -> March:
-        """March the objects along the rays of one image; there must be an object."""
+    def march(self, camera_to_world: np.ndarray) -> list[March]:
+        """March each object along the rays of one image."""
         return self._paster.march(camera_to_world)
 
     def show(self, objects: Sequence[PosedField]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -14,8 +14,7 @@ from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.composite import DepthComposite
-from mi_nerfattack.render.march import STOP
+from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
 
@@ -28,11 +27,13 @@ FARTHEST_M = 1e5
 class Paster:
     """Pastes objects into the frames of one camera.
 
-    Where the objects' opacity reaches 0.5 and their expected depth is nearer than the
-    frame's, a pixel takes the objects' colour ``I / a`` and their depth; elsewhere it
-    stays. The colour is the field's own: neither the light nor the exposure of the
-    frame changes it. After the first frame no kernel is compiled. Poses and textures
-    of the objects may change between frames; for other objects make another.
+    Objects are pasted one by one: where an object's opacity reaches 0.5 and its
+    expected depth is nearer than all that is there, a pixel takes its colour ``I / a``
+    and its depth; elsewhere it stays. So what lies between two objects hides the
+    farther, edges of the nearer included. The colour is the field's own: neither the
+    light nor the exposure of the frame changes it. After the first frame no kernel is
+    compiled. Poses and textures of the objects may change between frames; for other
+    objects make another.
 
     Args:
         camera: intrinsics of the frames.
@@ -47,8 +48,8 @@ class Paster:
         self._rays = PixelRays(camera)
         self._frozen = freeze_method(self._record, self._state)
 
-    def march(self, camera_to_world: np.ndarray) -> March:
-        """March all objects along the rays of one image; there must be an object.
+    def march(self, camera_to_world: np.ndarray) -> list[March]:
+        """March each object by itself along the rays of one image.
 
         Raises:
             InputError: the camera is so far away that single precision cannot tell
@@ -61,6 +62,8 @@ class Paster:
                 f"single precision, within {FARTHEST_M:g} m of the origin; put the "
                 "origin of poses and objects near the drive"
             )
+        if not self.objects:
+            return []
         with dr.suspend_grad():
             return self._frozen(self._rays.at(camera_to_world))
 
@@ -78,14 +81,12 @@ class Paster:
             )
         if not self.objects:
             return frame
-        layer = self.march(frame.camera_to_world)
-        mask, colour, depth = cut_out(layer, frame.depth)
-        image = np.where(mask[..., None], linear_to_uint8(colour), frame.image)
-        depth = np.where(mask, depth, frame.depth)
+        layers = self.march(frame.camera_to_world)
+        image, depth = paste_layers(frame.image, frame.depth, layers, linear_to_uint8)
         return CameraFrame(image, depth, frame.camera_to_world)
 
-    def _record(self, rays: Rays) -> March:
-        return DepthComposite().render(self.objects, rays, STOP).total
+    def _record(self, rays: Rays) -> list[March]:
+        return [march(posed, rays, STOP) for posed in self.objects]
 
     def _state(self, rays: Rays) -> list[Any]:
         states = [posed.state() for posed in self.objects]
@@ -101,40 +102,33 @@ def require_fields(objects: Sequence[Any]) -> None:
             )
 
 
-def paste_layer(rgb: np.ndarray, depth: np.ndarray, layer: March) -> np.ndarray:
-    """Paste a march into a linear image as if it were opaque.
+def paste_layers(
+    image: np.ndarray,
+    depth: np.ndarray,
+    layers: Sequence[March],
+    encode: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Paste marches into an image one by one, as if they were opaque.
 
     Args:
-        rgb: (height, width, 3), linear.
+        image: (height, width, 3), as `encode` makes it; linear float32 by default.
         depth: (height, width), metres along the ray; infinite where there is nothing.
-        layer: march of height * width rays, row by row from the top left.
+        layers: marches of height * width rays, row by row from the top left.
+        encode: turns linear colours (height, width, 3) into those of the image.
 
     Returns:
-        (height, width, 3), linear, float32.
+        image and depth with the layers in them.
 
     Source: appendix B.3.
     """
-    mask, colour, _ = cut_out(layer, depth)
-    return np.where(mask[..., None], colour, rgb).astype(np.float32)
-
-
-def cut_out(
-    layer: March, depth: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find what a march covers of an image.
-
-    Args:
-        layer: march of height * width rays, row by row from the top left.
-        depth: (height, width), metres along the ray, of the image.
-
-    Returns:
-        which pixels are covered (height, width), the march's linear colour ``I / a``
-        there (height, width, 3) and its expected depth (height, width), metres.
-    """
     shape = depth.shape
-    opacity = layer.opacity.numpy().reshape(shape)
-    nearness = layer.depth.numpy().reshape(shape).copy()
-    mask = (opacity >= OPAQUE) & (nearness < depth)
-    radiance = layer.radiance.numpy().T.reshape(*shape, 3)
-    colour = np.where(mask[..., None], radiance, 0)
-    return mask, colour / np.where(mask, opacity, 1)[..., None], nearness
+    for layer in layers:
+        opacity = layer.opacity.numpy().reshape(shape)
+        nearness = layer.depth.numpy().reshape(shape)
+        mask = (opacity >= OPAQUE) & (nearness < depth)
+        radiance = layer.radiance.numpy().T.reshape(*shape, 3)
+        colour = np.where(mask[..., None], radiance, 0)
+        colour = encode(colour / np.where(mask, opacity, 1)[..., None])
+        image = np.where(mask[..., None], colour, image)
+        depth = np.where(mask, nearness, depth)
+    return image, depth

@@ -108,6 +108,30 @@ def test_nearer_of_two_objects_is_on_top():
     assert found.depth[6, 8] == pytest.approx(4.5, abs=0.05)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_wall_between_two_objects_shows_no_outline_of_the_nearer(order):
+    # near: thin, so that half of a ray passes it; far: behind the wall
+    pose = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    near = PosedField(homogeneous(0.25, 3.0), Pose.upright((-4.0, 0.0, 0.0), 0.0, 0.5))
+    far = PosedField(homogeneous(60, -3.0), Pose.upright((2.0, 0.0, 0.0), 0.0, 2.0))
+    frame = frame_at(pose, 7.0)
+    for item in (near, far):
+        assert (paste_objects(frame, CAMERA, [item]).image == GREY).all()
+    found = paste_objects(frame, CAMERA, [near, far][::order])
+    assert (found.image == GREY).all() and (found.depth == 7.0).all()
+
+
+def test_wall_between_two_objects_hides_the_farther_alone():
+    pose = look_at((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    near = PosedField(homogeneous(2.0, 3.0), Pose.upright((-4.0, 0.0, 0.0), 0.0, 0.5))
+    far = PosedField(homogeneous(60, -3.0), Pose.upright((2.0, 0.0, 0.0), 0.0, 2.0))
+    frame = frame_at(pose, 7.0)
+    alone = paste_objects(frame, CAMERA, [near])
+    assert (alone.depth < 7).sum() > 3
+    found = paste_objects(frame, CAMERA, [far, near])
+    assert (found.image == alone.image).all() and (found.depth == alone.depth).all()
+
+
 def test_no_kernel_is_compiled_after_the_first_frame():
     posed = PosedField(homogeneous(30.0))
     paster = Paster(CAMERA, [posed])
