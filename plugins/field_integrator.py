@@ -9,7 +9,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.properties import (
     Mask,
@@ -25,6 +24,7 @@ from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.surroundings import nearest_surface
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
@@ -221,7 +221,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         ray = mi.Ray3f(dr.detach(ray))
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
-        t_max = self._surface(scene, ray, active)
+        t_max = nearest_surface(scene, ray, active)
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         if state_in is None:  # primal mode, or forward mode, which comes without
             rays.gains, shadow = self._relight(scene, sampler, ray, rays)
@@ -259,19 +259,6 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             dr.set_grad(total, tangent)
             radiance = self._over(total, rays, behind, wavelengths)
             return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
-
-    def _surface(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        shapes = scene.shapes()
-        if not shapes:
-            return mi.Float(dr.inf)
-        for shape in shapes:
-            if shape.is_ellipsoids():
-                raise InputError(
-                    f"{shape.id()}: ellipsoids among the scene's shapes would hide the "
-                    "fields; nest a splat_background in field_integrator instead"
-                )
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        return dr.select(hit.is_valid(), hit.t, dr.inf)
 
     def _behind(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool

@@ -197,9 +197,9 @@ def _surrogate_layers(
 ) -> dict[str, np.ndarray]:
     sensor = world.surrogate
     observation = sensor.observe(to_state(state), step)
-    seen, rays = observation.seen, observation.rays
-    assert seen is not None and rays is not None
-    behind = sensor.scene.background(rays.direction)
+    seen = observation.seen
+    assert seen is not None
+    behind = sensor.behind(observation)
     shape = (sensor.camera.height, sensor.camera.width)
     layers = seen.total.images("", shape)
     through = (1 - seen.total.opacity) * behind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -10,6 +11,7 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import (
@@ -17,6 +19,7 @@ from mi_nerfattack.render.camera.intrinsics import (
     CameraMount,
     generate_rays,
     mount_pose,
+    ray_lengths,
 )
 from mi_nerfattack.render.composite import (
     AbstractComposite,
@@ -28,6 +31,7 @@ from mi_nerfattack.render.composite import (
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.surroundings import ATTACHED, Clip, Ends, Surroundings
 from mi_nerfattack.rollout.offset import offset_gradient, offset_pose, wrench_of
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
@@ -35,8 +39,9 @@ from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observati
 class FieldSensor(AbstractDifferentiableSensor):
     """Camera in a scene with objects: the surrogate simulator.
 
-    One ray a pixel through its centre; behind everything the background of the
-    scene's field. All fields are marched for all vehicles together.
+    One ray a pixel through its centre, up to the first surface; behind all fields is
+    what the surroundings show there, or the background of the first layer. All fields
+    are marched for all vehicles together.
 
     Cost of an observation: one march. Cost of a product: one march derivative over
     the rays that meet an object (over all rays of the objects for their poses, over
@@ -44,7 +49,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     Args:
         scene: the scene's field in the world, or a backdrop; that one needs the depth
-            composite, and has no attached derivatives.
+            composite, and has no attached derivatives. Or any number of them.
         objects: fields with textures, posed in the world; may be empty.
         camera: intrinsics.
         mount: pose on the vehicle.
@@ -52,17 +57,22 @@ class FieldSensor(AbstractDifferentiableSensor):
             by products; None places samples at the middle of their intervals.
         stop: transmittance at which rays end.
         composite: how fields become one colour; `DepthComposite` by default.
+        surroundings: surfaces and lights among and behind the fields; with them there
+            are no attached derivatives.
+        clip: rays start at its near distance.
     """
 
     def __init__(
         self,
-        scene: Layer,
+        scene: Layer | Sequence[Layer],
         objects: list[PosedField],
         camera: Camera,
         mount: CameraMount | None = None,
         jitter_seed: int | None = None,
         stop: float = STOP,
         composite: AbstractComposite | None = None,
+        surroundings: Surroundings | None = None,
+        clip: Clip | None = None,
     ) -> None:
         for posed in objects:
             if not isinstance(posed.field, GridField):
@@ -71,7 +81,7 @@ class FieldSensor(AbstractDifferentiableSensor):
             raise ValueError(
                 "objects: two of them share a field, and so a texture; load it twice"
             )
-        self.scene = scene
+        self.scene = tuple(scene) if isinstance(scene, Sequence) else (scene,)
         self.objects = list(objects)
         self.camera = camera
         self.mount = mount or CameraMount()
@@ -79,60 +89,87 @@ class FieldSensor(AbstractDifferentiableSensor):
         self.stop = stop
         self.composite = composite or DepthComposite()
         self.composite.check(self._fields)
+        self.surroundings = surroundings
+        self.clip = clip or Clip()
+        near = self.clip.near_m * ray_lengths(camera).ravel()
+        self._near = mi.Float(near.tolist()) if self.clip.near_m else None
         self.renders = 0
         self._offsets = np.zeros((len(objects), 6))
         self._wrenches: list[Any] | None = None
         # Tracing these in Python takes longer than running them.
-        self._ahead = self.composite.ahead(scene, stop)
+        self._ahead = self.composite.ahead(self.scene[0], stop) if self.scene else None
         self._frozen_make_rays = freeze_method(self._make_rays, self._state)
         self._frozen_render = freeze_method(self._render, self._state)
         self._frozen_restore = freeze_method(self._restore, self._state)
         self._frozen_cotangent = freeze_method(self._cotangent, self._state)
         self._frozen_accumulate = freeze_method(self._accumulate, self._state)
-        self._frozen_all_rays = freeze_method(self._by_all_rays, self._state)
-        self._frozen_object_rays = freeze_method(self._by_object_rays, self._state)
+        self._frozen_by_rays = freeze_method(self._by_rays, self._state)
+
+    def showing(self, objects: list[PosedField]) -> FieldSensor:
+        """Return a camera like this one that shows other objects."""
+        view = self.camera, self.mount, self.jitter_seed, self.stop, self.composite
+        return FieldSensor(self.scene, objects, *view, self.surroundings, self.clip)
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render the composite; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)
         self.renders += count
         key = dr.opaque(mi.UInt32, step)
+        ends = self._look_around(state, key)
         if self._ahead is None:
-            found = self._frozen_render(_pose(state), key, count)
-            return self._observation(count, *found)
-        rays = self._frozen_make_rays(_pose(state), key, count)
-        return self.restore(state, step, self._ahead.march(rays))
+            found = self._frozen_render(_pose(state), key, ends, count)
+            return self._observation(count, ends, *found)
+        rays = self._frozen_make_rays(_pose(state), key, ends, count)
+        scene = self._ahead.march(rays)
+        return self.restore(state, step, scene if ends is None else (scene, ends))
 
     def keep(self, observation: Observation) -> Any:
-        """Keep the scene's march, 20 bytes a pixel (more for other composites)."""
+        """Keep the scene's march, 20 bytes a pixel (more for other composites).
+
+        With surroundings, 16 more for where rays end, and what is there.
+        """
         assert observation.seen is not None
-        return self.composite.keep(observation.seen)
+        kept, ends = self.composite.keep(observation.seen), observation.ends
+        return kept if ends is None else (kept, ends)
 
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """March the objects again, and lay them over the scene that was kept."""
         count = dr.width(state)
         key = dr.opaque(mi.UInt32, step)
-        found = self._frozen_restore(_pose(state), key, kept, count)
-        return self._observation(count, *found)
-
-    def _render(
-        self, state: Any, step: mi.UInt32, count: int
-    ) -> tuple[mi.Color3f, Seen, Rays]:
-        rays = self._make_rays(state, step, count)
-        seen = self.composite.render(self._fields, rays, self.stop)
-        return self._develop(seen.total, rays.direction), seen, rays
-
-    def _restore(
-        self, state: Any, step: mi.UInt32, kept: Any, count: int
-    ) -> tuple[mi.Color3f, Seen, Rays]:
-        rays = self._make_rays(state, step, count)
-        seen = self.composite.restore(self._fields, rays, kept, self.stop)
-        return self._develop(seen.total, rays.direction), seen, rays
+        scene, ends = kept if isinstance(kept, tuple) else (kept, None)
+        found = self._frozen_restore(_pose(state), key, scene, ends, count)
+        return self._observation(count, ends, *found)
 
     def _observation(
-        self, count: int, pixels: mi.Color3f, seen: Seen, rays: Rays
+        self, count: int, ends: Ends | None, pixels: mi.Color3f, *found: Any
     ) -> Observation:
-        return Observation(self._tensor(pixels, count), seen, rays)
+        return Observation(self._tensor(pixels, count), *found, ends=ends)
+
+    def behind(self, observation: Observation) -> mi.Color3f:
+        """Return what is seen behind all fields, (3, n), linear."""
+        assert observation.rays is not None
+        return self._behind(observation.rays.direction, observation.ends)
+
+    def _look_around(self, state: Any, step: mi.UInt32) -> Ends | None:
+        if self.surroundings is None:
+            return None
+        rays = self._frozen_make_rays(_pose(state), step, None, dr.width(state))
+        sky = self._behind(rays.direction, None)
+        return self.surroundings.see(rays, step, sky)
+
+    def _render(
+        self, state: Any, step: mi.UInt32, ends: Ends | None, count: int
+    ) -> tuple[mi.Color3f, Seen, Rays]:
+        rays = self._make_rays(state, step, ends, count)
+        seen = self.composite.render(self._fields, rays, self.stop)
+        return self._develop(seen.total, rays.direction, ends), seen, rays
+
+    def _restore(
+        self, state: Any, step: mi.UInt32, kept: Any, ends: Ends | None, count: int
+    ) -> tuple[mi.Color3f, Seen, Rays]:
+        rays = self._make_rays(state, step, ends, count)
+        seen = self.composite.restore(self._fields, rays, kept, self.stop)
+        return self._develop(seen.total, rays.direction, ends), seen, rays
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -140,13 +177,14 @@ class FieldSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.vjp`."""
         rays, seen = observation.rays, observation.seen
         assert rays is not None and seen is not None
+        if attached and observation.ends is not None:
+            raise InputError(f"attached: {ATTACHED}")
         cotangent, d_direction = self._frozen_cotangent(
-            seen.total, rays.direction, d_image.array
+            seen.total, rays.direction, observation.ends, d_image.array
         )
-        if attached:
-            d_rays, wrenches = self._frozen_all_rays(rays, seen, cotangent)
-        elif self._wrenches is not None:
-            d_rays, wrenches = None, self._frozen_object_rays(rays, seen, cotangent)
+        if attached or self._wrenches is not None:
+            first = 0 if attached else len(self.scene)
+            d_rays, wrenches = self._frozen_by_rays(rays, seen, cotangent, first)
         else:
             d_rays = wrenches = None
             for task in self.composite.tasks(self._fields, rays, seen, cotangent):
@@ -160,12 +198,16 @@ class FieldSensor(AbstractDifferentiableSensor):
         return self._by_state(state, d_rays, d_direction) if attached else None
 
     def _cotangent(
-        self, total: March, direction: mi.Vector3f, d_image: mi.Float
+        self,
+        total: March,
+        direction: mi.Vector3f,
+        ends: Ends | None,
+        d_image: mi.Float,
     ) -> tuple[March, mi.Vector3f]:
         """Differentiate by the composite and, for the sky, by the direction."""
         total, direction = total.copy(), mi.Vector3f(direction)
         dr.enable_grad(total, direction)
-        pixels = self._develop(total, direction)
+        pixels = self._develop(total, direction, ends)
         index = 3 * dr.arange(mi.UInt32, dr.width(pixels))
         weights = [dr.gather(mi.Float, d_image, index + c) for c in range(3)]
         dr.backward_from(dr.dot(pixels, mi.Color3f(*weights)))
@@ -175,24 +217,20 @@ class FieldSensor(AbstractDifferentiableSensor):
         posed = [self._fields[k] for k in task.fields]
         self.composite.accumulate(posed, task, self.stop)
 
-    def _by_all_rays(
-        self, rays: Rays, seen: Seen, cotangent: March
-    ) -> tuple[RayTangent, list[Any]]:
-        """Differentiate all layers: sums over layers, and the objects' wrenches."""
-        layers = range(len(self._fields))
+    def _by_rays(
+        self, rays: Rays, seen: Seen, cotangent: March, first: int
+    ) -> tuple[RayTangent | None, list[Any]]:
+        """Differentiate layers from `first` on: their sum if it is 0, and wrenches."""
+        layers = range(first, len(self._fields))
         found = self.composite.backward_rays(
             self._fields, rays, seen, cotangent, self.stop, layers
         )
+        wrenches = self._sum_wrenches(rays, found[len(self.scene) - first :])
+        if first:
+            return None, wrenches
         d_origin = sum((by_origin for by_origin, _ in found), mi.Vector3f(0))
         d_direction = sum((by_direction for _, by_direction in found), mi.Vector3f(0))
-        return (d_origin, d_direction), self._sum_wrenches(rays, found[1:])
-
-    def _by_object_rays(self, rays: Rays, seen: Seen, cotangent: March) -> list[Any]:
-        layers = range(1, len(self._fields))
-        found = self.composite.backward_rays(
-            self._fields, rays, seen, cotangent, self.stop, layers
-        )
-        return self._sum_wrenches(rays, found)
+        return (d_origin, d_direction), wrenches
 
     def _sum_wrenches(self, rays: Rays, found: list[RayTangent]) -> list[Any]:
         pairs = zip(self.objects, found, strict=True)
@@ -203,7 +241,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         # Recordings hold literals of one image's size; a task has none.
         sizes = [dr.width(x) for x in arguments if not isinstance(x, Task)]
         state = [posed.state() for posed in self._fields]
-        view = [self.camera, self.mount, self.jitter_seed]
+        view = [self.camera, self.mount, self.jitter_seed, self._near]
         return [self.composite, self.stop, view, sizes, state]
 
     def start_gradient(self, poses: bool = False) -> None:
@@ -266,6 +304,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.jvp`."""
         rays, seen = observation.rays, observation.seen
         assert rays is not None and seen is not None
+        if t_state is not None and observation.ends is not None:
+            raise InputError(f"attached: {ATTACHED}")
         t_rays = None if t_state is None else self._ray_tangent(state, t_state)
         tangent = self.composite.forward(self._fields, rays, seen, self.stop, t_rays)
         with dr.resume_grad():
@@ -273,15 +313,18 @@ class FieldSensor(AbstractDifferentiableSensor):
             dr.enable_grad(total, direction)
             dr.set_grad(total, tangent)
             dr.set_grad(direction, 0 if t_rays is None else t_rays[1])
-            pixels = self._develop(total, direction)
+            pixels = self._develop(total, direction, observation.ends)
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             t_pixels: Any = dr.forward_to(pixels, flags=flags)
         return self._tensor(t_pixels, dr.width(state))
 
-    def _make_rays(self, state: Any, step: mi.UInt32, count: int) -> Rays:
+    def _make_rays(
+        self, state: Any, step: mi.UInt32, ends: Ends | None, count: int
+    ) -> Rays:
         origin, direction = self._rays(state, count)
         jitter = self._jitter(step, dr.width(direction))
-        far, active = dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Bool, True)
+        far = dr.opaque(mi.Float, dr.inf) if ends is None else ends.t_max
+        active = dr.opaque(mi.Bool, True)
         return Rays(origin, direction, far, jitter, active)
 
     def _rays(self, state: Any, count: int) -> tuple[mi.Point3f, mi.Vector3f]:
@@ -293,7 +336,11 @@ class FieldSensor(AbstractDifferentiableSensor):
             mount.pitch_deg,
         )
         dr.eval(origin, columns)
-        return generate_rays(self.camera, origin, columns, count)
+        origin, direction = generate_rays(self.camera, origin, columns, count)
+        if self._near is not None:
+            index = dr.arange(mi.UInt32, dr.width(direction)) % dr.width(self._near)
+            origin += dr.gather(mi.Float, self._near, index) * direction
+        return origin, direction
 
     def _jitter(self, step: mi.UInt32, count: int) -> mi.Float:
         if self.jitter_seed is None:
@@ -309,10 +356,16 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     @property
     def _fields(self) -> list[Layer]:
-        return [self.scene, *self.objects]
+        return [*self.scene, *self.objects]
 
-    def _develop(self, total: March, direction: mi.Vector3f) -> mi.Color3f:
-        behind = self.scene.background(direction)
+    def _behind(self, direction: mi.Vector3f, ends: Ends | None) -> mi.Color3f:
+        sky = self._fields[0].background
+        return sky(direction) if ends is None else ends.radiance
+
+    def _develop(
+        self, total: March, direction: mi.Vector3f, ends: Ends | None
+    ) -> mi.Color3f:
+        behind = self._behind(direction, ends)
         return linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
 
     def _tensor(self, pixels: mi.Color3f, count: int) -> mi.TensorXf:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.surroundings import Ends
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,13 @@ class Observation:
         seen: the composite, one ray a pixel, its layers scene first; None where the
             sensor has no fields.
         rays: n height width rays; None where the sensor traces none.
+        ends: where surfaces end the rays, and what is seen there; None without any.
     """
 
     image: Any
     seen: Seen | None = None
     rays: Rays | None = None
+    ends: Ends | None = None
 
 
 class AbstractSensor(ABC):

@@ -34,13 +34,13 @@ def leaf(value):
 def taped_image(sensor, state, textures, offsets):
     """Render what a `FieldSensor` sees; its textures stay attached."""
     key = dr.opaque(mi.UInt32, 0)
-    rays = sensor._make_rays([state[i] for i in range(3)], key, dr.width(state))
-    layers = [taped_march(sensor.scene, rays, sensor.stop)]
+    rays = sensor._make_rays([state[i] for i in range(3)], key, None, dr.width(state))
+    layers = [taped_march(layer, rays, sensor.stop) for layer in sensor.scene]
     for k, (posed, texture) in enumerate(zip(sensor.objects, textures, strict=True)):
         posed.field.packed = posed.field.pack(mi.Float(texture.array))
         posed = moved(posed, [mi.Float(offsets[k, i].array) for i in range(6)])
         layers.append(taped_march(posed, rays, sensor.stop))
-    pixels = sensor._develop(depth_composite(layers), rays.direction)
+    pixels = sensor._develop(depth_composite(layers), rays.direction, None)
     return sensor._tensor(pixels, dr.width(state))
 
 

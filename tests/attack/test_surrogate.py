@@ -1,0 +1,175 @@
+"""Mitsuba scenes as sensors: equal images, derivatives, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import toy_loop as toy
+from helpers import walled_scene as walled
+from helpers.kernels import nothing_compiled
+
+from mi_nerfattack.attack.surrogate import surrogate_sensor
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.rollout.sensor import AbstractSensor
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+STATES = np.array([[0.0, 0.3, 0.05], [1.4, -0.2, -0.08]])
+
+
+@pytest.fixture
+def folder(variant: str, tmp_path: Path) -> Path:
+    """Folder with the fields of the scenes."""
+    walled.write_fields(tmp_path)
+    return tmp_path
+
+
+def sensor_of(description, attacked=("far", "near"), mount=toy.MOUNT):
+    return surrogate_sensor(walled.load(description), mount, attacked)
+
+
+@pytest.mark.parametrize(
+    ("lens", "walls", "composite"),
+    [
+        (walled.LENS, True, "depth"),
+        (walled.PERSPECTIVE, True, "interleaved"),
+        (walled.PERSPECTIVE, False, "depth"),
+    ],
+)
+def test_images_are_mitsubas(folder, lens, walls, composite):
+    """All vehicles of a batch; with a wall, or the sky of a field, behind."""
+    sky = {"type": "ngp_field", "filename": str(folder / "sky.safetensors")}
+    more = {} if walls else {"sky": sky}
+    description = walled.scene_dict(folder, lens, walls, composite=composite, **more)
+    sensor = sensor_of(description)
+    seen = sensor.observe(walled.close_loop(sensor).initial(STATES), 0)
+    for image, state in zip(seen.image.numpy(), STATES, strict=True):
+        wanted = linear_to_srgb_numpy(walled.rendered(description, state))
+        error = abs(image - wanted)
+        assert np.sqrt((error**2).mean()) <= 1e-5
+        assert (error <= 1e-4).mean() >= 0.999
+
+
+def rollout(sensor, horizon, attached=False, adjoint=None):
+    loop = walled.close_loop(sensor)
+    cost = StageSum(toy.square_error)
+    return Rollout(loop, cost, horizon, adjoint=adjoint or Replay(), attached=attached)
+
+
+class Held(AbstractSensor):
+    """Sees what a sensor would see along another drive."""
+
+    def __init__(self, sensor, drive):
+        self.sensor, self.states = sensor, drive.states
+
+    def observe(self, state, step):
+        del state
+        return self.sensor.observe(self.states[step], step)
+
+
+def difference(value, sensor, directions, h):
+    """Differentiate a function of the sensor's textures along a direction."""
+    base = [texture.numpy().copy() for texture in sensor.textures()]
+    ends = []
+    for s in (h, -h):
+        moved = [b + s * d for b, d in zip(base, directions, strict=True)]
+        sensor.set_textures([m.astype(np.float32) for m in moved])
+        ends.append(value())
+    sensor.set_textures(base)
+    return (ends[0] - ends[1]) / (2 * h)
+
+
+def along(gradients, directions):
+    pairs = zip(gradients, directions, strict=True)
+    return sum(float((gradient.numpy() * d).sum()) for gradient, d in pairs)
+
+
+def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
+    """A wall between both objects, and a path tracer behind: noise is replayed."""
+    behind = {"type": "path", "max_depth": 3}
+    description = walled.scene_dict(folder, jitter=True, behind=behind)
+    description["sensor"]["sampler"] = {"type": "independent", "sample_count": 2}
+    sensor = sensor_of(description)
+    whole = rollout(sensor, 10, adjoint=KeptBackgrounds())
+    initial = whole.loop.initial(STATES)
+    drive = whole.run(initial)
+    found = whole.gradient(drive).textures
+    directions = [rng.normal(size=texture.shape) for texture in found]
+    replayed = replace(whole, adjoint=Replay())
+    with nothing_compiled():
+        again = replayed.run(initial)
+    assert again.value == drive.value
+    gradient = replayed.gradient(again).textures
+    assert along(gradient, directions) == pytest.approx(along(found, directions), 1e-5)
+    loop = replace(whole.loop, sensor=Held(sensor, drive.trajectory))
+    held = replace(replayed, loop=loop)
+    wanted = difference(lambda: held.run(initial).value, sensor, directions, 0.05)
+    assert along(found, directions) == pytest.approx(wanted, 1e-3)
+
+
+def test_attached_gradient_is_that_of_the_loop(folder, rng):
+    """Without surfaces."""
+    sensor = sensor_of(walled.scene_dict(folder, walls=False))
+    whole = rollout(sensor, 10, attached=True)
+    initial = whole.loop.initial(STATES)
+    found = whole.gradient(whole.run(initial)).textures
+    directions = [rng.normal(size=texture.shape) for texture in found]
+    wanted = difference(lambda: whole.run(initial).value, sensor, directions, 0.05)
+    assert along(found, directions) == pytest.approx(wanted, 0.05)
+
+
+def test_attached_with_surfaces_is_refused(folder):
+    sensor = sensor_of(walled.scene_dict(folder))
+    whole = rollout(sensor, 1, attached=True)
+    drive = whole.run(whole.loop.initial(STATES))
+    with pytest.raises(InputError, match="constants of a frame.*set attached to false"):
+        whole.gradient(drive)
+    tangents = [mi.TensorXf(np.ones(t.shape)) for t in sensor.textures()]
+    with pytest.raises(InputError, match="constants of a frame"):
+        whole.tangent(drive, tangents, drive.trajectory.states[0])
+
+
+def test_the_scene_shows_what_the_sensor_wears(folder):
+    """Fields are shared, so that parameters count by their keys."""
+    scene = walled.load(walled.scene_dict(folder))
+    sensor = surrogate_sensor(scene, toy.MOUNT)
+    parameters = mi.traverse(scene)
+    for name, texture in zip(("far", "near"), sensor.textures(), strict=True):
+        (key,) = (k for k in parameters.keys() if k.endswith(f"{name}.texture"))
+        assert (parameters[key].numpy() == texture.numpy()).all()
+    parameters[key] = 0 * parameters[key]
+    parameters.update()
+    assert not sensor.textures()[1].numpy().any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"integrator": {"type": "path"}}, "PathIntegrator; a surrogate needs"),
+        ({"sensor": {"type": "thinlens", "aperture_radius": 0.1}}, "use perspective"),
+        ({"sensor": {"type": "orthographic"}}, "only perspective"),
+        ({"sensor.film.crop_width": 5}, "remove crop_"),
+        ({"integrator.far.relit": True}, "set relit to false"),
+        ({"integrator.far.type": "ngp_field"}, "no grid_field 'far'; .*: near, scene$"),
+    ],
+)
+def test_what_is_refused(folder, change, message):
+    description = walled.scene_dict(folder)
+    for path, value in change.items():
+        *way, last = path.split(".")
+        inner = description
+        for part in way:
+            inner = inner[part]
+        inner[last] = value
+        if value == "ngp_field":
+            inner["filename"] = str(folder / "sky.safetensors")
+    with pytest.raises(InputError, match=message):
+        sensor_of(description)
