@@ -1,18 +1,23 @@
-"""The examples in docs/loop.md run as they stand."""
+"""The examples in docs/loop.md run as they stand, and the script beside it."""
 
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from mi_nerfattack.fields import load_grid
+from mi_nerfattack.scenes import bundled
+
 GUIDE = Path(__file__).parents[2] / "docs/loop.md"
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_examples_run(tmp_path):
     text = GUIDE.read_text("utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -27,3 +32,18 @@ def test_examples_run(tmp_path):
     shape = r"\d+, 3"
     assert re.fullmatch(rf"\[-0\.\d+\] \({shape}\)", first), first
     assert re.fullmatch(rf"torch.Size\(\[{shape}\]\)", second), second
+
+
+@pytest.mark.usefixtures("variant")
+def test_scene_is_attacked_from_xml(monkeypatch, capsys):
+    """Both textures move, and the script says whether the failure transfers."""
+    monkeypatch.setattr(sys, "argv", ["attack_from_xml.py", "3", "1"])
+    names = runpy.run_path(str(GUIDE.parent / "examples/attack_from_xml.py"))
+    before = load_grid(bundled("hydrant/field.safetensors")).texture.numpy()
+    near, far = (texture.numpy() for texture in names["sensor"].textures())
+    assert (near != before).any() and (far != before).any() and (near != far).any()
+    seen = names["sensor"].observe(names["loop"].initial(names["start"]), 0)
+    assert 0 < (seen.ends.t_max.numpy() < 30).sum() < seen.ends.t_max.numpy().size / 10
+    *rows, traced, last = capsys.readouterr().out.splitlines()
+    assert len(rows) == 2 and traced.startswith("path-traced: mean error 0.")
+    assert last in ("the failure transfers", "the failure does not transfer")
