@@ -205,7 +205,8 @@ def _surrogate_layers(
     through = (1 - seen.total.opacity) * behind
     layers[""][..., :3] += through.numpy().T.reshape(*shape, 3)
     layers[""][..., 3] = 1.0
-    names = ["scene", *_exr_names(world)]
+    scenery = [f"scene{k or ''}" for k in range(len(sensor.scene))]
+    names = [*scenery, *_exr_names(world)]
     for name, layer in zip(names, seen.layers, strict=True):
         layers |= layer.images(name, shape)
     return layers

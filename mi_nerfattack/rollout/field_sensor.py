@@ -194,7 +194,7 @@ class FieldSensor(AbstractDifferentiableSensor):
             self._wrenches = [
                 [a + b for a, b in zip(*pair, strict=True)] for pair in pairs
             ]
-        dr.eval([dr.grad(field.packed) for field in self._grids], self._wrenches)
+        dr.eval([dr.grad(field.packed) for field in self.fields], self._wrenches)
         return self._by_state(state, d_rays, d_direction) if attached else None
 
     def _cotangent(
@@ -246,7 +246,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def start_gradient(self, poses: bool = False) -> None:
         """Make every object's packed grid a fresh leaf with gradient zero."""
-        for field in self._grids:
+        for field in self.fields:
             leaf = mi.Float(dr.detach(field.packed))
             dr.enable_grad(leaf)
             field.packed = leaf
@@ -257,15 +257,15 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def texture_gradients(self) -> list[Any]:
         """Return the accumulated gradient of each texture, (n_vertices, 3)."""
-        return [field.texture_gradient(dr.grad(field.packed)) for field in self._grids]
+        return [field.texture_gradient(dr.grad(field.packed)) for field in self.fields]
 
     def textures(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.textures`."""
-        return [field.texture for field in self._grids]
+        return [field.texture for field in self.fields]
 
     def set_textures(self, textures: list[Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.set_textures`."""
-        for field, texture in zip(self._grids, textures, strict=True):
+        for field, texture in zip(self.fields, textures, strict=True):
             field.set_parameter("texture", texture)
 
     def offsets(self) -> np.ndarray:
@@ -293,7 +293,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def start_tangent(self, textures: list[Any]) -> None:
         """See :meth:`AbstractDifferentiableSensor.start_tangent`."""
-        for field, tangent in zip(self._grids, textures, strict=True):
+        for field, tangent in zip(self.fields, textures, strict=True):
             leaf = mi.Float(dr.detach(field.packed))
             dr.enable_grad(leaf)
             none = dr.zeros(mi.Float, field.n_vertices)
@@ -350,8 +350,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         return mi.Float(mi.sample_tea_float32(key, dr.arange(mi.UInt32, count)))
 
     @property
-    def _grids(self) -> list[GridField]:
-        # checked by __init__
+    def fields(self) -> list[GridField]:
+        """The objects' fields; __init__ checks their kind."""
         return [posed.field for posed in self.objects]  # pyright: ignore[reportReturnType]
 
     @property

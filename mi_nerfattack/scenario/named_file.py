@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -73,7 +73,7 @@ class NamedFile:
     def content(self) -> dict[str, str]:
         """Return the name without its folder, and the SHA-256 of the content.
 
-        An XML file counts with the files that it names itself, meshes and pictures. Of
+        An XML file counts with the files that it and included ones name. Of
         an installed module, its own source counts; the name where it has none.
 
         Raises:
@@ -88,10 +88,8 @@ class NamedFile:
         digest = hashlib.sha256(raw)
         digest.update(self.function.encode())
         if self.path.suffix.lower() == ".xml":
-            text = raw.decode("utf-8", "replace")
-            for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
-                if os.path.isfile(inner := self.path.parent / name):
-                    digest.update(hashlib.sha256(_read(inner)).digest())
+            for inner in _files_in(raw, self.path.parent, {self.path}):
+                digest.update(hashlib.sha256(_read(inner)).digest())
         shown = ":".join(filter(None, (self.path.name, self.function)))
         return {"file": shown, "sha256": digest.hexdigest()}
 
@@ -140,6 +138,18 @@ def _any_code(value: Any, info: ValidationInfo) -> NamedFile:
             "file", "must have the form FILE.py:NAME or package.module:NAME"
         )
     return NamedFile(str(value), None)
+
+
+def _files_in(xml: bytes, folder: Path, seen: set[Path]) -> Iterator[Path]:
+    """Yield the files that an XML text names, and those that included ones name."""
+    text = xml.decode("utf-8", "replace")
+    for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
+        inner = folder / name
+        if inner not in seen and os.path.isfile(inner):
+            seen.add(inner)
+            yield inner
+            if inner.suffix.lower() == ".xml":
+                yield from _files_in(_read(inner), folder, seen)
 
 
 def _read(path: Path) -> bytes:

@@ -43,7 +43,8 @@ Row = tuple[Finite, Finite, Finite, Finite]
 class SceneSection(Section):
     """Where the drive takes place."""
 
-    field: File  # field file of the scene, or .ply of Gaussian splats: the surrogate
+    field: File | None = None  # or .ply of Gaussian splats: the surrogate
+    surrogate: File | None = None  # Mitsuba scene XML with a field_integrator, instead
     deployment: File  # Mitsuba scene XML: the deployment environment
     routes: File  # JSON of routes
     route: str  # name of the route that is driven
@@ -52,13 +53,25 @@ class SceneSection(Section):
     stop: Fraction = STOP  # transmittance at which rays end in the surrogate
     to_world: tuple[Row, Row, Row, Row] | None = None  # of the field: uniform scale
 
+    @model_validator(mode="after")
+    def _check_surrogate(self) -> Any:
+        """Refuse two surrogates, none, and what a Mitsuba scene says itself."""
+        if self.surrogate is None:
+            if self.field is None:
+                refuse("field", "is missing; give it, or surrogate")
+            return self
+        for key in ("field", "composite", "step_m", "stop", "to_world"):
+            if getattr(self, key) != self.defaults()[key]:
+                refuse(key, f"{self.surrogate} says it; leave out this, or surrogate")
+        return self
+
 
 class ObjectSection(Section):
     """An object whose texture is attacked."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    field: File  # grid field file
-    position_m: Triple
+    field: File | None = None  # grid field file; not with scene.surrogate
+    position_m: Triple | None = None  # likewise
     yaw_deg: Finite = 0.0
     scale: Positive = 1.0
     step_m: Positive | None = None  # of the march, before `scale`; the field's own
@@ -66,6 +79,7 @@ class ObjectSection(Section):
     @property
     def pose(self) -> Pose:
         """Where it stands."""
+        assert self.position_m is not None  # checked by Scenario
         return Pose.upright(self.position_m, np.radians(self.yaw_deg), self.scale)
 
 
@@ -149,6 +163,10 @@ class Scenario(Section):
         names = [item.id for item in self.objects]
         if len(set(names)) != len(names) or "scene" in names:
             refuse("objects", f"ids {names}; must differ, and not be scene")
+        if self.scene.surrogate is None:
+            self._check_placed()
+        else:
+            self._check_named(self.scene.surrogate)
         model = self.vehicle.model
         if model in STEERED and isinstance(self.policy, PilotNetSection):
             refuse(
@@ -157,6 +175,23 @@ class Scenario(Section):
                 "rate in rad/s; use dubins, or a policy of another kind",
             )
         return self
+
+    def _check_placed(self) -> None:
+        for index, item in enumerate(self.objects):
+            for key in ("field", "position_m"):
+                if getattr(item, key) is None:
+                    refuse(f"objects.{index}.{key}", "is missing")
+
+    def _check_named(self, xml: NamedFile) -> None:
+        """Refuse what the Mitsuba scene of the surrogate says itself."""
+        lens = ("width", "height", "fov_x_deg")
+        groups = [("camera", self.camera, lens), ("attack", self.attack, ("jitter",))]
+        own = ("field", "position_m", "yaw_deg", "scale", "step_m")
+        groups += [(f"objects.{i}", item, own) for i, item in enumerate(self.objects)]
+        for where, section, keys in groups:
+            for key in keys:
+                if getattr(section, key) != section.defaults()[key]:
+                    refuse(f"{where}.{key}", f"{xml} says it; leave it out")
 
     def identity(self) -> dict[str, str]:
         """Return all values by key, as JSON, and the content of the files they name.

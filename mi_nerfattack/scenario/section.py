@@ -158,9 +158,8 @@ class Kinds:
 
 def refuse(key: str, reason: str) -> NoReturn:
     """Raise an error of a key that a check of the whole section found."""
-    raise ValidationError.from_exception_data(
-        "", [_error(tuple(key.split(".")), reason)]
-    )
+    way = tuple(int(part) if part.isdigit() else part for part in key.split("."))
+    raise ValidationError.from_exception_data("", [_error(way, reason)])
 
 
 def _with(reasons: Mapping[str, str], validate: Callable[[], _Value]) -> _Value:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.deploy.path_traced_sensor import PathTracedSensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
@@ -18,6 +19,7 @@ from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.splats import SplatBackground
+from mi_nerfattack.render.surroundings import ATTACHED
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -108,34 +110,51 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     Raises:
         InputError: a file is missing or wrong.
     """
-    place = scenario.scene
-    surrogate = _load_surrogate(scenario)
-    fields = [load_grid(item.field.file) for item in scenario.objects]
-    for field, item in zip(fields, scenario.objects, strict=True):
-        field.refine(item.step_m or field.step_m)
-    posed = [
-        PosedField(field, item.pose)
-        for field, item in zip(fields, scenario.objects, strict=True)
-    ]
-    camera, mount = scenario.camera.build()
+    place, surrogate = scenario.scene, build_surrogate(scenario)
+    posed = surrogate.objects
+    camera, mount = surrogate.camera, surrogate.mount
     route = Route.from_file(place.routes.file, place.route)
     dynamics = scenario.vehicle.build()
     objective = scenario.objective.build(scenario, route, dynamics)
     xml = load_scene(place.deployment.file)
-    jitter = scenario.seed if scenario.attack.jitter else None
-    look = place.stop, COMPOSITES[place.composite]()
     spp, seed = scenario.deployment.spp, scenario.seed
     return World(
         scenario,
         route,
-        fields,
-        FieldSensor(surrogate, posed, camera, mount, jitter, *look),
+        surrogate.fields,
+        surrogate,
         PathTracedSensor(xml, posed, camera, mount, spp, seed),
         policy,
         dynamics,
         objective,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )
+
+
+def build_surrogate(scenario: Scenario) -> FieldSensor:
+    """Make the sensor that an attack is made through.
+
+    Raises:
+        InputError: a file is missing or wrong, or its scene has no derivative that
+            the scenario asks for.
+    """
+    place, (camera, mount) = scenario.scene, scenario.camera.build()
+    if place.surrogate is not None:
+        xml, seed = load_scene(place.surrogate.file), scenario.seed
+        names = [item.id for item in scenario.objects]
+        sensor = surrogate_sensor(xml, mount, names, seed)
+        if scenario.attack.attached and sensor.surroundings is not None:
+            raise InputError(f"{place.surrogate}: {ATTACHED}")
+        return sensor
+    posed = []
+    for item in scenario.objects:
+        assert item.field is not None  # checked by Scenario
+        field = load_grid(item.field.file)
+        field.refine(item.step_m or field.step_m)
+        posed.append(PosedField(field, item.pose))
+    jitter = scenario.seed if scenario.attack.jitter else None
+    look = place.stop, COMPOSITES[place.composite]()
+    return FieldSensor(_load_scene(scenario), posed, camera, mount, jitter, *look)
 
 
 def build_attack(world: World) -> GradientAttack:
@@ -162,8 +181,9 @@ def build_attack(world: World) -> GradientAttack:
     return GradientAttack(rollout, world.route, loop.initial(poses), freedom)
 
 
-def _load_surrogate(scenario: Scenario) -> Layer:
+def _load_scene(scenario: Scenario) -> Layer:
     """Load the scene: a field, or splats, which are told by the suffix .ply."""
+    assert scenario.scene.field is not None  # checked by SceneSection
     path, matrix = scenario.scene.field.file, scenario.scene.to_world
     try:
         pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
