@@ -97,6 +97,7 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
     behind = {"type": "path", "max_depth": 3}
     description = walled.scene_dict(folder, jitter=True, behind=behind)
     description["sensor"]["sampler"] = {"type": "independent", "sample_count": 2}
+    description["sky"] = {"type": "constant", "radiance": 0.4}
     sensor = sensor_of(description)
     whole = rollout(sensor, 10, adjoint=KeptBackgrounds())
     initial = whole.loop.initial(STATES)
