@@ -60,7 +60,15 @@ class OurAttack(AbstractAttack):
         policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)
-        self.loop = ClosedLoop(sensor, policy, path.goal, vehicle, RK4(), job.dt)
+        self.loop = ClosedLoop(
+            sensor,
+            policy,
+            path.goal,
+            vehicle,
+            RK4(),
+            job.dt,
+            eight_bit=False,  # the peer does not round
+        )
         self.initial = self.loop.initial(job.initial())
         objective = StageSum(CrossTrackDeviation(path, ROUNDING_M))
         self.rollout = Rollout(self.loop, objective, job.horizon)

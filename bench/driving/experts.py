@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.deploy.kinematic import KinematicVehicle
+from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle
 from mi_nerfattack.deploy.place import Place, bundled_place
 from mi_nerfattack.deploy.registry import kinematic_vehicle
@@ -16,7 +16,6 @@ from mi_nerfattack.deploy.vehicle import AbstractVehicle
 from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
-from mi_nerfattack.vehicle.integrators import RK4
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 LIMIT_M = 0.1
@@ -85,7 +84,7 @@ def cases() -> Iterator[Case]:
         ("room", "mitsuba"),
     ):
         place = bundled_place(name)
-        simple = kinematic_vehicle(place.car, place.period)
+        simple = kinematic_vehicle(place)
         yield Case(environments, place, simple, 0.0)
         if place.car.control_unit == "rad":
             yield Case("rate-limited steering", place, _rate_limited(place), LAG_S)
@@ -98,9 +97,8 @@ def _rate_limited(place: Place) -> KinematicVehicle:
     model = RateLimitedAckermann(
         wheelbase=car.wheelbase, max_steer=car.max_control, max_steer_rate=1.5
     )
-    return KinematicVehicle(
-        model, RK4(), place.period, car.max_control, "rad", substeps=2
-    )
+    motion = Motion(model, substeps=2)
+    return KinematicVehicle(motion, place.period, car.max_control, "rad")
 
 
 def follow(

@@ -30,7 +30,7 @@ from typing import Any
 
 import tyro
 
-from bench.kill.scenario import EVERY, HORIZON, WRITING, make_scenario, run_job
+from bench.kill.scenario import EVERY, HORIZON, RUNS, WRITING, make_scenario, run_job
 from mi_nerfattack.io import files, locks
 
 _LIFE_S = 300.0  # after which a process is taken to hang
@@ -76,7 +76,7 @@ class Life:
         """Where it was when it told the last."""
         stages = [name for name, _, _ in self.lines if name != WRITING]
         place = stages[-1] if stages else "start-up"
-        if self.done("deployment: gradient") == HORIZON:
+        if self.done("deployment: gradient") == RUNS * HORIZON:
             place = "results"
         writing = self.lines and self.lines[-1][0] == WRITING
         return f"{place}, {WRITING}" if writing else place
@@ -221,7 +221,7 @@ class Campaign:
             if aim == "drive":
                 return None if stage in _NOT_DRIVES else draw.uniform(0, 0.02)
             if aim == "results":
-                late = life.done("deployment: gradient") == HORIZON
+                late = life.done("deployment: gradient") == RUNS * HORIZON
                 return draw.uniform(0, 0.2 * whole) if late else None
             iteration, rest = divmod(done, 2 * HORIZON)
             due = stage == "surrogate: attack" and rest == 0 and iteration % EVERY == 0

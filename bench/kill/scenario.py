@@ -22,7 +22,7 @@ from mi_nerfattack.policy.pilotnet import PilotNet  # noqa: E402
 from mi_nerfattack.policy.torch_policy import TorchPolicy  # noqa: E402
 from mi_nerfattack.scenario.scenario import load_scenario  # noqa: E402
 
-HORIZON = 2
+HORIZON, RUNS = 2, 2
 EVERY = 3
 WRITING = "writing a file"
 
@@ -43,7 +43,7 @@ scale = 1.5
 file = "policy.safetensors"
 [drive]
 horizon = {HORIZON}
-runs = 2
+runs = {RUNS}
 [attack]
 iterations = 30
 learning_rate = 0.5

@@ -9,7 +9,6 @@ from mi_nerfattack import attack, deploy, policy, rollout, scenes, vehicle
 # isort: split
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 mi.set_variant("llvm_ad_rgb")
 horizon, iterations = map(int, sys.argv[1:] or (40, 12))
@@ -33,13 +32,7 @@ def error_path_traced():
     meshes = replace(place, scene=here / "deployment.xml", camera=sensor.camera)
     world = deploy.make_environment("mitsuba", meshes, deploy.Conditions(spp=8))
     world.show(sensor.objects)
-    frame, memory, states = world.reset(route, start), driver.initial_memory(1), []
-    for _ in range(horizon):
-        image = mi.TensorXf(frame.image[None] / np.float32(255))
-        control, memory = driver.step(image, route.goal, memory)
-        frame = world.step(float(np.array(control)[0]))
-        states.append(world.state[:3])
-    return abs(route.cross_track_numpy(np.array(states))).mean()
+    return deploy.drive(world, driver, route, start, 0, horizon).distance_m.mean()
 
 
 keys = [f"fields.{name}.texture" for name in names]

@@ -7,6 +7,7 @@ from .carla.environment import CarlaEnvironment as CarlaEnvironment
 from .carla.route import route_from_town as route_from_town
 from .carla.session import CarlaServer as CarlaServer
 from .carla.session import load_client as load_client
+from .driving import drive as drive
 from .environment import AbstractEnvironment as AbstractEnvironment
 from .environment import CameraFrame as CameraFrame
 from .mujoco.car import Handling as Handling
@@ -15,7 +16,6 @@ from .mujoco.spec import write_mjcf as write_mjcf
 from .mujoco.vehicle import HeadingRate as HeadingRate
 from .mujoco.vehicle import MujocoVehicle as MujocoVehicle
 from .mujoco.vehicle import SteeringAngle as SteeringAngle
-from .path_traced_sensor import PathTracedSensor as PathTracedSensor
 from .place import Conditions as Conditions
 from .place import bundled_place as bundled_place
 from .registry import make_environment as make_environment

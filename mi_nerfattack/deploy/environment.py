@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.rays import March
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -22,11 +24,48 @@ class CameraFrame:
         depth: (height, width) float32, metres along the ray through the pixel's
             centre, infinite where there is nothing.
         camera_to_world: (4, 4) float64, OpenCV axes, metres.
+        linear: (height, width, 3) float32, what the image was made of; None where the
+            environment gives eight bits alone.
+        beneath: the frame before objects were pasted, None where none were.
+        marches: of what lies in the frame layer by layer, a ray a pixel.
     """
 
     image: np.ndarray
     depth: np.ndarray
     camera_to_world: np.ndarray
+    linear: np.ndarray | None = None
+    beneath: CameraFrame | None = None
+    marches: Sequence[March] = ()
+
+    def layers(self, objects: Sequence[str]) -> dict[str, np.ndarray]:
+        """Take the frame apart, for a file.
+
+        Args:
+            objects: names of those that are shown; not looked at where their geometry
+                is the scene's.
+
+        Returns:
+            by layer name: the frame as ``""`` (height, width, 4) and ``Z``, the scene
+            alone as ``scene`` and ``scene.Z`` (further fields: ``scene1``, ...), each
+            object (premultiplied) as ``NAME``
+            and ``NAME.Z``; linear, metres along the ray.
+        """
+        found = self._layer("")
+        if self.beneath is not None:
+            found |= self.beneath._layer("scene")
+        scenes = range(len(self.marches) - len(objects))
+        names = [*(f"scene{k or ''}" for k in scenes), *objects]
+        for name, march in zip(names, self.marches, strict=False):
+            found |= march.images(name, self.depth.shape)
+        return found
+
+    def _layer(self, name: str) -> dict[str, np.ndarray]:
+        colour = self.linear
+        if colour is None:
+            colour = srgb_to_linear_numpy(self.image / np.float32(255))
+        opaque = np.ones((*self.depth.shape, 1), np.float32)
+        key = f"{name}.Z" if name else "Z"
+        return {name: np.concatenate([colour, opaque], axis=-1), key: self.depth}
 
 
 class AbstractEnvironment(ABC):

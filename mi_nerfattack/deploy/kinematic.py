@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,38 +10,48 @@ import numpy as np
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, planar_body, require_control
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
-from mi_nerfattack.vehicle.integrators import AbstractIntegrator
+from mi_nerfattack.vehicle.integrators import RK4, AbstractIntegrator
 from mi_nerfattack.vehicle.state import to_state
 from mi_nerfattack.vehicle.transition import Transition
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a vehicle without wheels moves.
+
+    Args:
+        dynamics: the model.
+        integrator: its time step.
+        substeps: integration steps a period.
+        delay: integration steps until a control takes effect.
+    """
+
+    dynamics: AbstractDynamics
+    integrator: AbstractIntegrator = field(default_factory=RK4)
+    substeps: int = 1
+    delay: int = 0
 
 
 class KinematicVehicle(AbstractVehicle):
     """Vehicle of a model of `mi_nerfattack.vehicle`.
 
     Args:
-        dynamics: the model; one with a `speed` takes that given to `reset`.
-        integrator: its time step.
+        motion: the model, whose `speed`, where it has one, is that given to `reset`.
         period: seconds that a control is held.
         max_control: where the model saturates the control.
         control_unit: "rad/s" (Dubins) or "rad" (models with a steering angle).
-        substeps: integration steps a period.
-        delay: integration steps until a control takes effect.
     """
 
     def __init__(
         self,
-        dynamics: AbstractDynamics,
-        integrator: AbstractIntegrator,
+        motion: Motion,
         period: float,
         max_control: float,
         control_unit: str = "rad/s",
-        substeps: int = 1,
-        delay: int = 0,
     ) -> None:
-        self.dynamics, self.integrator = dynamics, integrator
+        self.motion = motion
         self.period, self.max_control = period, max_control
         self.control_unit = control_unit
-        self.substeps, self.delay = substeps, delay
         self._transitions: dict[float | None, Transition] = {}
         self._transition: Transition | None = None
         self._state: Any = None
@@ -50,15 +60,16 @@ class KinematicVehicle(AbstractVehicle):
     def reset(self, pose: np.ndarray, speed: float, seed: int = 0) -> None:
         """Put the vehicle somewhere; `seed` has no effect on it."""
         del seed
-        key = speed if "speed" in self.dynamics.__dataclass_fields__ else None
+        motion = self.motion
+        key = speed if "speed" in motion.dynamics.__dataclass_fields__ else None
         if key not in self._transitions:
             changed = {} if key is None else {"speed": key}
             self._transitions[key] = Transition(
-                replace(self.dynamics, **changed),
-                self.integrator,
+                replace(motion.dynamics, **changed),
+                motion.integrator,
                 self.period,
-                self.substeps,
-                self.delay,
+                motion.substeps,
+                motion.delay,
             )
         self._transition = self._transitions[key]
         extended = self._transition.dynamics.extend(np.asarray(pose, np.float64))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
+from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, Finite, Seconds, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
@@ -27,6 +28,8 @@ class Place:
         mount: where the camera sits on it.
         period: seconds between two images.
         car: what drives.
+        motion: how, where an environment has no physics; the car's kinematic model by
+            default.
         recording: of `replay`: a folder, a video or a log.
         server: of `carla`: "HOST:PORT" or "HOST:PORT/TOWN".
     """
@@ -39,6 +42,7 @@ class Place:
     mount: CameraMount
     period: Seconds = 0.1
     car: Car = CAR
+    motion: Motion | None = None
     recording: Path | None = None
     server: str = "127.0.0.1:2000"
 

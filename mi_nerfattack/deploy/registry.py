@@ -4,35 +4,32 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from mi_nerfattack.deploy.built_in import built_in_shapes
-from mi_nerfattack.deploy.car import Car
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.kinematic import KinematicVehicle
+from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.simulated import SimulatedEnvironment
+from mi_nerfattack.deploy.simulated import SimulatedEnvironment, SurrogateEnvironment
 from mi_nerfattack.deploy.vehicle import AbstractVehicle
 from mi_nerfattack.deploy.views.base import AbstractView
-from mi_nerfattack.deploy.views.field import FieldView
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.render.pathtrace.daylight import set_daylight
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
-from mi_nerfattack.vehicle.integrators import RK4
 
 
-def kinematic_vehicle(car: Car, period: float) -> KinematicVehicle:
-    """Make the kinematic model of a car: Dubins for "rad/s", Ackermann for "rad"."""
-    model: Any
-    if car.control_unit == "rad":
-        model = Ackermann(wheelbase=car.wheelbase, max_steer=car.max_control)
-    else:
-        model = Dubins(max_heading_rate=car.max_control)
-    return KinematicVehicle(model, RK4(), period, car.max_control, car.control_unit)
+def kinematic_vehicle(place: Place) -> KinematicVehicle:
+    """Make what drives at a place, where an environment has no physics."""
+    car, motion = place.car, place.motion
+    if motion is None:
+        steered = Ackermann(wheelbase=car.wheelbase, max_steer=car.max_control)
+        turned = Dubins(max_heading_rate=car.max_control)
+        motion = Motion(steered if car.control_unit == "rad" else turned)
+    return KinematicVehicle(motion, place.period, car.max_control, car.control_unit)
 
 
 def mitsuba_view(place: Place, conditions: Conditions) -> MitsubaView:
@@ -49,12 +46,13 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
             "'mi-nerfattack fit' and give it"
         )
     _refuse_built_in("surrogate", conditions)
-    view = FieldView(PosedField(load_field(place.field)), place.camera)
-    return _pair("surrogate", kinematic_vehicle(place.car, place.period), view, place)
+    scene = PosedField(load_field(place.field))
+    sensor = FieldSensor(scene, [], place.camera, place.mount)
+    return SurrogateEnvironment(sensor, kinematic_vehicle(place))
 
 
 def _mitsuba(place: Place, conditions: Conditions) -> AbstractEnvironment:
-    vehicle = kinematic_vehicle(place.car, place.period)
+    vehicle = kinematic_vehicle(place)
     return _pair("mitsuba", vehicle, mitsuba_view(place, conditions), place)
 
 
@@ -83,7 +81,7 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
 
     _refuse_built_in("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
-    driver = KinematicDriver(kinematic_vehicle(place.car, place.period))
+    driver = KinematicDriver(kinematic_vehicle(place))
     exposure = {"exposure_compensation": str(conditions.exposure_ev)}
     return CarlaEnvironment(
         server,

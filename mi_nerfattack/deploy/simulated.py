@@ -2,43 +2,42 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.kinematic import KinematicVehicle
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
 from mi_nerfattack.deploy.views.base import AbstractView
+from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.state import to_state
 
 
-class SimulatedEnvironment(AbstractEnvironment):
-    """Any vehicle in any view: the surrogate, `mitsuba` and `mujoco` are such pairs.
+class AbstractSimulation(AbstractEnvironment):
+    """A simulated vehicle, and what sees for it.
 
     Args:
-        name: of the pair.
+        name: of the environment.
         vehicle: moves.
-        view: renders.
-        mount: the camera's place on the vehicle.
+        camera: intrinsics.
         period: seconds that the vehicle holds a control.
     """
 
     def __init__(
-        self,
-        name: str,
-        vehicle: AbstractVehicle,
-        view: AbstractView,
-        mount: CameraMount,
-        period: float,
+        self, name: str, vehicle: AbstractVehicle, camera: Camera, period: float
     ) -> None:
-        self.name, self.vehicle, self.view = name, vehicle, view
-        self.camera, self.period = view.camera, period
-        self.max_control = vehicle.max_control
+        self.name, self.vehicle, self.camera = name, vehicle, camera
+        self.period, self.max_control = period, vehicle.max_control
         self.control_unit = vehicle.control_unit
-        self._mount = mount_matrix(np.zeros((1, 3)), mount)[0]
         self._seed, self._steps = 0, -1
 
     def reset(
@@ -65,6 +64,33 @@ class SimulatedEnvironment(AbstractEnvironment):
         """State (m,) of the vehicle."""
         return self.vehicle.state
 
+    @abstractmethod
+    def _observe(self) -> CameraFrame:
+        """Render what the vehicle sees, of seed `_seed` and step `_steps`."""
+
+
+class SimulatedEnvironment(AbstractSimulation):
+    """Any vehicle in any view: `mitsuba` and `mujoco` are such pairs.
+
+    Args:
+        name: of the pair.
+        vehicle: moves.
+        view: renders.
+        mount: the camera's place on the vehicle.
+        period: seconds that the vehicle holds a control.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        vehicle: AbstractVehicle,
+        view: AbstractView,
+        mount: CameraMount,
+        period: float,
+    ) -> None:
+        super().__init__(name, vehicle, view.camera, period)
+        self.view, self._mount = view, mount_matrix(np.zeros((1, 3)), mount)[0]
+
     def show(self, objects: Sequence[Any]) -> None:
         """Show fields, in the view's way."""
         self.view.show(objects)
@@ -78,3 +104,48 @@ class SimulatedEnvironment(AbstractEnvironment):
         # 32 bits each: a seed of its own for every frame of every drive
         sequence = np.random.SeedSequence([self._seed, self._steps])
         return self.view.render(pose, int(sequence.generate_state(1)[0]))
+
+
+class SurrogateEnvironment(AbstractSimulation):
+    """The differentiable rollout of one vehicle: its sensor and its transition.
+
+    Frames are the images of an attack in eight bits, which is what the policy gets in
+    a `ClosedLoop`; the seed has no effect. The depth is the expected depth of all that
+    a ray meets, infinite where it meets less than half an opacity.
+
+    Args:
+        sensor: sees.
+        vehicle: moves.
+    """
+
+    def __init__(self, sensor: FieldSensor, vehicle: KinematicVehicle) -> None:
+        super().__init__("surrogate", vehicle, sensor.camera, vehicle.period)
+        self.sensor = sensor
+
+    def show(self, objects: Sequence[Any]) -> None:
+        """Compose other fields with the scene's; grid fields, no two of one texture."""
+        require_fields(objects)
+        self.sensor = self.sensor.showing(list(objects))
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _observe(self) -> CameraFrame:
+        state, sensor = self.state[None], self.sensor
+        pose = mount_matrix(state[:, :3], sensor.mount)[0]
+        found = sensor.observe(to_state(state), self._steps)
+        seen, rays, ends = found.seen, found.rays, found.ends
+        assert seen is not None and rays is not None
+        shape = (self.camera.height, self.camera.width)
+        total, far = seen.total, dr.inf if ends is None else ends.t_max
+        linear = total.radiance + (1 - total.opacity) * sensor.behind(found)
+        depth = dr.select(total.opacity >= OPAQUE, total.depth, far)
+        if sensor.clip.near_m:  # where rays start
+            depth += dr.norm(rays.origin - mi.Point3f(*map(float, pose[:3, 3])))
+        return CameraFrame(
+            np.round(255 * np.array(found.image)[0]).astype(np.uint8),
+            depth.numpy().reshape(shape),
+            pose,
+            linear.numpy().T.reshape(*shape, 3),
+            marches=seen.layers,
+        )

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.threads import one_thread
+from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.placement import Ground, Roadside, Scatter
 from mi_nerfattack.errors import InputError
@@ -74,61 +75,6 @@ class EvaluateSettings:
         length = route.length - (0.0 if route.closed else self.margin_m)
         count = int(length / (route.speed_ms * period) + 1e-6)
         return max(1, min(self.horizon, count))
-
-
-def drive(
-    environment: AbstractEnvironment,
-    policy: AbstractPolicy,
-    route: Route,
-    pose: np.ndarray,
-    seed: int,
-    steps: int,
-    on_step: Callable[[int], None] | None = None,
-    case: str = CLEAN,
-    run: int = 0,
-) -> Drive:
-    """Let a policy drive in an environment.
-
-    Args:
-        environment: is reset; what it shows is left alone.
-        policy: sees sRGB images (1, height, width, 3) in [0, 1]; one with memory
-            starts with its initial one.
-        route: whose goal the policy gets, and to which errors are measured.
-        pose: (3,), of the start, metres and radians.
-        seed: of the environment.
-        steps: control periods; fewer where the environment is over before.
-        on_step: called after each with its index; an exception ends the drive.
-        case: of the result.
-        run: of the result.
-
-    Raises:
-        InputError: the policy does not take the camera's images, or its control is
-            not finite.
-    """
-    frame = environment.reset(route, np.asarray(pose, np.float64), seed)
-    memory = policy.initial_memory(1)
-    states, controls = [environment.state[:3]], []
-    for index in range(steps):
-        image = mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
-        row, memory = policy.step(image, route.goal, memory)
-        controls.append(float(np.array(row)[0]))
-        frame = environment.step(controls[-1])
-        states.append(environment.state[:3])
-        if on_step is not None:
-            on_step(index)
-        if environment.is_over:
-            break
-    return Drive(
-        environment=environment.name,
-        route=route.name,
-        case=case,
-        run=run,
-        seed=seed,
-        states=np.stack(states),
-        controls=np.array(controls),
-        cross_track_m=route.cross_track_numpy(np.stack(states[1:])),
-        time_s=environment.period * np.arange(1, len(controls) + 1),
-    )
 
 
 class ExpertPolicy(AbstractPolicy):

@@ -205,20 +205,16 @@ class _Cases(_Model):
     gradient: _Case | None = None
 
 
-class _Environments(_Model):
-    surrogate: _Cases | None = None
-    deployment: _Cases | None = None
-
-
 class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
     seed: pydantic.NonNegativeInt
     departure_limits_m: dict[str, pydantic.PositiveFloat]
-    routes: dict[str, _Environments] = pydantic.Field(min_length=1)
+    routes: dict[str, dict[str, _Cases]] = pydantic.Field(min_length=1)
     cost: _Cost
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None
+    replay: dict[str, Any] | None = None
 
 
 def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.run_folder import RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages
 from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.scenario import Scenario, portable_text
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 
@@ -92,6 +93,8 @@ class Job:
                 folder.read(force, self.on_notice)
             world = build_world(self.scenario, self.policy)
             departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
+            for label in world.labels:  # what cannot be made is told before hours
+                world.open(label).close()
             folder.begin()
             try:
                 return self._work(world, folder, Account(started, folder.effort))
@@ -106,22 +109,24 @@ class Job:
         """Do what is not done yet."""
 
         def effort() -> Effort:
-            renders = world.surrogate.renders + world.deployment.renders
+            renders = world.surrogate.renders + stages.renders
             return account.total(renders, folder.checkpoint.seconds)
 
         stages = Stages(world, folder.drives, self.on_progress, effort)
         original = world.appearance()
-        stages.drive_all(world.surrogate, "unperturbed")
-        stages.drive_random(world.surrogate)
-        world.show(original)
-        attack = self._attack(world, folder, effort)
-        attacked = world.appearance()
-        stages.drive_all(world.surrogate, "gradient")
-        world.show(original)
-        stages.drive_all(world.deployment, "unperturbed")
-        stages.drive_random(world.deployment)
-        world.show(attacked)
-        stages.drive_all(world.deployment, "gradient")
+        with closing(stages):
+            stages.drive_all(SURROGATE, "unperturbed")
+            stages.drive_random(SURROGATE)
+            world.show(original)
+            attack = self._attack(world, folder, effort)
+            attacked = world.appearance()
+            stages.drive_all(SURROGATE, "gradient")
+            for label in world.deployments:
+                world.show(original)
+                stages.drive_all(label, "unperturbed")
+                stages.drive_random(label)
+                world.show(attacked)
+                stages.drive_all(label, "gradient")
         from mi_nerfattack.experiment.results import write_results  # it loads the plots
 
         return write_results(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from mi_nerfattack.experiment.checkpoint import REMEDY
@@ -11,7 +11,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 
-FORMAT = "mi_nerfattack attack drive 1"
+FORMAT = "mi_nerfattack attack drive 2"
 
 
 class DriveRecord(Record):
@@ -30,7 +30,7 @@ class KeptDrives:
         folder: of the files; made with the first.
         identity: versions and scenario, see :meth:`Scenario.identity`.
         route: that all drives follow.
-        seed: of all drives.
+        seed: of the first drive of a case; that of run k is k more.
     """
 
     def __init__(
@@ -69,16 +69,13 @@ class KeptDrives:
             if not kept.ignored:
                 about = (record.environment, self._route, record.case, record.run)
                 with misfits_told(path):
-                    self._take_up(Drive(*about, self._seed, **kept.tensors))
+                    seed = self._seed + record.run
+                    self._take_up(Drive(*about, seed, **kept.tensors))
         return max(efforts, key=lambda effort: effort.wall_s), ignored
 
-    def take(
-        self, environment: str, case: str, runs: Sequence[int]
-    ) -> list[Drive] | None:
-        """Return the drives of some runs, None unless all of them are there."""
-        found = [self._drives.get((environment, case, run)) for run in runs]
-        whole = [drive for drive in found if drive is not None]
-        return whole if len(whole) == len(found) else None
+    def take(self, environment: str, case: str, run: int) -> Drive | None:
+        """Return a drive, None unless it is there."""
+        return self._drives.get((environment, case, run))
 
     def drop(self, case: str) -> None:
         """Forget the drives of a case."""
@@ -98,24 +95,14 @@ class KeptDrives:
         if self.folder.exists():
             self.folder.rmdir()
 
-    def add(self, drives: Sequence[Drive], effort: Effort) -> None:
-        """Write drives, one after the other.
-
-        Args:
-            drives: of this run.
-            effort: of the run so far.
-        """
+    def add(self, drive: Drive, effort: Effort) -> None:
+        """Write a drive of this run, and what the run has cost so far."""
         files.make_folder(self.folder)
-        for drive in drives:
-            record = DriveRecord(
-                environment=drive.environment,
-                case=drive.case,
-                run=drive.run,
-                effort=effort,
-            )
-            path = self._path(drive.environment, drive.case, drive.run)
-            self._unit(path).write(drive.arrays(), record)
-            self._take_up(drive)
+        environment, case, run = drive.environment, drive.case, drive.run
+        record = DriveRecord(environment=environment, case=case, run=run, effort=effort)
+        path = self._path(environment, case, run)
+        self._unit(path).write(drive.arrays(), record)
+        self._take_up(drive)
 
     def _take_up(self, drive: Drive) -> None:
         self._drives[drive.environment, drive.case, drive.run] = drive

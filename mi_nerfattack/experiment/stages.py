@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.driving import drive
+from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.rollout.drive import Drive
-from mi_nerfattack.rollout.loop import Trajectory, simulate
-from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
 
 #: Called with stage, steps done, steps in all, and a remark.
@@ -22,14 +22,17 @@ OnProgress = Callable[[str, int, int, str], None]
 
 @dataclass
 class Stages:
-    """Drives through a world, keeping each batch on disk as it ends.
+    """Drives through a world, keeping each on disk as it ends.
+
+    One environment is open at a time.
 
     Attributes:
-        world: fields, sensors, policy.
+        world: fields, environments, policy.
         kept: drives that are finished.
         on_progress: told about every time step.
         effort: tells what the run has cost so far.
         drives: all drives that were asked for so far.
+        renders: frames of environments that are not the surrogate.
     """
 
     world: World
@@ -37,25 +40,35 @@ class Stages:
     on_progress: OnProgress
     effort: Callable[[], Effort]
     drives: list[Drive] = field(default_factory=list)
+    renders: int = 0
+    _opened: tuple[object, AbstractEnvironment] | None = None
 
-    @property
-    def random_count(self) -> int:
-        """Number of random textures."""
-        scenario = self.world.scenario
-        return scenario.baseline.textures or scenario.attack.iterations
+    def drive_all(self, label: str, case: str) -> None:
+        """Drive from all initial states, objects as they are; once where it is open.
 
-    def drive_all(self, sensor: AbstractSensor, case: str) -> None:
-        """Drive all initial states as one batch, with the textures as they are."""
-        self._drive(sensor, case, self.world.initial, 0, 1)
+        Args:
+            label: of the environment.
+            case: of the drives.
+        """
+        count = 1 if self.world.is_open_loop(label) else len(self.world.initial)
+        for run in range(count):
+            if not self._take(label, case, run, count):
+                self._drive(label, case, run, count, (label, case))
 
-    def drive_random(self, sensor: AbstractSensor) -> None:
+    def drive_random(self, label: str) -> None:
         """Drive with random textures, each from one of the initial states."""
-        initial, count = self.world.initial, self.random_count
-        for k in range(count):
-            if not self._take(sensor, "random", range(k, k + 1), count):
-                self._set_random_textures(k)
-                state = initial[k % len(initial)][None]
-                self._drive(sensor, "random", state, k, count)
+        scenario = self.world.scenario
+        count = scenario.baseline.textures or scenario.attack.iterations
+        for run in range(count):
+            if not self._take(label, "random", run, count):
+                self._set_random_textures(run)
+                self._drive(label, "random", run, count, (label, run))
+
+    def close(self) -> None:
+        """Close the environment that is open."""
+        if self._opened is not None:
+            self._opened[1].close()
+        self._opened = None
 
     def _set_random_textures(self, k: int) -> None:
         scenario, fields = self.world.scenario, self.world.fields
@@ -69,69 +82,46 @@ class Stages:
             ]
         )
 
-    def _take(
-        self, sensor: AbstractSensor, case: str, runs: range, batches: int
-    ) -> bool:
-        """Take up drives that are finished; False if they are not."""
-        found = self.kept.take(self._environment(sensor), case, runs)
+    def _take(self, label: str, case: str, run: int, count: int) -> bool:
+        """Take up a drive that is finished; False if it is not."""
+        found = self.kept.take(label, case, run)
         if found is None:
             return False
         horizon = self.world.scenario.drive.horizon
-        done = runs.stop if case == "random" else 1
-        stage = f"{self._environment(sensor)}: {case}"
-        self.on_progress(stage, done * horizon, batches * horizon, "kept")
-        self.drives += found
+        done, total = (run + 1) * horizon, count * horizon
+        self.on_progress(f"{label}: {case}", done, total, "kept")
+        self.drives.append(found)
         return True
 
-    def _drive(
-        self,
-        sensor: AbstractSensor,
-        case: str,
-        initial: np.ndarray,
-        first_run: int,
-        batches: int,
-    ) -> None:
-        """Drive a batch unless it is finished already."""
-        runs = range(first_run, first_run + len(initial))
-        if self._take(sensor, case, runs, batches):
-            return
-        horizon = self.world.scenario.drive.horizon
-        stage = f"{self._environment(sensor)}: {case}"
+    def _drive(self, label: str, case: str, run: int, count: int, look: object) -> None:
+        """Drive once, and keep the drive."""
+        world, scenario = self.world, self.world.scenario
+        horizon = scenario.drive.horizon
 
         def on_step(step: int) -> None:
-            done = first_run * horizon + step + 1
-            self.on_progress(stage, done, batches * horizon, "")
+            done = run * horizon + step + 1
+            self.on_progress(f"{label}: {case}", done, count * horizon, "")
 
-        loop = self.world.loop(sensor)
-        trajectory = simulate(loop, loop.initial(initial), horizon, on_step)
-        drives = self._records(trajectory, self._environment(sensor), case, first_run)
-        self.kept.add(drives, self.effort())
-        self.drives += drives
+        found = drive(
+            self._environment(label, look),
+            world.policy,
+            world.route,
+            world.initial[run % len(world.initial)],
+            scenario.seed + run,
+            horizon,
+            on_step,
+            case,
+            run,
+            label,
+        )
+        self.renders += 0 if label == SURROGATE else len(found.states)
+        self.kept.add(found, self.effort())
+        self.drives.append(found)
 
-    def _records(
-        self, trajectory: Trajectory, environment: str, case: str, first_run: int
-    ) -> list[Drive]:
-        states = trajectory.states_numpy()[..., :3]  # vehicles may have more
-        controls = trajectory.controls_numpy()
-        world = self.world
-        common: dict[str, Any] = {
-            "environment": environment,
-            "route": world.route.name,
-            "case": case,
-            "seed": world.scenario.seed,
-            "time_s": world.scenario.vehicle.dt_s
-            * np.arange(1, trajectory.horizon + 1),
-        }
-        return [
-            Drive(
-                run=first_run + i,
-                states=states[i],
-                controls=controls[i],
-                cross_track_m=world.route.cross_track_numpy(states[i, 1:]),
-                **common,
-            )
-            for i in range(len(states))
-        ]
-
-    def _environment(self, sensor: AbstractSensor) -> str:
-        return "surrogate" if sensor is self.world.surrogate else "deployment"
+    def _environment(self, label: str, look: object) -> AbstractEnvironment:
+        """Open an environment, unless it is; another look may need another one."""
+        key = look if self.world.builds_in(label) else label
+        if self._opened is None or self._opened[0] != key:
+            self.close()
+            self._opened = key, self.world.open(label)
+        return self._opened[1]

@@ -133,7 +133,8 @@ class Checkpointed(AbstractAdjoint):
                 seen = sensor.observe(drive.states[index], index)
                 kept.append((sensor.keep(seen), memory))
                 if index + 1 < end:
-                    _, memory = loop.policy.step(seen.image, loop.goal, memory)
+                    image = loop.shown(seen)
+                    _, memory = loop.policy.step(image, loop.goal, memory)
                 del seen
             for index in reversed(range(start, end)):
                 view, memory = kept.pop()

@@ -11,8 +11,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Name, Whole, checked
 from mi_nerfattack.vehicle.route.route import Route
 
-#: In the order of documents and plots; others follow, by name. `metrics.json` has the
-#: first two alone.
+#: In the order of documents and plots; others follow, by name.
 ENVIRONMENTS = (
     "surrogate",
     "deployment",

@@ -1,4 +1,9 @@
-"""The closed loop: sensor, policy, vehicle, sensor, ..."""
+"""The closed loop: sensor, policy, vehicle, sensor, ...
+
+A policy gets images of eight bits, as a camera gives them and every environment does:
+``round(255 x) / 255`` of what the sensor renders. The derivative of this rounding is
+taken as 1 (*straight through*); its true one is 0 almost everywhere.
+"""
 
 from __future__ import annotations
 
@@ -35,6 +40,8 @@ class ClosedLoop:
         substeps: integration steps a control period.
         delay: integration steps until a control takes effect; before the first one
             does, the control is 0.
+        eight_bit: round images as a camera does; without it the policy gets what the
+            sensor renders, and derivatives equal finite differences.
     """
 
     sensor: AbstractSensor
@@ -45,6 +52,7 @@ class ClosedLoop:
     dt: float
     substeps: int = 1
     delay: int = 0
+    eight_bit: bool = True
     transition: Transition = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -56,6 +64,17 @@ class ClosedLoop:
     def initial(self, poses: np.ndarray) -> Any:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""
         return to_state(self.dynamics.extend(np.atleast_2d(poses)))
+
+    def shown(self, observation: Observation) -> Any:
+        """Return the image that the policy gets, (n, height, width, 3), evaluated."""
+        image = observation.image
+        if not self.eight_bit:
+            return image
+        # a literal would be multiplied by its inverse, which is off in the last bit
+        most = dr.opaque(type(image.array), 255)
+        rounded = type(image)(dr.round(most * image.array) / most, image.shape)
+        dr.eval(rounded)
+        return rounded
 
 
 @dataclass(frozen=True)
@@ -149,7 +168,7 @@ def simulate(
     for index in range(horizon):
         seen = loop.sensor.observe(states[-1], index)
         step = Step(index, states[-1], seen, memory)
-        control, memory = loop.policy.step(seen.image, loop.goal, memory)
+        control, memory = loop.policy.step(loop.shown(seen), loop.goal, memory)
         controls.append(dr.value_t(type(initial))(control))
         older, newer = loop.transition.controls(controls, index, initial)
         states.append(loop.transition.advance(states[-1], older, newer))

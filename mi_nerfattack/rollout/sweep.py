@@ -137,7 +137,7 @@ class Sweep:
         d_state, *d_pair = loop.transition.vjp(step.state, older, newer, d_after)
         for source, value in zip(loop.transition.sources(index), d_pair, strict=True):
             self.pending[source] = self.pending.get(source, 0) + value
-        image = step.observation.image
+        image = loop.shown(step.observation)
         none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
         dr.eval(cotangent)
@@ -224,10 +224,11 @@ def forward(
         state = drive.states[index]
         seen = sensor.observe(state, index)
         t_image = sensor.jvp(seen, state, tangent if attached else None)
+        image = loop.shown(seen)
         t_control, t_memory = loop.policy.step_jvp(
-            seen.image, loop.goal, memory, t_image, t_memory
+            image, loop.goal, memory, t_image, t_memory
         )
-        _, memory = loop.policy.step(seen.image, loop.goal, memory)
+        _, memory = loop.policy.step(image, loop.goal, memory)
         controls.append(dr.value_t(type(state))(t_control))
         pair = loop.transition.controls(drive.controls[: index + 1], index, state)
         t_pair = loop.transition.controls(controls, index, state)

@@ -73,7 +73,8 @@ class NamedFile:
     def content(self) -> dict[str, str]:
         """Return the name without its folder, and the SHA-256 of the content.
 
-        An XML file counts with the files that it and included ones name. Of
+        An XML file counts with the files that it and included ones name; a folder with
+        all that lies in it. Of
         an installed module, its own source counts; the name where it has none.
 
         Raises:
@@ -84,6 +85,8 @@ class NamedFile:
             raw = b"" if source is None else _read(source)
             digest = hashlib.sha256(raw + self.name.encode())
             return {"file": self.name, "sha256": digest.hexdigest()}
+        if self.path.is_dir():
+            return {"file": self.path.name, "sha256": _folder_digest(self.path)}
         raw = _read(self.path)
         digest = hashlib.sha256(raw)
         digest.update(self.function.encode())
@@ -150,6 +153,14 @@ def _files_in(xml: bytes, folder: Path, seen: set[Path]) -> Iterator[Path]:
             yield inner
             if inner.suffix.lower() == ".xml":
                 yield from _files_in(_read(inner), folder, seen)
+
+
+def _folder_digest(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        name = path.relative_to(folder).as_posix()
+        digest.update(f"{name} {files.sha256(path)}\n".encode())
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> bytes:

@@ -25,6 +25,12 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.scenario.attack import AttackSection
+from mi_nerfattack.scenario.deployment import (
+    SURROGATE,
+    DeploymentSections,
+    RenderedDeployment,
+    labelled,
+)
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import PilotNetSection, PolicySection
@@ -135,12 +141,6 @@ class BaselineSection(Section):
     kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
 
 
-class DeploymentSection(Section):
-    """The path-traced scene."""
-
-    spp: Count = 16
-
-
 class Scenario(Section):
     """A complete scenario."""
 
@@ -155,7 +155,7 @@ class Scenario(Section):
     objective: ObjectiveSection = ObjectiveSection()
     attack: AttackSection = AttackSection()
     baseline: BaselineSection = BaselineSection()
-    deployment: DeploymentSection = DeploymentSection()
+    deployment: DeploymentSections = RenderedDeployment()
 
     @model_validator(mode="after")
     def _check_sections(self) -> Any:
@@ -167,7 +167,23 @@ class Scenario(Section):
             self._check_placed()
         else:
             self._check_named(self.scene.surrogate)
-        model = self.vehicle.model
+        model, sections = self.vehicle.model, labelled(self.deployment)
+        labels = [label for label, _ in sections]
+        if len(set(labels)) != len(labels) or SURROGATE in labels:
+            refuse(
+                "deployment",
+                f"environments called {labels}; give each a name of its own, which is "
+                f"not {SURROGATE}",
+            )
+        if model == "custom":
+            for label, section in sections:
+                name = section.model_dump()["environment"]
+                if name.startswith("mujoco"):
+                    refuse(
+                        "deployment",
+                        f"{label}: {name} drives a car with wheels, whose control is "
+                        "not that of a custom vehicle; take mitsuba",
+                    )
         if model in STEERED and isinstance(self.policy, PilotNetSection):
             refuse(
                 "vehicle.model",

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from mi_nerfattack.deploy.car import CAR, Car
+from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.ranges import Count, Finite, Positive, Whole
 from mi_nerfattack.scenario.named_file import AnyCode
 from mi_nerfattack.scenario.section import Kinds, Section, Trust, refuse
@@ -54,9 +57,25 @@ class AbstractVehicleSection(Section):
             InputError: a function cannot be loaded, or is no model of a vehicle.
         """
 
-    def build_integrator(self) -> AbstractIntegrator:
-        """Make the time step."""
-        return INTEGRATORS[self.integrator]()
+    def motion(self) -> Motion:
+        """Make the model with its time step; see :meth:`build`."""
+        integrator = INTEGRATORS[self.integrator]()
+        return Motion(self.build(), integrator, self.substeps, self.delay_steps)
+
+    def car(self) -> Car:
+        """Describe the car with wheels: of this width, other sizes in proportion.
+
+        A custom vehicle's says its limit alone.
+        """
+        size = self.width_m / CAR.width
+        names = ("wheelbase", "length", "track", "wheel_radius")
+        sizes = {name: size * getattr(CAR, name) for name in names}
+        sizes |= {"width": self.width_m, "mass": CAR.mass * size**3}
+        return replace(CAR, **{**sizes, **self._handling()})
+
+    @abstractmethod
+    def _handling(self) -> dict[str, Any]:
+        """Return what the model says about the car."""
 
 
 class DubinsSection(AbstractVehicleSection):
@@ -69,6 +88,9 @@ class DubinsSection(AbstractVehicleSection):
     def build(self) -> AbstractDynamics:
         """Make the model."""
         return Dubins(self.speed_ms, self.max_heading_rate)
+
+    def _handling(self) -> dict[str, Any]:
+        return {"max_control": self.max_heading_rate}
 
 
 class AckermannSection(AbstractVehicleSection):
@@ -83,6 +105,9 @@ class AckermannSection(AbstractVehicleSection):
         """Make the model."""
         steer = float(np.radians(self.max_steer_deg))
         return Ackermann(self.speed_ms, self.wheelbase_m, steer)
+
+    def _handling(self) -> dict[str, Any]:
+        return _steered(self.wheelbase_m, self.max_steer_deg)
 
 
 class AckermannRateSection(AbstractVehicleSection):
@@ -115,6 +140,9 @@ class AckermannRateSection(AbstractVehicleSection):
             self.speed_ms, self.wheelbase_m, steer, rate, self.steer_time_s
         )
 
+    def _handling(self) -> dict[str, Any]:
+        return _steered(self.wheelbase_m, self.max_steer_deg)
+
 
 class BicycleSection(AbstractVehicleSection):
     """Controlled by its steering angle, about its centre of gravity."""
@@ -131,6 +159,9 @@ class BicycleSection(AbstractVehicleSection):
         return KinematicBicycle(
             self.speed_ms, self.front_axle_m, self.rear_axle_m, steer
         )
+
+    def _handling(self) -> dict[str, Any]:
+        return _steered(self.front_axle_m + self.rear_axle_m, self.max_steer_deg)
 
 
 class CustomSection(AbstractVehicleSection):
@@ -171,6 +202,19 @@ class CustomSection(AbstractVehicleSection):
         control = type(state[0])(limit * rng.uniform(0.1, 0.5, TRIALS))
         require_model(dynamics.name, dynamics, state, control)
         return dynamics
+
+    def _handling(self) -> dict[str, Any]:
+        return {"max_control": self.control_limit}
+
+
+def _steered(wheelbase: float, max_steer_deg: float) -> dict[str, Any]:
+    steer = float(np.radians(max_steer_deg))
+    return {
+        "wheelbase": wheelbase,
+        "max_steer": steer,
+        "control_unit": "rad",
+        "max_control": steer,
+    }
 
 
 VehicleSection = Annotated[

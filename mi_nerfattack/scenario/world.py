@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.surrogate import surrogate_sensor
-from mi_nerfattack.deploy.path_traced_sensor import PathTracedSensor
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
+from mi_nerfattack.deploy.place import Place
+from mi_nerfattack.deploy.simulated import SurrogateEnvironment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.fields.splats import read_splats
@@ -25,8 +29,8 @@ from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
+from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
 from mi_nerfattack.scenario.scenario import Scenario
-from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -53,9 +57,9 @@ class World:
         route: the lane centre.
         fields: grid fields of the objects, in the scenario's order.
         surrogate: sensor in the scene's field.
-        deployment: sensor in the path-traced scene.
+        deployments: other environments, by label.
         policy: the policy under test.
-        dynamics: the vehicle.
+        motion: of the vehicle.
         objective: what an attack makes smaller.
         initial: (runs, 3) initial states, the first one nominal.
     """
@@ -64,24 +68,48 @@ class World:
     route: Route
     fields: list[GridField]
     surrogate: FieldSensor
-    deployment: PathTracedSensor
+    deployments: Mapping[str, Deployment]
     policy: AbstractPolicy
-    dynamics: AbstractDynamics
+    motion: Motion
     objective: AbstractObjective
     initial: np.ndarray
 
     def loop(self, sensor: AbstractSensor) -> ClosedLoop:
         """Close the loop through a sensor."""
-        vehicle = self.scenario.vehicle
+        motion = self.motion
         return ClosedLoop(
             sensor,
             self.policy,
             self.route.goal,
-            self.dynamics,
-            vehicle.build_integrator(),
-            vehicle.dt_s,
-            vehicle.substeps,
-            vehicle.delay_steps,
+            motion.dynamics,
+            motion.integrator,
+            self.scenario.vehicle.dt_s,
+            motion.substeps,
+            motion.delay,
+        )
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The environments that are driven in, the surrogate first."""
+        return SURROGATE, *self.deployments
+
+    def is_open_loop(self, label: str) -> bool:
+        """Whether controls have no effect in an environment."""
+        return label != SURROGATE and self.deployments[label].is_open_loop
+
+    def builds_in(self, label: str) -> bool:
+        """Whether an environment must be opened anew for objects of another look."""
+        return label != SURROGATE and self.deployments[label].builds_in
+
+    def open(self, label: str) -> AbstractEnvironment:
+        """Make an environment, with the objects as they look and stand at present."""
+        if label != SURROGATE:
+            return self.deployments[label].open(self.surrogate.objects)
+        vehicle = self.scenario.vehicle
+        car = vehicle.car()
+        rest = vehicle.dt_s, car.max_control, car.control_unit
+        return SurrogateEnvironment(
+            self.surrogate, KinematicVehicle(self.motion, *rest)
         )
 
     def appearance(self) -> Appearance:
@@ -90,7 +118,7 @@ class World:
         return Appearance(textures, self.surrogate.offsets())
 
     def show(self, appearance: Appearance) -> None:
-        """Give the objects their textures and places, in both environments."""
+        """Give the objects their textures and places."""
         self.set_textures(appearance.textures)
         self.surrogate.set_offsets(appearance.offsets)
 
@@ -111,21 +139,31 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         InputError: a file is missing or wrong.
     """
     place, surrogate = scenario.scene, build_surrogate(scenario)
-    posed = surrogate.objects
     camera, mount = surrogate.camera, surrogate.mount
     route = Route.from_file(place.routes.file, place.route)
-    dynamics = scenario.vehicle.build()
-    objective = scenario.objective.build(scenario, route, dynamics)
-    xml = load_scene(place.deployment.file)
-    spp, seed = scenario.deployment.spp, scenario.seed
+    motion = scenario.vehicle.motion()
+    speed = getattr(motion.dynamics, "speed", route.speed_ms)
+    route = replace(route, speed_ms=speed)
+    objective = scenario.objective.build(scenario, route, motion.dynamics)
+    where = Place(
+        scene=place.deployment.file,
+        field=None,
+        routes=place.routes.file,
+        objects=(),
+        camera=camera,
+        mount=mount,
+        period=scenario.vehicle.dt_s,
+        car=scenario.vehicle.car(),
+        motion=motion,
+    )
     return World(
         scenario,
         route,
         surrogate.fields,
         surrogate,
-        PathTracedSensor(xml, posed, camera, mount, spp, seed),
+        deployments(scenario.deployment, where),
         policy,
-        dynamics,
+        motion,
         objective,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )

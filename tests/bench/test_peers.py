@@ -251,7 +251,7 @@ def test_the_peer_drives_and_differentiates_as_we_do(rng, scene, grid, lookup):
     item = PosedField(blob(rng, peak=4.0), POSE)
     sensor = FieldSensor(PosedField(scene.field()), [item], CAMERA, MOUNT, stop=STOP)
     policy = TorchPolicy(Gain(), preprocess=Preprocess(STAGES))
-    loop = ClosedLoop(sensor, policy, 0, Dubins(5.0, 1.5), RK4(), 0.1)
+    loop = ClosedLoop(sensor, policy, 0, Dubins(5.0, 1.5), RK4(), 0.1, eight_bit=False)
     rollout = Rollout(loop, StageSum(CrossTrackDeviation(ROUTE, 0.05)), HORIZON)
     evaluation = rollout.run(loop.initial(INITIAL))
     expected = rollout.gradient(evaluation).textures[0].numpy()

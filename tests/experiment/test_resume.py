@@ -64,7 +64,7 @@ def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
 
     document = job(folder, output, on_progress=watch).run(resume=True)
     driven = [line for line in seen if line[2] != "kept"]
-    assert driven == [("deployment: gradient", k, "") for k in (1, 2)]
+    assert driven == [("deployment: gradient", k, "") for k in (1, 2, 3, 4)]
     kept = {stage for stage, _, remark in seen if remark == "kept"}
     assert kept == {
         f"{place}: {stage}"

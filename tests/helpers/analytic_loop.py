@@ -338,6 +338,7 @@ def make_pair(
         dt,
         substeps,
         delay,
+        eight_bit=False,  # as the twin, whose derivatives are exact
     )
     return loop, TorchLoop(vehicle, integrator, module, goal, dt, substeps, delay)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mi_nerfattack.deploy import CameraFrame
-from mi_nerfattack.deploy.car import CAR
-from mi_nerfattack.deploy.registry import kinematic_vehicle
+from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.simulated import SimulatedEnvironment
 from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.vehicle.dynamics import Dubins
 
 
 class BlankView(AbstractView):
@@ -31,6 +31,6 @@ class BlankView(AbstractView):
 
 
 def blank_environment(mount: CameraMount | None = None) -> SimulatedEnvironment:
-    vehicle = kinematic_vehicle(CAR, 0.1)
-    mount = mount or CameraMount()
+    motion, mount = Motion(Dubins(max_heading_rate=1.5)), mount or CameraMount()
+    vehicle = KinematicVehicle(motion, 0.1, 1.5)
     return SimulatedEnvironment("blank", vehicle, BlankView(), mount, 0.1)

@@ -76,7 +76,13 @@ def make_loop(
     )
     policy = TorchPolicy(SmoothPolicy())
     loop = ClosedLoop(
-        sensor, policy, 0, Dubins(SPEED, LIMIT), integrator or ExplicitEuler(), DT
+        sensor,
+        policy,
+        0,
+        Dubins(SPEED, LIMIT),
+        integrator or ExplicitEuler(),
+        DT,
+        eight_bit=False,  # derivatives are compared with finite differences
     )
     return loop, item
 

@@ -119,4 +119,5 @@ def close_loop(sensor: Any) -> ClosedLoop:
     """Drive by the toy's policy."""
     policy = TorchPolicy(toy.SmoothPolicy())
     vehicle = Dubins(toy.SPEED, toy.LIMIT)
-    return ClosedLoop(sensor, policy, 0, vehicle, ExplicitEuler(), toy.DT)
+    parts = sensor, policy, 0, vehicle, ExplicitEuler(), toy.DT
+    return ClosedLoop(*parts, eight_bit=False)  # compared with finite differences

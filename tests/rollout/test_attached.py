@@ -6,6 +6,8 @@ Differences are small, because one ray a pixel sees another point after a millir
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -67,7 +69,9 @@ def test_one_frame(world: World) -> None:
 
 def test_the_loop(world: World) -> None:
     """Five periods from the scenario's initial poses, in five directions."""
-    loop, poses = world.loop(world.surrogate), world.initial
+    # steps of eight bits have no finite differences
+    loop = replace(world.loop(world.surrogate), eight_bit=False)
+    poses = world.initial
     rollout = Rollout(loop, world.objective, 5, attached=True)
     gradient = rollout.gradient(rollout.run(loop.initial(poses)))
     by_state = np.array(gradient.initial).T[:, :3]

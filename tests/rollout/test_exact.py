@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,7 @@ from helpers.rollouts import (
 from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.reduction import Worst
+from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.rollout.sweep import StepRecorder
 from mi_nerfattack.rollout.torch_rollout import torch_rollout
 from mi_nerfattack.vehicle.state import to_state
@@ -55,6 +57,50 @@ def test_adjoints_are_autograd(
     value, expected = expected_gradient(loop, twin, initial, horizon, attached)
     assert evaluation.value == pytest.approx(value, rel=1e-12)
     assert_close(flat(found), expected)
+
+
+class Rounded(torch.nn.Module):
+    """A policy behind a camera of eight bits, differentiated straight through."""
+
+    def __init__(self, policy):
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, image, goal):
+        rounded = (255 * image).round() / 255
+        return self.policy(image + (rounded - image).detach(), goal)
+
+
+@pytest.mark.parametrize("name", ADJOINTS)
+def test_images_of_eight_bits_are_differentiated_straight_through(name, rng):
+    exact, twin = analytic.make_pair()
+    loop, twin.module = replace(exact, eight_bit=True), Rounded(twin.module)
+    initial = loop.dynamics.extend(analytic.random_poses(3))
+    rollout = Rollout(loop, Wave(), 7, adjoint=ADJOINTS[name], attached=True)
+    evaluation = rollout.run(to_state(initial))
+    found = rollout.gradient(evaluation, offsets=True)
+    value, expected = expected_gradient(loop, twin, initial, 7, True)
+    assert evaluation.value == pytest.approx(value, rel=1e-12)
+    assert_close(flat(found), expected)
+    unrounded = replace(rollout, loop=exact).run(to_state(initial)).value
+    assert abs(value - unrounded) > 1e-5  # the rounding is seen
+    t_initial = rng.normal(size=initial.shape)
+    t_textures = [rng.normal(size=t.shape) for t in loop.sensor.textures()]
+    tangents = [analytic.tensor(t) for t in t_textures]
+    forward = rollout.tangent(evaluation, tangents, to_state(t_initial))
+    pairs = zip(found.textures, t_textures, strict=True)
+    inner = sum((np.array(a) * b).sum() for a, b in pairs)
+    inner += (np.array(found.initial).T * t_initial).sum()
+    assert forward == pytest.approx(inner, rel=1e-9)
+
+
+def test_images_of_eight_bits_are_those_of_files():
+    loop = replace(analytic.make_pair()[0], eight_bit=True)
+    levels = np.arange(256, dtype=np.uint8)
+    shifts = np.array([-0.49, 0.0, 0.49])[:, None] / 255
+    image = mi.TensorXf((levels / 255 + shifts).astype(np.float32))
+    shown = np.array(loop.shown(Observation(image)))
+    assert (shown == np.divide(levels, 255, dtype=np.float32)).all()
 
 
 def test_a_hundred_periods():

@@ -76,7 +76,7 @@ def test_models_of_the_section():
     default = vehicle()
     assert default.build() == Dubins(5.0, 1.5)
     assert default.substeps == 1 and default.delay_steps == 0
-    assert default.build_integrator() == RK4()
+    assert default.motion().integrator == RK4()
     degree = np.pi / 180
 
     def build(model, **keys):

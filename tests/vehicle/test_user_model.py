@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -13,7 +14,6 @@ from helpers.states import row64, state64
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import StageSum
 from mi_nerfattack.vehicle import (
     RK4,
@@ -76,9 +76,7 @@ def test_own_model_equals_ours(framework, count, integrator):
 def test_whole_loop_with_an_own_model(framework):
     """The loop's gradient is autograd's through the whole of the loop in torch."""
     ours, twin = analytic.make_pair("ackermann_rate", "rk4", 2, 1)
-    loop = ClosedLoop(
-        ours.sensor, ours.policy, 1, OWN[framework], RK4(), 0.1, substeps=2, delay=1
-    )
+    loop = replace(ours, dynamics=OWN[framework])
     poses = analytic.random_poses(3)
     initial = torch.tensor(OWN[framework].extend(poses), requires_grad=True)
     texture = torch.tensor(loop.sensor.textures()[0].numpy(), requires_grad=True)

@@ -80,7 +80,7 @@ def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
         ("overhead.png", "all drives from above"),
         ("strip.png", "what the policy sees"),
         ("attribution*.png", "when and where the failure is made"),
-        ("metrics.json, steps.csv", "the numbers"),
+        ("metrics.json, *.csv", "the numbers"),
         ("objects/", "the attacked fields"),
         ("frames/", "EXR frames with layers"),
     ):

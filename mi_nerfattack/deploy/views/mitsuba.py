@@ -16,7 +16,6 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March
 
 #: Samples of a pixel that are added up in one order whatever the threads do.
 _PART = 16
@@ -55,7 +54,7 @@ class MitsubaView(AbstractView):
         rgb, depth = self.linear(camera_to_world, seed)
         image = linear_to_uint8(rgb)
         pose = np.array(camera_to_world, np.float64)
-        return self._paster.paste(CameraFrame(image, depth, pose))
+        return self._paster.paste(CameraFrame(image, depth, pose, rgb))
 
     def linear(
         self, camera_to_world: np.ndarray, seed: int
@@ -79,10 +78,6 @@ class MitsubaView(AbstractView):
         rgb = sum(w * view.rgb for w, view in zip(weights, views, strict=True))
         gain = np.float32(2.0**self.exposure_ev)
         return np.asarray(gain * rgb), views[0].depth.copy()
-
-    def march(self, camera_to_world: np.ndarray) -> list[March]:
-        """March each object along the rays of one image."""
-        return self._paster.march(camera_to_world)
 
     def show(self, objects: Sequence[PosedField]) -> None:
         """Paste other fields."""

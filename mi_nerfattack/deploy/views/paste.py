@@ -82,8 +82,14 @@ class Paster:
         if not self.objects:
             return frame
         layers = self.march(frame.camera_to_world)
-        image, depth = paste_layers(frame.image, frame.depth, layers, linear_to_uint8)
-        return CameraFrame(image, depth, frame.camera_to_world)
+        linear, pose = frame.linear, frame.camera_to_world
+        if linear is None:
+            at = frame.image, frame.depth, layers
+            image, depth = paste_layers(*at, linear_to_uint8)
+        else:
+            linear, depth = paste_layers(linear, frame.depth, layers)
+            image = linear_to_uint8(linear)
+        return CameraFrame(image, depth, pose, linear, frame, layers)
 
     def _record(self, rays: Rays) -> list[March]:
         return [march(posed, rays, STOP) for posed in self.objects]

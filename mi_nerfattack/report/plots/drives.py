@@ -118,6 +118,44 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         _legend_below(figure, handles)
 
 
+def control_change(
+    path: str | Path, drives: Sequence[Drive], base: Drive, unit: str
+) -> None:
+    """Plot by how much controls differ from those of a drive, step by step.
+
+    Random textures appear as the range over their runs and its mean.
+
+    Args:
+        path: PNG file.
+        drives: of as many steps as `base`.
+        base: the unperturbed drive.
+        unit: of the control.
+    """
+    with chart(path, 3.0) as figure:
+        axis = figure.subplots()
+        changes = {
+            case: np.array(
+                [d.controls - base.controls for d in drives if d.case == case]
+            )
+            for case in ("random", "gradient")
+        }
+        random = changes["random"]
+        if len(random):
+            band = {"facecolor": _STYLES["random"]["color"], "alpha": 0.25}
+            axis.fill_between(base.time_s, random.min(0), random.max(0), **band)
+            style = _style("random", linewidth=1.6, label="random texture: range, mean")
+            axis.plot(base.time_s, random.mean(0), **style)
+        for row in changes["gradient"]:
+            style = _style("gradient", label=_LABELS["gradient"])
+            axis.plot(base.time_s, row, **style)
+        axis.axhline(0, color=_STYLES["unperturbed"]["color"], label="unperturbed")
+        axis.set_title(f"Change of control: {base.environment}", loc="left")
+        axis.set_xlabel("time (s)")
+        axis.set_ylabel(f"change of control ({unit})")
+        axis.grid(alpha=0.25)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+
+
 def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
     """Plot an attack's objective and mean cross-track error per iteration.
 

@@ -30,33 +30,35 @@ def first_person_strip(
 
     Args:
         path: PNG or JPEG file.
-        rows: frames of each row by label, sRGB, uint8, (H, W, 3), all of one size; a
-            line break in a label starts another line.
+        rows: frames of each row by label, sRGB, uint8, (H, W, 3), those of a row of
+            one size; a line break in a label starts another line.
         times_s: time of each column, seconds.
     """
-    height, width, _ = next(iter(rows.values()))[0].shape
+    sizes = [frames[0].shape[:2] for frames in rows.values()]
+    width = max(width for _, width in sizes)
     font = _font()
     label_px = 2 * GAP_PX + max(_text_width(font, label) for label in rows)
     header_px = FONT_PX + 2 * GAP_PX
-    column_px, row_px = SCALE * width + GAP_PX, SCALE * height + GAP_PX
-    size = (label_px + column_px * len(times_s), header_px + row_px * len(rows))
+    column_px, row_px = SCALE * width + GAP_PX, [SCALE * h + GAP_PX for h, _ in sizes]
+    size = (label_px + column_px * len(times_s), header_px + sum(row_px))
     sheet = Image.new("RGB", size, _BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     for column, time in enumerate(times_s):
         centre = label_px + column * column_px + SCALE * width // 2
         text = f"{time:.1f} s"
         draw.text((centre, header_px // 2), text, _INK, font, anchor="mm")
-    for row, (label, frames) in enumerate(rows.items()):
-        top = header_px + row * row_px
-        middle = (GAP_PX, top + SCALE * height // 2)
+    top = header_px
+    for (label, frames), height in zip(rows.items(), row_px, strict=True):
+        middle = (GAP_PX, top + height // 2)
         draw.text(middle, label, _INK, font, anchor="lm", spacing=GAP_PX)
         for column in range(len(times_s)):
             left = label_px + column * column_px
             if column < len(frames):
                 sheet.paste(_enlarged(frames[column]), (left, top))
             else:
-                corner = (left + SCALE * width - 1, top + SCALE * height - 1)
+                corner = (left + SCALE * width - 1, top + height - GAP_PX - 1)
                 draw.rectangle(((left, top), corner), fill=_ABSENT)
+        top += height
     files.write_image(path, np.asarray(sheet))
 
 

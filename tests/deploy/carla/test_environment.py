@@ -16,7 +16,7 @@ from helpers.small_fields import homogeneous
 from mi_nerfattack.deploy.carla.drivers import Axles, KinematicDriver, PhysicalDriver
 from mi_nerfattack.deploy.carla.environment import CarlaEnvironment
 from mi_nerfattack.deploy.carla.session import CarlaServer, CarlaSession, load_client
-from mi_nerfattack.deploy.kinematic import KinematicVehicle
+from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
@@ -27,7 +27,6 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.dynamics import Dubins
-from mi_nerfattack.vehicle.integrators import RK4
 from mi_nerfattack.vehicle.route.route import Route
 
 CAMERA = from_fov(8, 6, 90.0)
@@ -38,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def kinematic() -> KinematicDriver:
-    return KinematicDriver(KinematicVehicle(Dubins(), RK4(), PERIOD, 1.5))
+    return KinematicDriver(KinematicVehicle(Motion(Dubins()), PERIOD, 1.5))
 
 
 def make(server: Server, driver=None, where=None, **more) -> CarlaEnvironment:
@@ -54,7 +53,7 @@ def make(server: Server, driver=None, where=None, **more) -> CarlaEnvironment:
 
 
 def test_a_kinematic_drive_is_our_model_and_its_camera():
-    server, twin = Server(), KinematicVehicle(Dubins(), RK4(), PERIOD, 1.5)
+    server, twin = Server(), KinematicVehicle(Motion(Dubins()), PERIOD, 1.5)
     environment = make(server, kinematic())
     pose = np.array([5.0, 1.0, 0.2])
     frame = environment.reset(STRAIGHT, pose)

@@ -1,0 +1,91 @@
+"""What the policy saw: frames of drives, as a strip and as EXR files with layers.
+
+The first unperturbed and the first attacked drive of each environment are driven again
+by their recorded controls, which gives the frames that the policy saw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.evaluation.metrics import environment_order
+from mi_nerfattack.io import exr, files
+from mi_nerfattack.report.plots.strip import first_person_strip
+from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.world import Appearance, World
+
+STRIP_FRAMES = 6
+EXR_FRAMES = 3
+
+
+def write_pictures(
+    output: Path, world: World, drives: Iterable[Drive], looks: Mapping[str, Appearance]
+) -> None:
+    """Write ``strip.png`` and ``frames/``.
+
+    Args:
+        output: the run folder.
+        world: what was driven in; its textures are changed.
+        drives: all drives.
+        looks: how the objects look and where they stand, per case.
+    """
+    files.make_folder(output / "frames")
+    rows: dict[str, list[np.ndarray]] = {}
+    nominal = [d for d in drives if d.run == 0 and d.case in looks]
+    nominal.sort(key=lambda d: (environment_order(d.environment), d.case))
+    longest = max(nominal, key=lambda d: len(d.controls))
+    columns = _steps(longest, STRIP_FRAMES)
+    for drive in nominal:
+        world.show(looks[drive.case])
+        environment = world.open(drive.environment)
+        try:
+            row = rows[f"{drive.environment}\n{drive.case}"] = []
+            for step, frame in _again(environment, world, drive):
+                if step in columns:
+                    row.append(frame.image)
+                if step in _steps(drive, EXR_FRAMES):
+                    _write_frame(output / "frames", world, drive, step, frame)
+        finally:
+            environment.close()
+    times = [step * world.scenario.vehicle.dt_s for step in columns]
+    first_person_strip(output / "strip.png", rows, times)
+
+
+def _steps(drive: Drive, count: int) -> list[int]:
+    last = len(drive.controls) - 1
+    return np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+
+
+def _again(
+    environment: AbstractEnvironment, world: World, drive: Drive
+) -> Iterator[tuple[int, CameraFrame]]:
+    """Yield the frames of a drive, each with the index of the control it led to."""
+    frame = environment.reset(world.route, drive.states[0], drive.seed)
+    for step, control in enumerate(drive.controls):
+        yield step, frame
+        if step + 1 < len(drive.controls):
+            frame = environment.step(float(control))
+
+
+def _write_frame(
+    folder: Path, world: World, drive: Drive, step: int, frame: CameraFrame
+) -> None:
+    names = [item.id for item in world.scenario.objects]
+    metadata = {
+        "scenario": world.scenario.name,
+        "environment": drive.environment,
+        "case": drive.case,
+        "step": str(step),
+        "camera_to_world": " ".join(f"{v:.9g}" for v in frame.camera_to_world.ravel()),
+        "camera": str(world.surrogate.camera),
+    }
+    # path-traced light sources may exceed the range of half precision
+    half = drive.environment == SURROGATE
+    layers = frame.layers(["object"] if len(names) == 1 else names)
+    name = f"{drive.environment}_{drive.case}_{step:04d}.exr"
+    exr.write_layers(folder / name, layers, metadata, half)

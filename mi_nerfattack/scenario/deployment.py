@@ -1,0 +1,173 @@
+"""The tables ``[deployment]``: environments in which an attack is verified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PlainValidator, SerializeAsAny, TypeAdapter, ValidationInfo
+
+from mi_nerfattack.deploy.built_in import make_built_in
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.place import Conditions, Place
+from mi_nerfattack.deploy.registry import make_environment
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.ranges import Count, Finite
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenario.named_file import File
+from mi_nerfattack.scenario.section import Kinds, Section
+
+#: What the environment of attacks is called, and the deployment without a name.
+SURROGATE, DEPLOYMENT = "surrogate", "deployment"
+
+Label = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
+Sky = Literal["day", "morning", "noon", "evening", "overcast"]
+Objects = Literal["pasted", "built-in"]
+
+
+class AbstractDeploymentSection(Section):
+    """What all have: a name, under which results stand."""
+
+    name: Label | None = None
+
+    def place(self, place: Place) -> Place:
+        """Add what this environment needs of a place."""
+        return place
+
+
+class RenderedDeployment(AbstractDeploymentSection):
+    """Images by Mitsuba; `mujoco` drives a car with wheels."""
+
+    environment: Literal["mitsuba", "mujoco"] = "mitsuba"
+    spp: Count = 16
+    sky: Sky = "day"
+    exposure_ev: Finite = 0.0
+    objects: Objects = "pasted"
+
+
+class RasterisedDeployment(AbstractDeploymentSection):
+    """Images by MuJoCo, and its car with wheels."""
+
+    environment: Literal["mujoco_gl"]
+    sky: Sky = "day"
+    exposure_ev: Finite = 0.0
+    objects: Objects = "pasted"
+
+
+class CarlaDeployment(AbstractDeploymentSection):
+    """A running CARLA server; experimental."""
+
+    environment: Literal["carla"]
+    sky: Sky = "day"
+    exposure_ev: Finite = 0.0
+    server: str = "127.0.0.1:2000"  # HOST:PORT or HOST:PORT/TOWN
+
+    def place(self, place: Place) -> Place:
+        """Name the server."""
+        return replace(place, server=self.server)
+
+
+class ReplayDeployment(AbstractDeploymentSection):
+    """A recorded drive, in which controls have no effect."""
+
+    environment: Literal["replay"]
+    recording: File  # folder, video or MCAP log
+
+    def place(self, place: Place) -> Place:
+        """Name the recording."""
+        return replace(place, recording=self.recording.file)
+
+
+_KINDS = Annotated[
+    RenderedDeployment | RasterisedDeployment | CarlaDeployment | ReplayDeployment,
+    Kinds("environment"),
+]
+_ONE: TypeAdapter[Any] = TypeAdapter(_KINDS)
+_SEVERAL: TypeAdapter[Any] = TypeAdapter(
+    Annotated[tuple[_KINDS, ...], Field(min_length=1)]
+)
+
+
+def _read(value: Any, info: ValidationInfo) -> Any:
+    kind = _SEVERAL if isinstance(value, tuple) else _ONE
+    return kind.validate_python(value, context=info.context)
+
+
+#: A table, or an array of tables.
+DeploymentSections = Annotated[
+    SerializeAsAny[AbstractDeploymentSection]
+    | tuple[SerializeAsAny[AbstractDeploymentSection], ...],
+    PlainValidator(_read),
+]
+
+
+def labelled(
+    given: AbstractDeploymentSection | Sequence[AbstractDeploymentSection],
+) -> list[tuple[str, AbstractDeploymentSection]]:
+    """Return each section with its label.
+
+    A section without a name is called by its environment; "deployment" if it is alone.
+    """
+    sections = [given] if isinstance(given, AbstractDeploymentSection) else given
+    alone = len(sections) == 1
+    return [
+        (item.name or (DEPLOYMENT if alone else item.model_dump()["environment"]), item)
+        for item in sections
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Deployment:
+    """An environment that can be opened with objects in it.
+
+    Attributes:
+        environment: key of `deploy.registry.ENVIRONMENTS`.
+        place: where.
+        conditions: of light and camera.
+        builds_in: objects become geometry of the scene, so that those of another look
+            need another environment; otherwise they are shown as fields.
+    """
+
+    environment: str
+    place: Place
+    conditions: Conditions
+    builds_in: bool
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether controls have no effect."""
+        return self.environment == "replay"
+
+    def open(self, objects: Sequence[PosedField]) -> AbstractEnvironment:
+        """Make the environment, objects as they look and stand at present."""
+        if self.builds_in:
+            grids = [
+                (p.field, p.placed) for p in objects if isinstance(p.field, GridField)
+            ]
+            built_in = tuple(make_built_in(*item) for item in grids)
+            conditions = replace(self.conditions, built_in=built_in)
+            return make_environment(self.environment, self.place, conditions)
+        environment = make_environment(self.environment, self.place, self.conditions)
+        environment.show(objects)
+        return environment
+
+
+def deployments(
+    given: AbstractDeploymentSection | Sequence[AbstractDeploymentSection],
+    place: Place,
+) -> Mapping[str, Deployment]:
+    """Return the deployments of a scenario by label, in its order.
+
+    Args:
+        given: their sections.
+        place: where the scenario drives.
+    """
+    found = {}
+    for label, section in labelled(given):
+        values = section.model_dump()
+        names = ("sky", "exposure_ev", "spp")
+        conditions = Conditions(**{n: values[n] for n in names if n in values})
+        name, builds_in = values["environment"], values.get("objects") == "built-in"
+        found[label] = Deployment(name, section.place(place), conditions, builds_in)
+    return found
