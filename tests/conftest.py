@@ -47,13 +47,25 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(autouse=True)
-def seeded() -> None:
-    """Give every test the same random numbers, whatever ran before it."""
+def seed_all() -> None:
+    """Give what follows the same random numbers, whatever ran before it."""
     random.seed(SEED)
     np.random.seed(SEED)
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(SEED)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """Seed every test."""
+    seed_all()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef) -> None:
+    """Seed what tests share too: it is made before `seeded` of the first of them."""
+    if fixturedef.scope != "function":
+        seed_all()
 
 
 @pytest.fixture

@@ -85,7 +85,7 @@ class NamedFile:
             raw = b"" if source is None else _read(source)
             digest = hashlib.sha256(raw + self.name.encode())
             return {"file": self.name, "sha256": digest.hexdigest()}
-        if self.path.is_dir():
+        if os.path.isdir(self.path):  # never raises; Path.is_dir may
             return {"file": self.path.name, "sha256": _folder_digest(self.path)}
         raw = _read(self.path)
         digest = hashlib.sha256(raw)

@@ -270,14 +270,14 @@ def test_exposure_needs_images_without_alpha():
 
 
 def test_poses_are_corrected():
-    images, depth = sphere_views(16, alpha=False)
+    images, _ = sphere_views(48)  # many right ones hold the field
     rng = np.random.default_rng(0)
     wrong = images.camera_to_world.copy()
     wrong[1:8, :3, 3] += rng.normal(0, 0.15, (7, 3))
     moved = replace(images, camera_to_world=wrong)
-    settings = options(steps=400, poses=True, camera_rate=0.2)
+    settings = options(steps=400, poses=True, camera_rate=0.1)
     result = fit_ngp(moved, *BOX, TINY_NGP, settings, None, step_m=0.05, cone=0.0)
-    fitted = [i for i in range(16) if i % 8]
+    fitted = [i for i in range(48) if i % 8]
     true = images.camera_to_world[fitted]
 
     def off_axis(poses: np.ndarray) -> float:
@@ -286,4 +286,4 @@ def test_poses_are_corrected():
         return float(np.linalg.norm(np.cross(-eye, axis), axis=1)[:7].mean())
 
     assert off_axis(true) < 1e-6
-    assert off_axis(result.poses) < 0.5 * off_axis(wrong[fitted])
+    assert off_axis(result.poses) < 0.25 * off_axis(wrong[fitted])
