@@ -13,7 +13,7 @@ import torch
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.evaluate import CLEAN, EvaluateSettings, evaluate_run
+from mi_nerfattack.evaluation.evaluate import NO_OBJECT, EvaluateSettings, evaluate_run
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -33,7 +33,7 @@ from mi_nerfattack.vehicle.route.route import load_routes
 OnStage = Callable[[str, int, int], None]
 
 ARMS = ("cloning", "DAgger")
-_FORMAT = "mi_nerfattack compared drive 1"
+_FORMAT = "mi_nerfattack compared drive 2"
 _REMEDY = "choose another folder, or remove this one"
 _LAST = LossAlone(every=1 << 30)  # the weights of the last epoch count
 
@@ -304,7 +304,15 @@ class _Drives(AbstractWork):
         number, drive_number = divmod(index, self.settings.runs)
         route = routes[number]
         rules = EvaluateSettings(objects=0, horizon=self.settings.horizon)
-        arguments = (environment, policy, route, CLEAN, drive_number, (), _no_ground)
+        arguments = (
+            environment,
+            policy,
+            route,
+            NO_OBJECT,
+            drive_number,
+            (),
+            _no_ground,
+        )
         driven = evaluate_run(*arguments, rules)
         limit = departure_limit(route.lane_width_m, rules.car_width_m)
         result = _Driven(

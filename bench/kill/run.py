@@ -44,7 +44,7 @@ _AIMS = {
 }
 # The attack is checked by itself; the attribution is a part of the results, which a
 # resumed run writes anew.
-_NOT_DRIVES = {"surrogate: attack", "surrogate: attribution", WRITING}
+_NOT_DRIVES = {"surrogate: optimisation", "surrogate: attribution", WRITING}
 _RESULTS = ("attack.json", "objects/ball.safetensors", "steps.csv")
 
 
@@ -76,7 +76,7 @@ class Life:
         """Where it was when it told the last."""
         stages = [name for name, _, _ in self.lines if name != WRITING]
         place = stages[-1] if stages else "start-up"
-        if self.done("deployment: gradient") == RUNS * HORIZON:
+        if self.done("deployment: attack") == RUNS * HORIZON:
             place = "results"
         writing = self.lines and self.lines[-1][0] == WRITING
         return f"{place}, {WRITING}" if writing else place
@@ -221,10 +221,14 @@ class Campaign:
             if aim == "drive":
                 return None if stage in _NOT_DRIVES else draw.uniform(0, 0.02)
             if aim == "results":
-                late = life.done("deployment: gradient") == RUNS * HORIZON
+                late = life.done("deployment: attack") == RUNS * HORIZON
                 return draw.uniform(0, 0.2 * whole) if late else None
             iteration, rest = divmod(done, 2 * HORIZON)
-            due = stage == "surrogate: attack" and rest == 0 and iteration % EVERY == 0
+            due = (
+                stage == "surrogate: optimisation"
+                and rest == 0
+                and iteration % EVERY == 0
+            )
             return draw.uniform(0, 0.03) if due else None
 
         return stop
@@ -240,9 +244,9 @@ class Campaign:
     def _check(self, output: Path, seen: Life, life: Life) -> None:
         """Check that a resumed process has lost no more than it may."""
         self.resumes += bool(life.lines) or life.complete
-        begun = life.first("surrogate: attack")
+        begun = life.first("surrogate: optimisation")
         if begun is not None:
-            lost = (seen.done("surrogate: attack") - begun) // (2 * HORIZON)
+            lost = (seen.done("surrogate: optimisation") - begun) // (2 * HORIZON)
             self.lost[max(lost, 0)] += 1
             if lost > EVERY:
                 self.failures.append(f"{output.name}: {lost} iterations lost")

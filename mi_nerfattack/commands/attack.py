@@ -13,7 +13,7 @@ import tyro
 class Attack:
     """Optimise the textures of a scenario's objects until the policy leaves its lane.
 
-    Drives the unperturbed scene, as many random textures as the attack has
+    Drives past the objects as they are, as many random textures as the attack has
     iterations, and the attack in the surrogate; repeats all three in the deployment
     environments that the scenario names; writes everything to a run folder.
     """

@@ -21,7 +21,7 @@ def drive(
     seed: int,
     steps: int,
     on_step: Callable[[int], None] | None = None,
-    case: str = "clean",
+    case: str = "no_object",
     run: int = 0,
     label: str | None = None,
 ) -> Drive:

@@ -28,7 +28,7 @@ from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Cases of a card, and that of the expert's drives, which is none of its own there.
-CLEAN, RANDOM_OBJECTS, EXPERT = "clean", "random_objects", "expert"
+NO_OBJECT, RANDOM, EXPERT = "no_object", "random", "expert"
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
 STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
 
@@ -68,7 +68,7 @@ class EvaluateSettings:
     @property
     def cases(self) -> tuple[str, ...]:
         """Names of the cases."""
-        return (CLEAN, RANDOM_OBJECTS) if self.objects else (CLEAN,)
+        return (NO_OBJECT, RANDOM) if self.objects else (NO_OBJECT,)
 
     def steps(self, route: Route, period: float = 0.1) -> int:
         """Return the number of steps of `period` seconds of a drive, at least 1."""
@@ -133,7 +133,7 @@ def evaluate_run(
         environment: shows nothing but its world afterwards.
         policy: drives.
         route: from its start.
-        case: "clean" or "random_objects".
+        case: "no_object" or "random".
         run: number of the drive, from 0.
         objects: stand beside the road, in turns; their own textures come back.
         ground: of the world.
@@ -143,7 +143,7 @@ def evaluate_run(
     rng = _generator(settings, route, run)
     pose, seed = random_start(route, settings, rng), int(rng.integers(2**31))
     steps = settings.steps(route, environment.period)
-    shown = objects if case == RANDOM_OBJECTS else ()
+    shown = objects if case == RANDOM else ()
     with own_textures(shown):
         posed = list(_roadside(route, shown, ground, settings, run, rng))
         environment.show(posed)
@@ -177,15 +177,15 @@ def evaluate(
         progress: called after each step of a drive.
 
     Returns:
-        {ENVIRONMENT: {ROUTE: {"clean" | "random_objects": figures}}}, see `make_card`.
+        {ENVIRONMENT: {ROUTE: {"no_object" | "random": figures}}}, see `make_card`.
 
     Raises:
         InputError: before the first drive, a lane that is too narrow for the car or a
             route too short for objects; then whatever a drive raises.
     """
-    cases = settings.cases if objects else (CLEAN,)
+    cases = settings.cases if objects else (NO_OBJECT,)
     limits = departure_limits(routes, settings.car_width_m)
-    if RANDOM_OBJECTS in cases:
+    if RANDOM in cases:
         check_roadside(routes, settings, len(objects))
     jobs = [
         (environment, route, case, run)
@@ -230,7 +230,7 @@ def make_card(
             continue
         figures = card_figures(group, limits[route])
         expert = drives.get((label, route, EXPERT))
-        if case == CLEAN and expert is not None:
+        if case == NO_OBJECT and expert is not None:
             seen = card_figures(expert, limits[route])
             names = ("n", "cross_track_mean_m", "cross_track_max_m", "drives_departed")
             figures["expert"] = {name: seen[name] for name in names}

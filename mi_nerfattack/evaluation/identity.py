@@ -16,7 +16,7 @@ from mi_nerfattack.scenario.named_file import NamedFile
 from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.vehicle.route.route import Route
 
-FORMAT = "mi_nerfattack evaluated drive 3"
+FORMAT = "mi_nerfattack evaluated drive 4"
 
 
 @dataclass(frozen=True)

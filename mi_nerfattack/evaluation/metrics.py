@@ -200,9 +200,11 @@ class _Cost(_Model):
 
 
 class _Cases(_Model):
-    unperturbed: _Case | None = None
+    no_object: _Case | None = None
+    own: _Case | None = None
     random: _Case | None = None
-    gradient: _Case | None = None
+    best_random: _Case | None = None
+    attack: _Case | None = None
 
 
 class _Document(_Model):

@@ -19,9 +19,9 @@ from mi_nerfattack.deploy.registry import environment_versions, make_environment
 from mi_nerfattack.deploy.sites import CARLA, PlaceSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
-    CLEAN,
     EXPERT,
-    RANDOM_OBJECTS,
+    NO_OBJECT,
+    RANDOM,
     EvaluateSettings,
     ExpertPolicy,
     check_roadside,
@@ -97,7 +97,7 @@ class EvaluateWork(AbstractWork):
     @property
     def cases(self) -> tuple[str, ...]:
         """Names of the cases; without objects there is one."""
-        return self.settings.cases if self.place.objects else (CLEAN,)
+        return self.settings.cases if self.place.objects else (NO_OBJECT,)
 
     @property
     def jobs(self) -> list[Job]:
@@ -151,7 +151,7 @@ class EvaluateWork(AbstractWork):
         found = Drive(
             environment=job.environment.name,
             route=job.route.name,
-            case=CLEAN if job.case == EXPERT else job.case,
+            case=NO_OBJECT if job.case == EXPERT else job.case,
             run=job.run,
             seed=kept.record.seed,
             **kept.tensors,
@@ -210,7 +210,7 @@ class Opened:
         environment = self._open(job)
         driver, case = self._policy, job.case
         if case == EXPERT:
-            driver, case = self._expert(environment, job.route), CLEAN
+            driver, case = self._expert(environment, job.route), NO_OBJECT
         return evaluate_run(
             environment,
             driver,
@@ -257,8 +257,8 @@ class Evaluation:
     """A finished evaluation.
 
     Args:
-        card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}; the figures of the case "clean"
-            have those of the expert as `expert`.
+        card: {ENVIRONMENT: {ROUTE: {CASE: figures}}}; the figures of the case
+            "no_object" have those of the expert as `expert`.
         drives: by environment, route and case ("expert" among them).
         seconds: of a drive on one worker, mean, by environment and case.
     """
@@ -287,7 +287,7 @@ def run_evaluation(
             be made; later, a policy that does not take the images.
     """
     limits = departure_limits(work.routes, work.settings.car_width_m)
-    if RANDOM_OBJECTS in work.cases:
+    if RANDOM in work.cases:
         check_roadside(work.routes, work.settings, work.settings.objects)
     _check_workers(work, workers)
     jobs = work.jobs

@@ -115,18 +115,18 @@ class Job:
         stages = Stages(world, folder.drives, self.on_progress, effort)
         original = world.appearance()
         with closing(stages):
-            stages.drive_all(SURROGATE, "unperturbed")
+            stages.drive_all(SURROGATE, "own")
             stages.drive_random(SURROGATE)
             world.show(original)
             attack = self._attack(world, folder, effort)
             attacked = world.appearance()
-            stages.drive_all(SURROGATE, "gradient")
+            stages.drive_all(SURROGATE, "attack")
             for label in world.deployments:
                 world.show(original)
-                stages.drive_all(label, "unperturbed")
+                stages.drive_all(label, "own")
                 stages.drive_random(label)
                 world.show(attacked)
-                stages.drive_all(label, "gradient")
+                stages.drive_all(label, "attack")
         from mi_nerfattack.experiment.results import write_results  # it loads the plots
 
         return write_results(
@@ -134,7 +134,7 @@ class Job:
             world,
             stages.drives,
             attack,
-            {"unperturbed": original, "gradient": attacked},
+            {"own": original, "attack": attacked},
             self.text,
             effort().model_dump(),
             folder.checkpoint.ignored,
@@ -192,7 +192,7 @@ class Job:
             nonlocal done
             del step
             done += 1
-            self.on_progress("surrogate: attack", done, total, remark)
+            self.on_progress("surrogate: optimisation", done, total, remark)
             check()
 
         attack.step(on_step)

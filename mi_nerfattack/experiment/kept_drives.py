@@ -11,7 +11,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 
-FORMAT = "mi_nerfattack attack drive 2"
+FORMAT = "mi_nerfattack attack drive 3"
 
 
 class DriveRecord(Record):

@@ -1,7 +1,7 @@
 """What the policy saw: frames of drives, as a strip and as EXR files with layers.
 
-The first unperturbed and the first attacked drive of each environment are driven again
-by their recorded controls, which gives the frames that the policy saw.
+The first drive of each environment and case, whose objects look alike in all drives, is
+driven again by its recorded controls, which gives the frames that the policy saw.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Nothing that the policy does has an effect there, so that there is no cross-track error
 of its own. Each frame is a question asked anew; its answer is compared with that to the
-same frame with the objects unperturbed.
+same frame with objects in their own textures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.drives import control_change
 from mi_nerfattack.rollout.drive import CASES, Drive
 
-UNPERTURBED = "unperturbed"
+OWN = "own"
 COLUMNS = ("environment", "case", "run", "step", "time_s", "control", "change")
 
 
@@ -28,21 +28,21 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
     """Return figures by environment and case, for ``metrics.json``.
 
     ``control_change_mean`` and ``control_change_max`` are of the distance from the
-    control of the unperturbed drive in the same frame, over all frames and runs; the
-    interval of the mean is a bootstrap over runs, null for a single one.
+    control with own textures in the same frame, over all frames and runs; the interval
+    of the mean is a bootstrap over runs, null for a single one.
 
     Args:
-        drives: of recorded drives; of each environment one is unperturbed.
+        drives: of recorded drives; of each environment one past own textures.
         unit: of the control.
         seed: of the bootstrap.
     """
     found: dict[str, Any] = {}
     for environment, group in _environments(drives).items():
-        base = _unperturbed(group)
+        base = _own(group)
         cases: dict[str, Any] = {}
         for case in CASES:
             changes = [abs(d.controls - base.controls) for d in group if d.case == case]
-            if not changes or case == UNPERTURBED:
+            if not changes or case == OWN:
                 continue
             means = np.array([change.mean() for change in changes])
             largest = max(changes, key=np.max)
@@ -81,7 +81,7 @@ def write_control_changes(
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     for environment, group in _environments(drives).items():
-        base = _unperturbed(group)
+        base = _own(group)
         for drive in group:
             change = (drive.controls - base.controls).tolist()
             columns = drive.time_s.tolist(), drive.controls.tolist(), change
@@ -102,5 +102,5 @@ def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
     return found
 
 
-def _unperturbed(group: Sequence[Drive]) -> Drive:
-    return next(drive for drive in group if drive.case == UNPERTURBED)
+def _own(group: Sequence[Drive]) -> Drive:
+    return next(drive for drive in group if drive.case == OWN)

@@ -63,7 +63,7 @@ def write_results(
     if replayed:
         document["replay"] = control_changes(replayed, unit, scenario.seed)
     if attack.freedom.pose_rate is not None:
-        document["object_poses"] = _poses(world, looks["gradient"])
+        document["object_poses"] = _poses(world, looks["attack"])
     if ignored:
         document["ignored_changes"] = ignored
     files.write_json(output / "metrics.json", document)
@@ -72,7 +72,7 @@ def write_results(
     files.write_json(output / "attack.json", history)
     files.make_folder(output / "objects")
     for grid, item, texture in zip(
-        world.fields, scenario.objects, looks["gradient"].textures, strict=True
+        world.fields, scenario.objects, looks["attack"].textures, strict=True
     ):
         grid.set_parameter("texture", texture)
         save_field(output / "objects" / f"{item.id}.safetensors", grid)

@@ -63,7 +63,7 @@ class RunFolder:
         of_drives, ignored = self.drives.read(force)
         self.effort = max(of_attack, of_drives, key=lambda effort: effort.wall_s)
         if not self.checkpoint.found:
-            self.drives.drop("gradient")
+            self.drives.drop("attack")
         for line in dict.fromkeys([*self.checkpoint.ignored, *ignored]):
             on_notice(f"{self.path}: ignored, as told: {line}")
 

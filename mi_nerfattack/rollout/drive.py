@@ -22,8 +22,8 @@ ENVIRONMENTS = (
     "carla",
 )
 
-
-CASES = ("unperturbed", "random", "gradient", "clean", "random_objects")
+#: What objects show in a drive, in the order of documents and plots.
+CASES = ("no_object", "own", "random", "best_random", "attack")
 
 
 @dataclass(frozen=True, eq=False)

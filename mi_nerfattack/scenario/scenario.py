@@ -109,7 +109,7 @@ class DriveSection(Section):
     """What is driven."""
 
     horizon: Count = 60
-    runs: Count = 4  # drives of the unperturbed and the attacked case
+    runs: Count = 4  # drives of each case but random
     lateral_sd_m: NonNegative = 0.1
     heading_sd_deg: NonNegative = 0.5
     covariance: tuple[Triple, Triple, Triple] | None = None  # see _check_covariance

@@ -81,8 +81,8 @@ def test_the_command_prints_a_card_as_json(place, capsys):
     assert list(printed) == ["mitsuba"]
     assert list(printed["mitsuba"]) == ["straight"]
     # without objects there is no case with objects
-    assert list(printed["mitsuba"]["straight"]) == ["clean"]
-    figures = printed["mitsuba"]["straight"]["clean"]
+    assert list(printed["mitsuba"]["straight"]) == ["no_object"]
+    figures = printed["mitsuba"]["straight"]["no_object"]
     assert figures["n"] == len(figures["per_run"]) == 2
     assert figures["expert"]["cross_track_mean_m"] < figures["cross_track_mean_m"]
 
@@ -96,7 +96,7 @@ def test_finished_drives_are_kept_and_more_runs_add_to_them(place, capsys, monke
     kept[0].unlink()
     assert cli.main([*place, "--json", "--runs", "3"]) == 0
     second = json.loads(capsys.readouterr().out)
-    old, new = (card["mitsuba"]["straight"]["clean"] for card in (first, second))
+    old, new = (card["mitsuba"]["straight"]["no_object"] for card in (first, second))
     assert new["per_run"][:2] == old["per_run"]
     assert [path.stat().st_mtime_ns for path in kept[1:]] == times[1:]
     monkeypatch.setattr(evaluate_work, "make_environment", None)  # nothing is driven
@@ -172,7 +172,7 @@ def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
     text = Path("out/still-drive.md").read_text()
     assert "2 of 2 drives left the lane" in text
     assert "Drives that left the lane: 2 of 2." in text
-    assert "| mitsuba | straight | clean | 2 |" in text
+    assert "| mitsuba | straight | no_object | 2 |" in text
     assert "There is no record of the training" in text
     assert "mi-nerfattack evaluate still.py:drive --environments mitsuba" in text
     assert "--seed 4" in text and "file_sha256" in text
@@ -180,7 +180,8 @@ def test_a_page_tells_errors_failures_and_how_they_were_measured(place, capsys):
     assert files.read_image("out/still-drive.png").std() > 5
     document = files.read_json("out/still-drive.card.json")
     assert (
-        document["environments"]["mitsuba"]["straight"]["clean"]["drives_departed"] == 2
+        document["environments"]["mitsuba"]["straight"]["no_object"]["drives_departed"]
+        == 2
     )
     assert document["training"] is None
 
@@ -240,7 +241,7 @@ def test_pages_are_named_after_the_policy():
 
 def test_a_summary_counts_all_drives():
     figures = {"n": 5, "drives_departed": 1, "cross_track_mean_m": 0.25}
-    text = summary({"mitsuba": {"left": {"clean": figures, "random_objects": figures}}})
+    text = summary({"mitsuba": {"left": {"no_object": figures, "random": figures}}})
     assert text.startswith("2 of 10 drives left the lane")
 
 
@@ -365,7 +366,10 @@ def test_a_toml_file_says_how_the_policy_is_called(place, capsys):
     )
     place = with_policy("mine.toml", place)
     assert cli.main([*place, "--json", "--horizon", "2"]) == 0
-    assert json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["clean"]["n"] == 2
+    assert (
+        json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["no_object"]["n"]
+        == 2
+    )
     assert cli.main([*place, "--goals", "3"]) == 2
     assert "mine.toml: says itself" in capsys.readouterr().err
 

@@ -24,8 +24,8 @@ from mi_nerfattack.deploy.placement import scene_ground
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
-    CLEAN,
-    RANDOM_OBJECTS,
+    NO_OBJECT,
+    RANDOM,
     EvaluateSettings,
     ExpertPolicy,
     drive,
@@ -117,7 +117,7 @@ def test_starts_are_cut_and_depend_on_seed_route_and_run_alone():
     assert np.abs(np.rad2deg(poses[:, 2])).max() <= 9.0
     np.testing.assert_array_equal(poses[:, 0], 0)
     few, many = EvaluateSettings(runs=2, horizon=2), EvaluateSettings(horizon=2)
-    arguments = (Counting(), straight(), CLEAN, 1, [], flat_ground)
+    arguments = (Counting(), straight(), NO_OBJECT, 1, [], flat_ground)
     one = evaluate_run(surrogate(), *arguments, few)
     other = evaluate_run(surrogate("mujoco"), *arguments, many)
     np.testing.assert_array_equal(one.states, other.states)
@@ -144,7 +144,7 @@ def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
             for case in settings.cases
             for run in range(2)
         ]
-        assert [item.case for item in runs] == [CLEAN] * 2 + [RANDOM_OBJECTS] * 2
+        assert [item.case for item in runs] == [NO_OBJECT] * 2 + [RANDOM] * 2
         shown = environment.seen
         assert not any(shown[:8]) and all(len(item) == 1 for item in shown[8:])
         assert environment.objects == []
@@ -162,8 +162,10 @@ def test_the_card_counts_drives_that_left_the_lane():
         drive(surrogate(), Counting(), straight(), np.array([0, y, 0]), 3, 4, run=run)
         for run, y in enumerate([0.0, 0.8, -0.9])
     ]
-    found = make_card({("surrogate", "straight", "clean"): drives}, {"straight": 0.85})
-    figures = found["surrogate"]["straight"]["clean"]
+    found = make_card(
+        {("surrogate", "straight", "no_object"): drives}, {"straight": 0.85}
+    )
+    figures = found["surrogate"]["straight"]["no_object"]
     assert figures["n"] == 3
     assert figures["drives_departed"] == 1
     assert figures["cross_track_mean_m"] == pytest.approx(1.7 / 3)
@@ -199,7 +201,7 @@ def test_evaluate_drives_everything_and_counts_steps():
     for routes in found.values():
         assert list(routes) == ["straight", "left"]
         for cases in routes.values():
-            assert list(cases) == [CLEAN, RANDOM_OBJECTS]
+            assert list(cases) == [NO_OBJECT, RANDOM]
             assert all(figures["n"] == 2 for figures in cases.values())
     assert calls == [(step, 64) for step in range(1, 65)]
     assert card_table(found).row_count == 8
@@ -259,7 +261,7 @@ def test_the_room_has_starts_in_its_lane_and_objects_that_find_a_place():
     ground = scene_ground(load_scene(room.scene))
     grid, few = load_grid(room.objects[0]), replace(settings, horizon=2)
     for run in range(8):
-        arguments = (route, RANDOM_OBJECTS, run, [grid], ground, few)
+        arguments = (route, RANDOM, run, [grid], ground, few)
         driven = evaluate_run(environment, Counting(), *arguments)
         assert not driven.departed(limit).any()
 

@@ -46,8 +46,8 @@ def test_a_town_is_driven_in_this_process_and_given_back(server, capsys):
     assert evaluate("carla", *TOWN, "--json", "--page", "out") == 0
     read = capsys.readouterr()
     figures = json.loads(read.out)["carla"]["straight"]
-    assert list(figures) == ["clean"] and figures["clean"]["n"] == 1
-    assert figures["clean"]["expert"]["n"] == 1
+    assert list(figures) == ["no_object"] and figures["no_object"]["n"] == 1
+    assert figures["no_object"]["expert"]["n"] == 1
     assert "no drives past objects: a town its --scene" in read.err
     text = Path("out/still-drive.md").read_text()
     assert "CARLA's Town01" in text and "scene.xml" not in text

@@ -23,7 +23,7 @@ from mi_nerfattack.rollout.drive import Drive, departure_limit
 
 #: What `metrics.json` of a run folder holds.
 RUN_ENVIRONMENTS = ("surrogate", "deployment")
-RUN_CASES = ("unperturbed", "random", "gradient")
+RUN_CASES = ("own", "random", "attack")
 LIMITS = {"straight": 0.85}
 COST = {"wall_s": 12.5, "peak_memory_mb": 900.0, "renders": 240}
 
@@ -48,10 +48,10 @@ def make_drive(
 
 def make_document(drives=None):
     drives = drives or [
-        make_drive([0.1, -0.3], case="unperturbed"),
+        make_drive([0.1, -0.3], case="own"),
         make_drive([0.1, -0.3, 0.2], run=0),
         make_drive([0.5, 0.9, 1.0], run=1),
-        make_drive([1.0, 1.2], case="gradient", environment="deployment"),
+        make_drive([1.0, 1.2], case="attack", environment="deployment"),
     ]
     return metrics.metrics_document({"name": "x"}, 7, drives, LIMITS, COST)
 
@@ -173,8 +173,8 @@ def test_document_follows_the_schema(tmp_path):
     metrics.validate(read)
     assert (read["schema"], read["seed"], read["scenario"]) == (1, 7, {"name": "x"})
     assert read["cost"] == COST
-    assert list(read["routes"]["straight"]["surrogate"]) == ["unperturbed", "random"]
-    case = read["routes"]["straight"]["deployment"]["gradient"]
+    assert list(read["routes"]["straight"]["surrogate"]) == ["own", "random"]
+    case = read["routes"]["straight"]["deployment"]["attack"]
     assert case["n"] == 1
     assert case["steps_departed"] == 2
 
@@ -228,7 +228,7 @@ def test_validate_names_a_missing_key():
 
 
 def test_steps_hold_a_row_per_step(tmp_path):
-    drives = [make_drive([0.1, -0.9]), make_drive([1 / 3], case="gradient")]
+    drives = [make_drive([0.1, -0.9]), make_drive([1 / 3], case="attack")]
     table.write_steps(tmp_path / "steps.csv", drives, LIMITS)
     rows = list(csv.DictReader(io.StringIO(files.read_text(tmp_path / "steps.csv"))))
     assert tuple(rows[0]) == table.STEP_COLUMNS
@@ -237,7 +237,7 @@ def test_steps_hold_a_row_per_step(tmp_path):
     assert float(rows[1]["x_m"]) == 1.0
     assert float(rows[1]["control"]) == 0.1
     assert float(rows[2]["cross_track_m"]) == 1 / 3
-    assert rows[2]["case"] == "gradient"
+    assert rows[2]["case"] == "attack"
 
 
 def test_metrics_table_fits_80_columns():
@@ -252,7 +252,7 @@ def test_metrics_table_fits_80_columns():
     console.print(table.metrics_table({"routes": figures}))
     text = console.file.getvalue()
     assert all(len(line) <= 80 for line in text.splitlines())
-    assert text.count("unperturbed") == 2
+    assert text.count("own") == 2
     assert "61.750" in text
     assert "…" not in text
 
@@ -263,12 +263,12 @@ def test_metrics_table_fits_80_columns():
 def plot_drives():
     drives = []
     for environment in RUN_ENVIRONMENTS:
-        drives.append(make_drive(np.full(40, 0.02), environment, "unperturbed"))
+        drives.append(make_drive(np.full(40, 0.02), environment, "own"))
         for run in range(3):
             drives.append(
                 make_drive(np.full(30 + run, 0.1 * run), environment, run=run)
             )
-        drives.append(make_drive(np.linspace(0, 1.5, 40), environment, "gradient"))
+        drives.append(make_drive(np.linspace(0, 1.5, 40), environment, "attack"))
     return drives
 
 
@@ -306,7 +306,7 @@ def test_overhead_shows_drives_and_object(tmp_path):
 
 
 def test_overhead_has_a_panel_for_an_environment_of_your_own(tmp_path):
-    drives = [make_drive([0.1, 0.2], name, "unperturbed") for name in ("a", "b")]
+    drives = [make_drive([0.1, 0.2], name, "own") for name in ("a", "b")]
     plots.overhead(tmp_path / "one.png", drives[:1], ROUTE, 3.5, [], 0.85)
     plots.overhead(tmp_path / "two.png", drives, ROUTE, 3.5, [], 0.85)
     one, two = (files.read_image(tmp_path / f"{name}.png") for name in ("one", "two"))

@@ -31,11 +31,11 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     result = run(
         "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
     )
-    assert "gradient" in result.stdout and str(output) in result.stdout
+    assert "attack" in result.stdout and str(output) in result.stdout
     document = json.loads((output / "metrics.json").read_text())
     validate(document)
     route = document["routes"]["line"]
-    counts = {"unperturbed": 2, "random": 3, "gradient": 2}
+    counts = {"own": 2, "random": 3, "attack": 2}
     for environment in ("surrogate", "deployment"):
         for case, count in counts.items():
             assert route[environment][case]["n"] == count
@@ -51,7 +51,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     assert np.array_equal(density, original.parameters()["density"].numpy())
     for environment in ("surrogate", "deployment"):
         layers, metadata = read_layers(
-            output / "frames" / f"{environment}_gradient_0000.exr"
+            output / "frames" / f"{environment}_attack_0000.exr"
         )
         assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
         assert metadata["scenario"] == "kill"

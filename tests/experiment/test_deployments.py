@@ -87,7 +87,7 @@ def test_the_surrogates_drives_are_those_of_the_environment(folder, whole):
         (row,) = (
             d
             for d in kept
-            if (d.environment, d.case, d.run) == ("surrogate", "unperturbed", run)
+            if (d.environment, d.case, d.run) == ("surrogate", "own", run)
         )
         horizon = scenario.drive.horizon
         found = drive(environment, policy, world.route, start, 0, horizon)
@@ -107,26 +107,26 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     document = job(folder, output, (TABLE, SEVERAL)).run()
     validate(document)
     assert server.is_as_before
-    cases = {"unperturbed": 2, "random": 2, "gradient": 2}
+    cases = {"own": 2, "random": 2, "attack": 2}
     environments = document["routes"]["line"]
     assert list(environments) == ["surrogate", "mujoco", "carla", "lit"]
     for found in environments.values():
         assert {case: figures["n"] for case, figures in found.items()} == cases
     replayed = document["replay"]["tape"]
     assert replayed["frames"] == 2 and replayed["control_unit"] == "rad/s"
-    assert set(replayed["cases"]) == {"random", "gradient"}
-    assert replayed["cases"]["gradient"]["n"] == 1
-    assert replayed["cases"]["gradient"]["control_change_max"] > 1e-4
+    assert set(replayed["cases"]) == {"random", "attack"}
+    assert replayed["cases"]["attack"]["n"] == 1
+    assert replayed["cases"]["attack"]["control_change_max"] > 1e-4
     assert "cross_track" not in json.dumps(document["replay"])
     with (output / "controls.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * (1 + 2 + 1)
-    assert all(float(r["change"]) == 0 for r in rows if r["case"] == "unperturbed")
+    assert all(float(r["change"]) == 0 for r in rows if r["case"] == "own")
     assert "tape" not in (output / "steps.csv").read_text()
     for name in ("strip", "overhead", "errors", "controls_tape"):
         assert (output / f"{name}.png").stat().st_size > 5000
     for label, parts in (("mujoco", 6), ("carla", 6), ("tape", 6), ("lit", 2)):
-        layers, _ = read_layers(output / "frames" / f"{label}_gradient_0000.exr")
+        layers, _ = read_layers(output / "frames" / f"{label}_attack_0000.exr")
         assert len(layers) == parts, label
     page = (output / "report.html").read_text()
     assert "Change of control in the recording, tape" in page
@@ -134,7 +134,7 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     for label in ("mujoco", "lit", "carla", "tape"):
         images = [
             read_layers(output / "frames" / f"{label}_{case}_0000.exr")[0][""]
-            for case in ("unperturbed", "gradient")
+            for case in ("own", "attack")
         ]
         assert abs(images[0] - images[1]).max() > 0.02, label
     # finished, it opens nothing again but for the results

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 @pytest.mark.usefixtures("no_results")
 def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path):
     output, notices = tmp_path / "run", []
-    interrupt(folder, output, "surrogate: attack", 4 * 4 + 1)
+    interrupt(folder, output, "surrogate: optimisation", 4 * 4 + 1)
     before = contents(output)
     change = ("learning_rate = 0.5", "learning_rate = 0.25\njitter = true")
     with pytest.raises(InputError) as refused:
@@ -35,7 +35,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     first = []
 
     def watch(stage, done, total, remark):
-        if stage == "surrogate: attack":
+        if stage == "surrogate: optimisation":
             first.append(done)
 
     run = job(folder, output, change, watch, notices)
@@ -55,11 +55,11 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
 def test_changed_file_and_version_are_named(folder, tmp_path, monkeypatch):
     output, mine = tmp_path / "run", tmp_path / "mine"
     shutil.copytree(folder, mine)
-    interrupt(mine, output, "surrogate: attack", 4 * 3 + 1)
+    interrupt(mine, output, "surrogate: optimisation", 4 * 3 + 1)
     # a field of another name and place but the same content is the same
     shutil.copy(mine / "object.safetensors", mine / "copy.safetensors")
     same = ('"object.safetensors"', '"copy.safetensors"')
-    interrupt(mine, output, "surrogate: attack", 4 * 4 + 1, True, change=same)
+    interrupt(mine, output, "surrogate: optimisation", 4 * 4 + 1, True, change=same)
     tensors, metadata = files.read_safetensors(mine / "object.safetensors")
     tensors["texture"] = tensors["texture"] + 1
     files.write_safetensors(mine / "object.safetensors", tensors, metadata)
@@ -81,7 +81,7 @@ def test_changed_file_and_version_are_named(folder, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("no_results")
 def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
     output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
+    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     other = ('"object.safetensors"', '"scene.safetensors"')
     with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*this run needs"):
         job(folder, output, other).run(resume=True, force=True)
@@ -117,7 +117,7 @@ def run_forced(folder, output, change, **more):
 def test_best_of_another_objective_is_measured_anew(folder, tmp_path):
     """Seconds in the lane are above minus any sum of distances, which was least."""
     output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: attack", 4 * 4 + 1)
+    interrupt(folder, output, "surrogate: optimisation", 4 * 4 + 1)
     before = checkpoint_of(output)
     assert before["best_objective"] < 0
     change = ("[drive]", '[objective]\nkind = "departure_time"\n[drive]')
@@ -167,7 +167,7 @@ def test_what_may_change_is_changed_by_force(
 
     line, output = "deterministic = true", tmp_path / "run"
     old, new = (f'{line}\nparameters = "{name}"' for name in (first, then))
-    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1, change=(line, old))
+    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1, change=(line, old))
     monkeypatch.setattr(module.Job, "_attack", watch)
     run_forced(folder, output, (line, new))
     before, after, attack = seen[0]

@@ -38,7 +38,7 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
     expected = job(folder, whole, FIFTY).run()
     # 4 steps an iteration: in the drive, and in the derivative
     for resume, step in ((False, 4 * 17 + 1), (True, 4 * 32 + 3)):
-        interrupt(folder, output, "surrogate: attack", step, resume, change=FIFTY)
+        interrupt(folder, output, "surrogate: optimisation", step, resume, change=FIFTY)
         iteration = len(checkpoint_of(output)["history"])
         assert iteration == step // 4
     result = job(folder, output, FIFTY).run(resume=True)
@@ -53,10 +53,10 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
 def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
     interrupt(folder, output, "surrogate: random", 3)  # in the second of two drives
-    interrupt(folder, output, "deployment: gradient", 1, resume=True)
+    interrupt(folder, output, "deployment: attack", 1, resume=True)
     before = checkpoint_of(output)
     written = {path: path.stat().st_mtime_ns for path in output.glob("drives/*")}
-    # 2 unperturbed and 2 random ones twice, 2 of the attack
+    # 2 of their own and 2 random ones twice, 2 of the attack
     assert len(written) == 10
 
     def watch(stage, done, total, remark):
@@ -64,13 +64,13 @@ def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
 
     document = job(folder, output, on_progress=watch).run(resume=True)
     driven = [line for line in seen if line[2] != "kept"]
-    assert driven == [("deployment: gradient", k, "") for k in (1, 2, 3, 4)]
+    assert driven == [("deployment: attack", k, "") for k in (1, 2, 3, 4)]
     kept = {stage for stage, _, remark in seen if remark == "kept"}
     assert kept == {
         f"{place}: {stage}"
         for place in ("surrogate", "deployment")
         for stage in STAGES
-        if (place, stage) != ("deployment", "gradient")
+        if (place, stage) != ("deployment", "attack")
     }
     for name, value in checkpoint_of(output).items():
         assert np.array_equal(value, before[name], equal_nan=True), name
@@ -101,7 +101,7 @@ def test_interrupt_within_a_step_leaves_a_whole_state(folder, whole, tmp_path):
         signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        progress = stop_at("surrogate: attack", 4 * 4 + 4, press)
+        progress = stop_at("surrogate: optimisation", 4 * 4 + 4, press)
         job(folder, output, on_progress=progress).run()
     assert len(checkpoint_of(output)["history"]) == 4
     job(folder, output).run(resume=True)

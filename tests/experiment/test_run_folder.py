@@ -66,7 +66,7 @@ def test_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_pat
 @pytest.mark.usefixtures("no_results")
 def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
     output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
+    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     with locks.exclusive(output), pytest.raises(InputError, match="another process"):
         job(folder, output).run(resume=True)
     job(folder, output).run(resume=True)
@@ -75,12 +75,12 @@ def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
 @pytest.mark.usefixtures("no_results")
 @pytest.mark.parametrize(
     "name",
-    ["checkpoint.safetensors", "drives/surrogate_unperturbed_0000.safetensors"],
+    ["checkpoint.safetensors", "drives/surrogate_own_0000.safetensors"],
 )
 @pytest.mark.parametrize("damage", ["cut", "bit", "foreign"])
 def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, damage):
     output = tmp_path / "run"
-    interrupt(folder, output, "surrogate: attack", 4 * 3 + 1)
+    interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     raw = bytearray((output / name).read_bytes())
     if damage == "foreign":
         raw = (folder / "object.safetensors").read_bytes()
@@ -116,7 +116,7 @@ def test_failed_checkpoint_leaves_the_one_before(
         monkeypatch.setattr(os, call, fail)
 
     # checkpoint_every = 3: the disk fills up after the first checkpoint
-    progress = stop_at("surrogate: attack", 4 * 4, fill)
+    progress = stop_at("surrogate: optimisation", 4 * 4, fill)
     with pytest.raises(InputError) as failed:
         job(folder, output, on_progress=progress).run()
     monkeypatch.undo()
@@ -130,7 +130,7 @@ def test_failed_checkpoint_leaves_the_one_before(
 
 
 @pytest.mark.usefixtures("no_results")
-@pytest.mark.parametrize("stage", ["surrogate: unperturbed", "surrogate: attack"])
+@pytest.mark.parametrize("stage", ["surrogate: own", "surrogate: optimisation"])
 def test_a_refused_attack_leaves_nothing(folder, tmp_path, stage):
     def refuse():
         raise InputError("policy: control nan")
@@ -151,7 +151,7 @@ def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
         raise InputError("disk or gradient") from cause
 
     with pytest.raises(InputError, match="disk or gradient"):
-        stop = stop_at("surrogate: attack", step, refuse)
+        stop = stop_at("surrogate: optimisation", step, refuse)
         job(folder, tmp_path, on_progress=stop).run()
     seen = {path.name for path in tmp_path.iterdir()}
     assert seen >= {"scenario.toml", "drives"}

@@ -357,7 +357,7 @@ def checkpoints(folder: Path) -> list[tuple[Path, Any]]:
     CheckpointFile(path, {"a": "1"}).save(attack, Effort())
     drives = KeptDrives(folder / "drives", {"a": "1"}, "line", 0)
     rows = np.zeros((3, 3)), np.zeros(2), np.zeros(2), np.arange(2.0)
-    drives.add(Drive("surrogate", "line", "gradient", 0, 0, *rows), Effort())
+    drives.add(Drive("surrogate", "line", "attack", 0, 0, *rows), Effort())
 
     def read(path: Path) -> None:
         kept = CheckpointFile(path, {"a": "1"})

@@ -12,7 +12,7 @@ from helpers import toy_loop as toy
 
 from mi_nerfattack.io import files
 
-STAGES = ("unperturbed", "random", "gradient")
+STAGES = ("own", "random", "attack")
 
 
 def write_scenario(folder, changes):

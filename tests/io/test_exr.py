@@ -29,7 +29,7 @@ def frame_layers(rng, height=9, width=7):
 def test_exr_round_trip(tmp_path, half):
     layers = frame_layers(np.random.default_rng(0))
     path = tmp_path / "frame.exr"
-    exr.write_layers(path, layers, {"step": "12", "case": "gradient"}, half)
+    exr.write_layers(path, layers, {"step": "12", "case": "attack"}, half)
     read, metadata = exr.read_layers(path)
     assert set(read) == set(layers)
     for name, array in layers.items():

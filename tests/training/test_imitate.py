@@ -173,7 +173,7 @@ def test_training_goes_on_after_a_closed_loop(data):
         module, data, TrainSettings(epochs=2, batch=12), validation=loop
     )
     # 3 periods on a straight lane from a random start: the error is near the start's
-    assert set(before["routes"]) == {"mitsuba straight clean"}
+    assert set(before["routes"]) == {"mitsuba straight no_object"}
     assert [row[DEPARTED] for row in history] == [0, 0]
     assert history[0]["train_loss"] != history[1]["train_loss"]
 

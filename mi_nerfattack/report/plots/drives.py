@@ -23,8 +23,8 @@ from mi_nerfattack.rollout.drive import CASES, Drive
 
 _STYLES: dict[str, dict[str, Any]] = {
     "random": {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
-    "unperturbed": {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
-    "gradient": {
+    "own": {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
+    "attack": {
         "color": "#D55E00",
         "linewidth": 2.0,
         "zorder": 5,
@@ -32,9 +32,9 @@ _STYLES: dict[str, dict[str, Any]] = {
     },
 }
 _LABELS = {
-    "unperturbed": "unperturbed",
+    "own": "own texture",
     "random": "random texture",
-    "gradient": "attacked (gradient)",
+    "attack": "attack",
 }
 _LANE, _CENTRE, _OBJECT, _LIMIT = "#ececec", "#9a9a9a", "#F0C000", "#000000"
 
@@ -128,7 +128,7 @@ def control_change(
     Args:
         path: PNG file.
         drives: of as many steps as `base`.
-        base: the unperturbed drive.
+        base: the drive past own textures.
         unit: of the control.
     """
     with chart(path, 3.0) as figure:
@@ -137,7 +137,7 @@ def control_change(
             case: np.array(
                 [d.controls - base.controls for d in drives if d.case == case]
             )
-            for case in ("random", "gradient")
+            for case in ("random", "attack")
         }
         random = changes["random"]
         if len(random):
@@ -145,10 +145,10 @@ def control_change(
             axis.fill_between(base.time_s, random.min(0), random.max(0), **band)
             style = _style("random", linewidth=1.6, label="random texture: range, mean")
             axis.plot(base.time_s, random.mean(0), **style)
-        for row in changes["gradient"]:
-            style = _style("gradient", label=_LABELS["gradient"])
+        for row in changes["attack"]:
+            style = _style("attack", label=_LABELS["attack"])
             axis.plot(base.time_s, row, **style)
-        axis.axhline(0, color=_STYLES["unperturbed"]["color"], label="unperturbed")
+        axis.axhline(0, color=_STYLES["own"]["color"], label=_LABELS["own"])
         axis.set_title(f"Change of control: {base.environment}", loc="left")
         axis.set_xlabel("time (s)")
         axis.set_ylabel(f"change of control ({unit})")
@@ -231,7 +231,7 @@ def _draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
 
 
 def _cross(case: str) -> dict[str, Any]:
-    dark = {"random": "#4d4d4d", "unperturbed": "#003f66", "gradient": "#7a1f00"}
+    dark = {"random": "#4d4d4d", "own": "#003f66", "attack": "#7a1f00"}
     style = {"linestyle": "none", "marker": "x", "markersize": 4.5, "zorder": 7}
     return style | {"color": dark[case], "markeredgewidth": 1.2}
 
@@ -251,7 +251,7 @@ def _map_handles(drives: Sequence[Drive], objects: bool, limit: float) -> list[A
         handles.append(Patch(facecolor=_OBJECT, edgecolor="black", label="object"))
     if any(np.any(drive.departed(limit)) for drive in drives):
         label = f"departed (> {limit:.2f} m)"
-        handles.append(Line2D([], [], label=label, **_cross("gradient")))
+        handles.append(Line2D([], [], label=label, **_cross("attack")))
     return handles
 
 

@@ -13,13 +13,13 @@ from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
 from mi_nerfattack.rollout.drive import Drive
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "random_objects": {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (5, 1.2))},
-    "clean": {"color": BLUE, "linewidth": 0.9},
+    "random": {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (5, 1.2))},
+    "no_object": {"color": BLUE, "linewidth": 0.9},
     "expert": {"color": GREY, "linewidth": 0.8, "linestyle": ":"},
 }
 _LABELS = {
-    "clean": "alone",
-    "random_objects": "past objects of random texture",
+    "no_object": "alone",
+    "random": "past objects of random texture",
     "expert": "expert, alone",
 }
 _ROW_IN, _LEGEND_IN = 1.9, 0.5

@@ -24,7 +24,7 @@ def test_names_neither_end_a_cell_nor_begin_an_element():
     card["environments"]["a|b\n<script>"] = card["environments"].pop("mujoco")
     card["command"] = "evaluate `a|b` <c>"
     text = page_text("<net>", card)
-    assert "| a\\|b &lt;script> | straight | clean | 20 |" in text
+    assert "| a\\|b &lt;script> | straight | no_object | 20 |" in text
     assert "| command | `evaluate 'a\\|b' <c>` |" in text
     assert "# Policy `<net>`" in text and "(&lt;net>.png)" in text
     assert "<script" not in text
