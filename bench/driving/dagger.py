@@ -13,13 +13,13 @@ import torch
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.evaluate import NO_OBJECT, EvaluateSettings, evaluate_run
+from mi_nerfattack.evaluation.evaluate import EvaluateSettings, evaluate_run
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.report.plots.charts import BLUE, ORANGE, chart
-from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.rollout.drive import NO_OBJECT, departure_limit
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.training.collect import CollectSettings, collect
 from mi_nerfattack.training.dataset import FrameDataset

@@ -13,9 +13,10 @@ import tyro
 class Attack:
     """Optimise the textures of a scenario's objects until the policy leaves its lane.
 
-    Drives past the objects as they are, as many random textures as the attack has
-    iterations, and the attack in the surrogate; repeats all three in the deployment
-    environments that the scenario names; writes everything to a run folder.
+    Drives without objects, past the objects as they are, past random textures that
+    cost together what the attack does, past the best of them and past the attack, in
+    the surrogate and in the deployment environments that the scenario names; writes
+    everything to a run folder.
     """
 
     scenario: tyro.conf.Positional[Path]

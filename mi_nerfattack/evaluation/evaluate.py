@@ -23,12 +23,12 @@ from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
 from mi_nerfattack.ranges import Count, Whole, checked
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.drive import Drive, departure_limits
+from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive, departure_limits
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
-#: Cases of a card, and that of the expert's drives, which is none of its own there.
-NO_OBJECT, RANDOM, EXPERT = "no_object", "random", "expert"
+#: The case of the expert's drives, which is none of its own in a card.
+EXPERT = "expert"
 #: Of the starts: 0.25 m and 3 degrees, cut at three times as much.
 STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0)
 

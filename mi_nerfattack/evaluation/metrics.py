@@ -8,20 +8,20 @@ width: the car then touches the lane's edge.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pydantic
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
-from mi_nerfattack.rollout.drive import CASES, ENVIRONMENTS, Drive
+from mi_nerfattack.rollout.drive import CASES, ENVIRONMENTS, RANDOM, Drive, Lane
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 def summarise(
-    drives: Iterable[Drive], limits: Mapping[str, float], seed: int = 0
+    drives: Iterable[Drive], lanes: Mapping[str, Lane], seed: int = 0
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """Summarise drives by route, environment and case.
 
@@ -29,26 +29,32 @@ def summarise(
 
     - `n`: number of runs;
     - `cross_track_mean_m`: mean of |e| over all steps of all runs;
-    - `cross_track_mean_ci95_m`: 95 % percentile bootstrap interval of the mean over
-      runs of each run's mean of |e|; null for a single run, which has no spread;
+    - `cross_track_mean_ci95_m`: of `random`, where every run has a texture of its own,
+      the 95 % percentile bootstrap interval of the mean over runs of each run's mean of
+      |e|; null for a single run, and for cases that show one look, however many starts
+      they are driven from: starts tell nothing about other attacks;
     - `cross_track_mean_worst_run_m`: largest of the runs' means;
     - `cross_track_max_m`: largest |e| of any step;
     - `cross_track_total`: plain sum of |e| over the steps of a run (unit: metre-steps,
       so it grows when the time step shrinks), averaged over the runs;
     - `steps_departed`: number of steps beyond the limit, summed over the runs;
     - `drives_departed`: number of runs with at least one such step;
-    - `per_run`: the figures of each run, ordered by its index.
+    - `wheel_out_s`: seconds beyond the limit, averaged over the runs;
+    - `centre_out_s`: seconds with the car's centre out of the lane, likewise;
+    - `per_run`: the figures of each run, ordered by its index; `returned_s` is the time
+      at which it was back in the lane after its last departure, null if it never left
+      or never came back.
 
     Args:
         drives: in any order; lengths may differ.
-        limits: departure limit of each route, metres.
+        lanes: of each route.
         seed: seed of the bootstrap.
 
     Returns:
         {route: {environment: {case: figures}}} of plain Python values.
 
     Raises:
-        InputError: for the same run twice, or a route without a limit.
+        InputError: for the same run twice, or a route without a lane.
     """
     groups: dict[tuple[str, str, str], dict[int, Drive]] = {}
     for drive in drives:
@@ -61,7 +67,7 @@ def summarise(
     for route, environment, case in sorted(groups, key=_order):
         runs = groups[route, environment, case]
         ordered = [runs[index] for index in sorted(runs)]
-        figures = _case_figures(ordered, limit_of(route, limits), seed)
+        figures = _case_figures(ordered, lane_of(route, lanes), seed)
         result.setdefault(route, {}).setdefault(environment, {})[case] = figures
     return result
 
@@ -104,7 +110,7 @@ def metrics_document(
     scenario: Mapping[str, Any],
     seed: int,
     drives: Iterable[Drive],
-    limits: Mapping[str, float],
+    lanes: Mapping[str, Lane],
     cost: Mapping[str, float],
 ) -> dict[str, Any]:
     """Build the validated content of `metrics.json`.
@@ -113,38 +119,36 @@ def metrics_document(
         scenario: the scenario as run, in JSON types.
         seed: the run's seed; also that of the bootstrap.
         drives: all drives of the run, at least one.
-        limits: departure limit of each route, metres.
+        lanes: of each route.
         cost: `wall_s`, `peak_memory_mb`, `renders` and, as of `Effort`, more.
 
     Returns:
         A document for `files.write_json`.
     """
-    routes = summarise(drives, limits, seed)
+    routes = summarise(drives, lanes, seed)
     document = {
         "schema": SCHEMA,
         "scenario": dict(scenario),
         "seed": seed,
-        "departure_limits_m": {route: limit_of(route, limits) for route in routes},
+        "departure_limits_m": {name: lane_of(name, lanes).wheel_m for name in routes},
         "routes": routes,
+        "flags": [],
         "cost": dict(cost),
     }
     validate(document)
     return document
 
 
-def limit_of(route: str, limits: Mapping[str, float]) -> float:
-    """Return a route's departure limit; InputError if it has none or it is not > 0."""
-    if route not in limits:
-        known = ", ".join(sorted(limits)) or "none"
-        raise InputError(f"limits: no limit for route {route!r}; given: {known}")
-    limit = float(limits[route])
-    if not 0 < limit < float("inf"):
-        raise InputError(f"limits.{route}: {limit!r}; must be positive metres")
-    return limit
+def lane_of(route: str, lanes: Mapping[str, Lane]) -> Lane:
+    """Return a route's lane; InputError if it has none."""
+    if route not in lanes:
+        known = ", ".join(sorted(lanes)) or "none"
+        raise InputError(f"lanes: no lane for route {route!r}; given: {known}")
+    return lanes[route]
 
 
 def validate(document: Any) -> None:
-    """Check a metrics document against schema 1.
+    """Check a metrics document against schema 2.
 
     Raises:
         InputError: naming the first key that is missing, of a wrong type, negative or
@@ -156,7 +160,7 @@ def validate(document: Any) -> None:
         first = err.errors()[0]
         key = ".".join(["metrics", *map(str, first["loc"])])
         value = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
-        raise InputError(f"{key}: {first['msg']}{value}; see schema 1") from err
+        raise InputError(f"{key}: {first['msg']}{value}; see schema {SCHEMA}") from err
 
 
 class _Model(pydantic.BaseModel):
@@ -171,6 +175,9 @@ class _Run(_Model):
     cross_track_max_m: pydantic.NonNegativeFloat
     cross_track_total: pydantic.NonNegativeFloat
     steps_departed: pydantic.NonNegativeInt
+    wheel_out_s: pydantic.NonNegativeFloat
+    centre_out_s: pydantic.NonNegativeFloat
+    returned_s: pydantic.PositiveFloat | None
 
 
 class _Case(_Model):
@@ -182,6 +189,8 @@ class _Case(_Model):
     cross_track_total: pydantic.NonNegativeFloat
     steps_departed: pydantic.NonNegativeInt
     drives_departed: pydantic.NonNegativeInt
+    wheel_out_s: pydantic.NonNegativeFloat
+    centre_out_s: pydantic.NonNegativeFloat
     per_run: list[_Run]
 
     @pydantic.model_validator(mode="after")
@@ -197,6 +206,8 @@ class _Cost(_Model):
     renders: pydantic.NonNegativeInt
     checkpoint_s: pydantic.NonNegativeFloat = 0.0
     processes: pydantic.NonNegativeInt = 1
+    forward_s: pydantic.NonNegativeFloat = 0.0
+    backward_s: pydantic.NonNegativeFloat = 0.0
 
 
 class _Cases(_Model):
@@ -207,6 +218,18 @@ class _Cases(_Model):
     attack: _Case | None = None
 
 
+class _Baseline(_Model):
+    textures: pydantic.PositiveInt
+    deployment_textures: pydantic.PositiveInt
+    backward_multiple: pydantic.NonNegativeFloat
+    best: pydantic.NonNegativeInt
+    objectives: list[float]
+    attack_objective: float
+
+
+_Share = Annotated[float, pydantic.Field(ge=0, le=1)]
+
+
 class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
@@ -214,29 +237,40 @@ class _Document(_Model):
     departure_limits_m: dict[str, pydantic.PositiveFloat]
     routes: dict[str, dict[str, _Cases]] = pydantic.Field(min_length=1)
     cost: _Cost
+    flags: list[str]
+    converged: bool | None = None
+    saturated_share: _Share | dict[str, _Share] | None = None
+    total_variation: pydantic.NonNegativeFloat | dict[str, float] | None = None
+    baseline: _Baseline | None = None
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None
     replay: dict[str, Any] | None = None
 
 
-def _case_figures(drives: list[Drive], limit: float, seed: int) -> dict[str, Any]:
-    per_run = [_run_figures(drive, limit) for drive in drives]
+def _case_figures(drives: list[Drive], lane: Lane, seed: int) -> dict[str, Any]:
+    per_run = [_run_figures(drive, lane) for drive in drives]
+    of_textures = drives[0].case == RANDOM
     means = np.array([run["cross_track_mean_m"] for run in per_run])
     distances = np.concatenate([drive.distance_m for drive in drives])
     return {
         "n": len(drives),
         "cross_track_mean_m": float(distances.mean()),
-        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        "cross_track_mean_ci95_m": mean_interval(means, seed) if of_textures else None,
         "cross_track_mean_worst_run_m": float(means.max()),
         "cross_track_max_m": float(distances.max()),
         "cross_track_total": float(np.mean([r["cross_track_total"] for r in per_run])),
         "steps_departed": sum(run["steps_departed"] for run in per_run),
         "drives_departed": sum(run["steps_departed"] > 0 for run in per_run),
+        "wheel_out_s": float(np.mean([r["wheel_out_s"] for r in per_run])),
+        "centre_out_s": float(np.mean([r["centre_out_s"] for r in per_run])),
         "per_run": per_run,
     }
 
 
-def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
+def _run_figures(drive: Drive, lane: Lane) -> dict[str, Any]:
+    out = drive.departed(lane.wheel_m)
+    beyond = drive.departed(lane.centre_m)
+    seconds = np.diff(drive.time_s, prepend=0.0)
     return {
         "run": drive.run,
         "seed": drive.seed,
@@ -244,8 +278,19 @@ def _run_figures(drive: Drive, limit: float) -> dict[str, Any]:
         "cross_track_mean_m": float(drive.distance_m.mean()),
         "cross_track_max_m": float(drive.distance_m.max()),
         "cross_track_total": float(drive.distance_m.sum()),
-        "steps_departed": int(drive.departed(limit).sum()),
+        "steps_departed": int(out.sum()),
+        "wheel_out_s": float(seconds[out].sum()),
+        "centre_out_s": float(seconds[beyond].sum()),
+        "returned_s": _returned_s(drive, out),
     }
+
+
+def _returned_s(drive: Drive, out: np.ndarray) -> float | None:
+    """Return the time of the first step after the last one that is out."""
+    steps = np.flatnonzero(out)
+    if not len(steps) or out[-1]:
+        return None
+    return float(drive.time_s[steps[-1] + 1])
 
 
 def _card_run(drive: Drive, limit: float) -> dict[str, Any]:

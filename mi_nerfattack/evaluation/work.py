@@ -20,8 +20,6 @@ from mi_nerfattack.deploy.sites import CARLA, PlaceSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
     EXPERT,
-    NO_OBJECT,
-    RANDOM,
     EvaluateSettings,
     ExpertPolicy,
     check_roadside,
@@ -39,7 +37,7 @@ from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
-from mi_nerfattack.rollout.drive import Drive, departure_limits
+from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive, departure_limits
 from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.system.workers import (
     AbstractWork,

@@ -18,6 +18,9 @@ class Effort(Record):
         renders: frames.
         checkpoint_s: seconds spent on writing checkpoints.
         processes: how many have worked on the run.
+        forward_s: seconds of the attack's drives; the first of each process, which
+            compiles, is left out.
+        backward_s: seconds of the passes back through them, likewise.
     """
 
     wall_s: float = 0.0
@@ -25,6 +28,13 @@ class Effort(Record):
     renders: int = 0
     checkpoint_s: float = 0.0
     processes: int = 0
+    forward_s: float = 0.0
+    backward_s: float = 0.0
+
+    @property
+    def backward_multiple(self) -> float:
+        """Cost of a pass back, in drives; 1 where none was measured."""
+        return self.backward_s / self.forward_s if self.forward_s else 1.0
 
 
 class Account:
@@ -37,6 +47,15 @@ class Account:
 
     def __init__(self, started: float, before: Effort) -> None:
         self._started, self._before = started, before
+        self._passes = [0.0, 0.0]
+        self._compiled = False
+
+    def add_iteration(self, forward_s: float, backward_s: float) -> None:
+        """Add the seconds of an iteration of the attack."""
+        if self._compiled:
+            self._passes[0] += forward_s
+            self._passes[1] += backward_s
+        self._compiled = True
 
     def total(self, renders: int, checkpoint_s: float) -> Effort:
         """Return the effort so far.
@@ -52,4 +71,6 @@ class Account:
             renders=before.renders + renders,
             checkpoint_s=before.checkpoint_s + checkpoint_s,
             processes=before.processes + 1,
+            forward_s=before.forward_s + self._passes[0],
+            backward_s=before.backward_s + self._passes[1],
         )

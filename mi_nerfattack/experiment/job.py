@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,18 @@ from mi_nerfattack.backend.determinism import deterministic
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.baseline import Baseline
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.run_folder import RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages
-from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.rollout.drive import (
+    ATTACK,
+    BEST_RANDOM,
+    NO_OBJECT,
+    OWN,
+    departure_limit,
+)
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.scenario import Scenario, portable_text
 from mi_nerfattack.scenario.world import World, build_attack, build_world
@@ -49,6 +56,7 @@ class Job:
         output: the run folder.
         on_progress: told about every time step.
         on_notice: told what a resumed run ignores, or that there is none.
+        started: `time.perf_counter()` from which the wall time counts.
     """
 
     scenario: Scenario
@@ -57,6 +65,7 @@ class Job:
     output: Path
     on_progress: OnProgress = _quiet
     on_notice: OnNotice = _quiet
+    started: float = field(default_factory=time.perf_counter)
 
     def run(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
         """Claim the run folder and do the whole job; see :meth:`run_claimed`."""
@@ -82,7 +91,6 @@ class Job:
                 damaged, or of another scenario or versions.
             SetupError: the scenario is deterministic and the variant cannot be.
         """
-        started = time.perf_counter()
         identity = {**versions(), **self.scenario.identity()}
         text = portable_text(self.scenario, self.text)
         route, seed = self.scenario.scene.route, self.scenario.seed
@@ -97,7 +105,7 @@ class Job:
                 world.open(label).close()
             folder.begin()
             try:
-                return self._work(world, folder, Account(started, folder.effort))
+                return self._work(world, folder, Account(self.started, folder.effort))
             except InputError as err:
                 if not _is_of_disk(err):
                     folder.withdraw()
@@ -113,20 +121,22 @@ class Job:
             return account.total(renders, folder.checkpoint.seconds)
 
         stages = Stages(world, folder.drives, self.on_progress, effort)
-        original = world.appearance()
+        stages.looks[OWN] = original = world.appearance()
         with closing(stages):
-            stages.drive_all(SURROGATE, "own")
-            stages.drive_random(SURROGATE)
-            world.show(original)
-            attack = self._attack(world, folder, effort)
-            attacked = world.appearance()
-            stages.drive_all(SURROGATE, "attack")
+            for case in (NO_OBJECT, OWN):
+                stages.drive_all(SURROGATE, case)
+            attack = self._attack(world, folder, account, effort)
+            stages.looks[ATTACK] = world.appearance()
+            baseline = Baseline.of(world, original, attack, effort())
+            baseline.drive(stages)
+            for case in (BEST_RANDOM, ATTACK):
+                stages.drive_all(SURROGATE, case)
             for label in world.deployments:
-                world.show(original)
-                stages.drive_all(label, "own")
-                stages.drive_random(label)
-                world.show(attacked)
-                stages.drive_all(label, "attack")
+                for case in (NO_OBJECT, OWN):
+                    stages.drive_all(label, case)
+                stages.drive_random(label, baseline.deployed, baseline.look)
+                for case in (BEST_RANDOM, ATTACK):
+                    stages.drive_all(label, case)
         from mi_nerfattack.experiment.results import write_results  # it loads the plots
 
         return write_results(
@@ -134,16 +144,17 @@ class Job:
             world,
             stages.drives,
             attack,
-            {"own": original, "attack": attacked},
+            stages.looks,
             self.text,
-            effort().model_dump(),
+            effort,
             folder.checkpoint.ignored,
-            self._counter("surrogate: attribution", 3),
+            baseline.figures(),
+            self._counter(world, "surrogate: attribution", 3),
         )
 
-    def _counter(self, stage: str, sweeps: int) -> Callable[[int], None]:
+    def _counter(self, world: World, stage: str, sweeps: int) -> Callable[[int], None]:
         """Report the progress of some sweeps through a drive, step by step."""
-        done, total = 0, sweeps * self.scenario.drive.horizon
+        done, total = 0, sweeps * world.horizon
 
         def on_step(step: int) -> None:
             nonlocal done
@@ -154,7 +165,11 @@ class Job:
         return on_step
 
     def _attack(
-        self, world: World, folder: RunFolder, effort: Callable[[], Effort]
+        self,
+        world: World,
+        folder: RunFolder,
+        account: Account,
+        effort: Callable[[], Effort],
     ) -> GradientAttack:
         """Do the iterations that are missing; whatever stops them, keep those done."""
         attack = build_attack(world)
@@ -162,12 +177,12 @@ class Job:
         if checkpoint.found:
             checkpoint.restore(attack)
         if not attack.best_is_judged:
-            attack.judge_best(self._counter("surrogate: best so far", 1))
+            attack.judge_best(self._counter(world, "surrogate: best so far", 1))
             checkpoint.save(attack, effort())
         try:
             with held_interrupts() as check:
                 while attack.iteration < section.iterations:
-                    self._iterate(attack, check)
+                    self._iterate(attack, account, check)
                     if attack.iteration % section.checkpoint_every == 0:
                         checkpoint.save(attack, effort())
                     check()
@@ -179,8 +194,10 @@ class Job:
         attack.restore_best()
         return attack
 
-    def _iterate(self, attack: GradientAttack, check: Callable[[], None]) -> None:
-        horizon = self.scenario.drive.horizon
+    def _iterate(
+        self, attack: GradientAttack, account: Account, check: Callable[[], None]
+    ) -> None:
+        horizon = attack.rollout.horizon
         total = 2 * horizon * self.scenario.attack.iterations
         done = 2 * horizon * attack.iteration
         remark = f"iteration {attack.iteration + 1}"
@@ -192,7 +209,12 @@ class Job:
             nonlocal done
             del step
             done += 1
+            if done % (2 * horizon) == horizon:
+                times.append(time.perf_counter())
             self.on_progress("surrogate: optimisation", done, total, remark)
             check()
 
+        times = [time.perf_counter()]
         attack.step(on_step)
+        start, turn = times
+        account.add_iteration(turn - start, time.perf_counter() - turn)

@@ -11,15 +11,16 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 
-FORMAT = "mi_nerfattack attack drive 3"
+FORMAT = "mi_nerfattack attack drive 4"
 
 
 class DriveRecord(Record):
-    """Which drive of the run it is, and the cost of the run so far."""
+    """Which drive of the run it is, its objective, and the cost of the run so far."""
 
     environment: str
     case: str
     run: int
+    objective: float | None
     effort: Effort
 
 
@@ -40,6 +41,7 @@ class KeptDrives:
         self._identity = {"format": FORMAT, **identity}
         self._route, self._seed = route, seed
         self._drives: dict[tuple[str, str, int], Drive] = {}
+        self._objectives: dict[tuple[str, str, int], float | None] = {}
 
     def paths(self) -> list[Path]:
         """Return the files of drives that are there."""
@@ -70,12 +72,17 @@ class KeptDrives:
                 about = (record.environment, self._route, record.case, record.run)
                 with misfits_told(path):
                     seed = self._seed + record.run
-                    self._take_up(Drive(*about, seed, **kept.tensors))
+                    drive = Drive(*about, seed, **kept.tensors)
+                self._take_up(drive, record.objective)
         return max(efforts, key=lambda effort: effort.wall_s), ignored
 
     def take(self, environment: str, case: str, run: int) -> Drive | None:
         """Return a drive, None unless it is there."""
         return self._drives.get((environment, case, run))
+
+    def objective(self, environment: str, case: str, run: int) -> float | None:
+        """Return what :meth:`add` was told of a drive that is there."""
+        return self._objectives[environment, case, run]
 
     def drop(self, case: str) -> None:
         """Forget the drives of a case."""
@@ -95,17 +102,30 @@ class KeptDrives:
         if self.folder.exists():
             self.folder.rmdir()
 
-    def add(self, drive: Drive, effort: Effort) -> None:
-        """Write a drive of this run, and what the run has cost so far."""
+    def add(self, drive: Drive, effort: Effort, objective: float | None = None) -> None:
+        """Write a drive of this run.
+
+        Args:
+            drive: finished.
+            effort: what the run has cost so far.
+            objective: the attack's, for the look of a random drive.
+        """
         files.make_folder(self.folder)
         environment, case, run = drive.environment, drive.case, drive.run
-        record = DriveRecord(environment=environment, case=case, run=run, effort=effort)
+        record = DriveRecord(
+            environment=environment,
+            case=case,
+            run=run,
+            objective=objective,
+            effort=effort,
+        )
         path = self._path(environment, case, run)
         self._unit(path).write(drive.arrays(), record)
-        self._take_up(drive)
+        self._take_up(drive, objective)
 
-    def _take_up(self, drive: Drive) -> None:
-        self._drives[drive.environment, drive.case, drive.run] = drive
+    def _take_up(self, drive: Drive, objective: float | None) -> None:
+        key = drive.environment, drive.case, drive.run
+        self._drives[key], self._objectives[key] = drive, objective
 
     def _unit(self, path: Path) -> Unit[DriveRecord]:
         return Unit(path, self._identity, DriveRecord, REMEDY)

@@ -15,7 +15,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.io import exr, files
 from mi_nerfattack.report.plots.strip import first_person_strip
-from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.drive import CASES, NO_OBJECT, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
 
@@ -24,7 +24,10 @@ EXR_FRAMES = 3
 
 
 def write_pictures(
-    output: Path, world: World, drives: Iterable[Drive], looks: Mapping[str, Appearance]
+    output: Path,
+    world: World,
+    drives: Iterable[Drive],
+    looks: Mapping[str, Appearance | None],
 ) -> None:
     """Write ``strip.png`` and ``frames/``.
 
@@ -32,19 +35,20 @@ def write_pictures(
         output: the run folder.
         world: what was driven in; its textures are changed.
         drives: all drives.
-        looks: how the objects look and where they stand, per case.
+        looks: how the objects look and where they stand, per case; None: nowhere.
     """
     files.make_folder(output / "frames")
     rows: dict[str, list[np.ndarray]] = {}
     nominal = [d for d in drives if d.run == 0 and d.case in looks]
-    nominal.sort(key=lambda d: (environment_order(d.environment), d.case))
+    nominal.sort(key=lambda d: (environment_order(d.environment), CASES.index(d.case)))
     longest = max(nominal, key=lambda d: len(d.controls))
     columns = _steps(longest, STRIP_FRAMES)
     for drive in nominal:
-        world.show(looks[drive.case])
-        environment = world.open(drive.environment)
+        if look := looks[drive.case]:
+            world.show(look)
+        environment = world.open(drive.environment, empty=look is None)
         try:
-            row = rows[f"{drive.environment}\n{drive.case}"] = []
+            row = rows[f"{drive.environment}\n{drive.case.replace('_', ' ')}"] = []
             for step, frame in _again(environment, world, drive):
                 if step in columns:
                     row.append(frame.image)
@@ -75,7 +79,8 @@ def _again(
 def _write_frame(
     folder: Path, world: World, drive: Drive, step: int, frame: CameraFrame
 ) -> None:
-    names = [item.id for item in world.scenario.objects]
+    shown = () if drive.case == NO_OBJECT else world.scenario.objects
+    names = [item.id for item in shown]
     metadata = {
         "scenario": world.scenario.name,
         "environment": drive.environment,

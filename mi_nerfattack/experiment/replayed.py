@@ -18,9 +18,8 @@ import numpy as np
 from mi_nerfattack.evaluation.intervals import mean_interval
 from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.drives import control_change
-from mi_nerfattack.rollout.drive import CASES, Drive
+from mi_nerfattack.rollout.drive import CASES, OWN, Drive
 
-OWN = "own"
 COLUMNS = ("environment", "case", "run", "step", "time_s", "control", "change")
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.evaluation.metrics import metrics_document
+from mi_nerfattack.evaluation.metrics import metrics_document, validate
 from mi_nerfattack.experiment.attribution import attribute, write_attribution
+from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.pictures import write_pictures
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
 from mi_nerfattack.fields import save_field
@@ -17,7 +19,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.plots import drives as plots
 from mi_nerfattack.report.table import write_steps
-from mi_nerfattack.rollout.drive import Drive, departure_limit
+from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.world import Appearance, World, object_footprints
 
@@ -27,52 +29,52 @@ def write_results(
     world: World,
     drives: list[Drive],
     attack: GradientAttack,
-    looks: dict[str, Appearance],
+    looks: Mapping[str, Appearance | None],
     scenario_text: str,
-    cost: dict[str, Any],
+    effort: Callable[[], Effort],
     ignored: list[str],
+    baseline: dict[str, Any],
     on_step: OnStep | None = None,
 ) -> dict[str, Any]:
-    """Write everything but scenario and checkpoint.
+    """Write everything but scenario and checkpoint, ``metrics.json`` last but one.
 
     Args:
         output: the run folder, present.
         world: what was driven in; its textures are changed.
         drives: all drives.
         attack: the finished attack.
-        looks: how the objects look and where they stand, per case.
+        looks: how the objects look and where they stand, per case; None: nowhere.
         scenario_text: the scenario file.
-        cost: of the run, as `metrics.json` holds it.
+        effort: tells what the run has cost so far.
         ignored: changes between interruption and resumption that were ignored.
+        baseline: figures of the random looks.
         on_step: called after each of the 3 x horizon control periods of the
             attribution.
 
     Returns:
         the document that ``metrics.json`` holds.
     """
-    scenario = world.scenario
-    route = world.route
-    limit = departure_limit(route.lane_width_m, scenario.vehicle.width_m)
-    limits = {route.name: limit}
+    scenario, route = world.scenario, world.route
+    lane = Lane.of(route, scenario.vehicle.width_m)
+    lanes, limit = {route.name: lane}, lane.wheel_m
     replayed = [d for d in drives if world.is_open_loop(d.environment)]
     driven = [drive for drive in drives if drive not in replayed]
-    document = metrics_document(
-        scenario.model_dump(mode="json"), scenario.seed, driven, limits, cost
-    )
+    attacked = looks[ATTACK]
+    assert attacked is not None, "an attack has objects"
+    more: dict[str, Any] = {"baseline": baseline}
     unit = scenario.vehicle.car().control_unit
     if replayed:
-        document["replay"] = control_changes(replayed, unit, scenario.seed)
+        more["replay"] = control_changes(replayed, unit, scenario.seed)
     if attack.freedom.pose_rate is not None:
-        document["object_poses"] = _poses(world, looks["attack"])
+        more["object_poses"] = _poses(world, attacked)
     if ignored:
-        document["ignored_changes"] = ignored
-    files.write_json(output / "metrics.json", document)
-    write_steps(output / "steps.csv", driven, limits)
+        more["ignored_changes"] = ignored
+    write_steps(output / "steps.csv", driven, lanes)
     history = [asdict(record) for record in attack.history]
     files.write_json(output / "attack.json", history)
     files.make_folder(output / "objects")
     for grid, item, texture in zip(
-        world.fields, scenario.objects, looks["attack"].textures, strict=True
+        world.fields, scenario.objects, attacked.textures, strict=True
     ):
         grid.set_parameter("texture", texture)
         save_field(output / "objects" / f"{item.id}.safetensors", grid)
@@ -83,6 +85,10 @@ def write_results(
     images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = output / "strip.png"
     write_pictures(output, world, drives, looks)
+    values, cost = scenario.model_dump(mode="json"), effort().model_dump()
+    document = metrics_document(values, scenario.seed, driven, lanes, cost) | more
+    validate(document)
+    files.write_json(output / "metrics.json", document)
     write_report(output / "report.html", document, images, scenario_text, versions())
     return document
 

@@ -10,6 +10,7 @@ from mi_nerfattack.experiment.checkpoint import CheckpointFile
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.io import files, locks
+from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM
 
 CHECKPOINT = "checkpoint.safetensors"
 DRIVES = "drives"
@@ -63,7 +64,8 @@ class RunFolder:
         of_drives, ignored = self.drives.read(force)
         self.effort = max(of_attack, of_drives, key=lambda effort: effort.wall_s)
         if not self.checkpoint.found:
-            self.drives.drop("attack")
+            for case in (BEST_RANDOM, ATTACK):  # they depend on it
+                self.drives.drop(case)
         for line in dict.fromkeys([*self.checkpoint.ignored, *ignored]):
             on_notice(f"{self.path}: ignored, as told: {line}")
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
-from mi_nerfattack.fields.random_textures import random_texture
-from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive
+from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.world import World
+from mi_nerfattack.scenario.world import Appearance, World
 
 #: Called with stage, steps done, steps in all, and a remark.
 OnProgress = Callable[[str, int, int, str], None]
+#: Returns the objective of what the objects look like.
+Judge = Callable[[OnStep], float]
 
 
 @dataclass
@@ -31,38 +31,69 @@ class Stages:
         kept: drives that are finished.
         on_progress: told about every time step.
         effort: tells what the run has cost so far.
+        looks: by case, what all its drives show; None for no objects.
         drives: all drives that were asked for so far.
-        renders: frames of environments that are not the surrogate.
+        renders: frames that the world's surrogate did not render.
     """
 
     world: World
     kept: KeptDrives
     on_progress: OnProgress
     effort: Callable[[], Effort]
+    looks: dict[str, Appearance | None] = field(
+        default_factory=lambda: {NO_OBJECT: None}
+    )
     drives: list[Drive] = field(default_factory=list)
     renders: int = 0
     _opened: tuple[object, AbstractEnvironment] | None = None
 
     def drive_all(self, label: str, case: str) -> None:
-        """Drive from all initial states, objects as they are; once where it is open.
+        """Drive from all initial states with the look of a case; once in an open loop.
 
         Args:
             label: of the environment.
             case: of the drives.
         """
         count = 1 if self.world.is_open_loop(label) else len(self.world.initial)
+        if look := self.looks[case]:
+            self.world.show(look)
         for run in range(count):
             if not self._take(label, case, run, count):
-                self._drive(label, case, run, count, (label, case))
+                self._drive(label, case, run, count, case)
 
-    def drive_random(self, label: str) -> None:
-        """Drive with random textures, each from one of the initial states."""
-        scenario = self.world.scenario
-        count = scenario.baseline.textures or scenario.attack.iterations
+    def drive_random(
+        self,
+        label: str,
+        count: int,
+        look: Callable[[int], Appearance],
+        judge: Judge | None = None,
+    ) -> list[float | None]:
+        """Drive with random looks, each from one of the initial states.
+
+        Args:
+            label: of the environment.
+            count: of looks.
+            look: gives each by its number.
+            judge: gives the objective of each, beside the drive.
+
+        Returns:
+            the objectives; of a drive that was kept, what was kept.
+        """
+        sweeps, horizon = 1 if judge is None else 2, self.world.horizon
         for run in range(count):
-            if not self._take(label, "random", run, count):
-                self._set_random_textures(run)
-                self._drive(label, "random", run, count, (label, run))
+            if self._take(label, RANDOM, run, count, sweeps):
+                continue
+            self.world.show(look(run))
+            done, objective = run * sweeps * horizon, None
+            if judge is not None:
+                total = count * sweeps * horizon
+                objective = judge(
+                    lambda step, done=done, total=total: self.on_progress(
+                        f"{label}: {RANDOM}", done + step + 1, total, "judged"
+                    )
+                )
+            self._drive(label, RANDOM, run, count, run, sweeps, objective)
+        return [self.kept.objective(label, RANDOM, run) for run in range(count)]
 
     def close(self) -> None:
         """Close the environment that is open."""
@@ -70,40 +101,40 @@ class Stages:
             self._opened[1].close()
         self._opened = None
 
-    def _set_random_textures(self, k: int) -> None:
-        scenario, fields = self.world.scenario, self.world.fields
-        sequence = np.random.SeedSequence([scenario.seed, 1, k])
-        seeds = sequence.generate_state(len(fields))
-        kind = scenario.baseline.kind
-        self.world.set_textures(
-            [
-                random_texture(grid, kind, int(seed))
-                for grid, seed in zip(fields, seeds, strict=True)
-            ]
-        )
-
-    def _take(self, label: str, case: str, run: int, count: int) -> bool:
+    def _take(
+        self, label: str, case: str, run: int, count: int, sweeps: int = 1
+    ) -> bool:
         """Take up a drive that is finished; False if it is not."""
         found = self.kept.take(label, case, run)
         if found is None:
             return False
-        horizon = self.world.scenario.drive.horizon
+        horizon = self.world.horizon * sweeps
         done, total = (run + 1) * horizon, count * horizon
         self.on_progress(f"{label}: {case}", done, total, "kept")
         self.drives.append(found)
         return True
 
-    def _drive(self, label: str, case: str, run: int, count: int, look: object) -> None:
-        """Drive once, and keep the drive."""
+    def _drive(
+        self,
+        label: str,
+        case: str,
+        run: int,
+        count: int,
+        look: object,
+        sweeps: int = 1,
+        objective: float | None = None,
+    ) -> None:
+        """Drive once, and keep the drive; it is the last sweep of a run."""
         world, scenario = self.world, self.world.scenario
-        horizon = scenario.drive.horizon
+        horizon = world.horizon
+        before, total = ((run + 1) * sweeps - 1) * horizon, count * sweeps * horizon
 
         def on_step(step: int) -> None:
-            done = run * horizon + step + 1
-            self.on_progress(f"{label}: {case}", done, count * horizon, "")
+            self.on_progress(f"{label}: {case}", before + step + 1, total, "")
 
+        empty = case == NO_OBJECT
         found = drive(
-            self._environment(label, look),
+            self._environment(label, look, empty),
             world.policy,
             world.route,
             world.initial[run % len(world.initial)],
@@ -114,14 +145,17 @@ class Stages:
             run,
             label,
         )
-        self.renders += 0 if label == SURROGATE else len(found.states)
-        self.kept.add(found, self.effort())
+        counted = label == SURROGATE and not empty  # by the surrogate itself
+        self.renders += 0 if counted else len(found.states)
+        self.kept.add(found, self.effort(), objective)
         self.drives.append(found)
 
-    def _environment(self, label: str, look: object) -> AbstractEnvironment:
+    def _environment(
+        self, label: str, look: object, empty: bool
+    ) -> AbstractEnvironment:
         """Open an environment, unless it is; another look may need another one."""
-        key = look if self.world.builds_in(label) else label
+        key = label, look if empty or self.world.builds_in(label) else None
         if self._opened is None or self._opened[0] != key:
             self.close()
-            self._opened = key, self.world.open(label)
+            self._opened = key, self.world.open(label, empty)
         return self._opened[1]

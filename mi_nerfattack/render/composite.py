@@ -184,7 +184,7 @@ class DepthComposite(AbstractComposite):
     def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`; a layer is the field alone."""
         layers = [_see(item, rays, stop) for item in rays.light(posed)]
-        return Seen(depth_composite(layers), layers)
+        return Seen(depth_composite(layers), layers) if layers else nothing(rays)
 
     def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
         """See :meth:`AbstractComposite.ahead`."""
@@ -277,6 +277,11 @@ class DepthComposite(AbstractComposite):
             total = depth_composite(leaves)
             dr.backward_from(total.pair(cotangent))
             return [dr.grad(leaf) for leaf in leaves]
+
+
+def nothing(rays: Rays) -> Seen:
+    """Return what is seen of no layers."""
+    return Seen(dr.zeros(March, dr.width(rays.direction)), [])
 
 
 def _see(item: Layer, rays: Rays, stop: float) -> March:

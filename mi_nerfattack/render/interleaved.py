@@ -21,6 +21,7 @@ from mi_nerfattack.render.composite import (
     DepthComposite,
     Seen,
     Task,
+    nothing,
     select,
 )
 from mi_nerfattack.render.march import (
@@ -52,6 +53,8 @@ class InterleavedComposite(AbstractComposite):
     def render(self, posed: Sequence[Layer], rays: Rays, stop: float) -> Seen:
         """See :meth:`AbstractComposite.render`."""
         lit = rays.light(_fields(posed))
+        if not lit:
+            return nothing(rays)
         if len(lit) == 1:  # nothing to merge
             share = march(lit[0], rays, stop)
             return Seen(share, [share])

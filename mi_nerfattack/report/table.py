@@ -11,9 +11,9 @@ from typing import Any
 import rich.box
 import rich.table
 
-from mi_nerfattack.evaluation.metrics import limit_of
+from mi_nerfattack.evaluation.metrics import lane_of
 from mi_nerfattack.io import files
-from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.drive import Drive, Lane
 
 STEP_COLUMNS = (
     "environment",
@@ -33,7 +33,7 @@ STEP_COLUMNS = (
 
 
 def write_steps(
-    path: str | Path, drives: Iterable[Drive], limits: Mapping[str, float]
+    path: str | Path, drives: Iterable[Drive], lanes: Mapping[str, Lane]
 ) -> None:
     """Write a CSV file with a row per drive and step, atomically.
 
@@ -44,13 +44,13 @@ def write_steps(
     Args:
         path: the file.
         drives: written in the given order.
-        limits: departure limit of each route, metres.
+        lanes: of each route.
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(STEP_COLUMNS)
     for drive in drives:
-        writer.writerows(_rows(drive, limit_of(drive.route, limits)))
+        writer.writerows(_rows(drive, lane_of(drive.route, lanes).wheel_m))
     files.write_text(path, buffer.getvalue())
 
 
@@ -75,13 +75,14 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
         document: as of `metrics.metrics_document`.
 
     Returns:
-        A row per route, environment and case; `steps departed` are beyond the limit.
+        A row per route, environment and case: `wheel out` is the time beyond the limit,
+        mean over the runs, `left` how many runs had such a time.
     """
     table = _distances()
     table.add_column("route", overflow="fold", max_width=14)
     for name in ("environment", "case"):
         table.add_column(name, no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "total\n(m)", "steps\ndeparted"):
+    for name in ("runs", "mean\n(m)", "max\n(m)", "wheel\nout (s)", "left"):
         table.add_column(name, justify="right", no_wrap=True)
     for route, environments in document["routes"].items():
         for environment, cases in environments.items():
@@ -142,6 +143,6 @@ def _cells(figures: Mapping[str, Any]) -> list[str]:
         str(figures["n"]),
         f"{figures['cross_track_mean_m']:.3f}",
         f"{figures['cross_track_max_m']:.3f}",
-        f"{figures['cross_track_total']:.2f}",
-        str(figures["steps_departed"]),
+        f"{figures['wheel_out_s']:.1f}",
+        str(figures["drives_departed"]),
     ]

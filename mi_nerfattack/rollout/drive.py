@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Name, Whole, checked
+from mi_nerfattack.ranges import Name, Positive, Whole, checked
 from mi_nerfattack.vehicle.route.route import Route
 
 #: In the order of documents and plots; others follow, by name.
@@ -22,8 +22,16 @@ ENVIRONMENTS = (
     "carla",
 )
 
-#: What objects show in a drive, in the order of documents and plots.
-CASES = ("no_object", "own", "random", "best_random", "attack")
+#: What objects show in a drive.
+NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK = (
+    "no_object",
+    "own",
+    "random",
+    "best_random",
+    "attack",
+)
+#: In the order of documents and plots.
+CASES = (NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +121,26 @@ def departure_limit(lane_width_m: float, car_width_m: float) -> float:
             "be positive metres and the car narrower than the lane"
         )
     return (lane_width_m - car_width_m) / 2
+
+
+@dataclass(frozen=True)
+@checked("Lane")
+class Lane:
+    """How far from a lane's centre a car may be.
+
+    Args:
+        wheel_m: beyond it a wheel is out of the lane: the departure limit, metres.
+        centre_m: beyond it the car's centre is: half the lane's width, metres.
+    """
+
+    wheel_m: Positive
+    centre_m: Positive
+
+    @classmethod
+    def of(cls, route: Route, car_width_m: float) -> Lane:
+        """Return the lane of a route; InputError unless it is wider than the car."""
+        limit = departure_limit(route.lane_width_m, car_width_m)
+        return cls(limit, route.lane_width_m / 2)
 
 
 def departure_limits(routes: Iterable[Route], car_width_m: float) -> dict[str, float]:

@@ -85,12 +85,10 @@ class FieldSensor(AbstractDifferentiableSensor):
         self.objects = list(objects)
         self.camera = camera
         self.mount = mount or CameraMount()
-        self.jitter_seed = jitter_seed
-        self.stop = stop
+        self.jitter_seed, self.stop = jitter_seed, stop
         self.composite = composite or DepthComposite()
         self.composite.check(self._fields)
-        self.surroundings = surroundings
-        self.clip = clip or Clip()
+        self.surroundings, self.clip = surroundings, clip or Clip()
         near = self.clip.near_m * ray_lengths(camera).ravel()
         self._near = mi.Float(near.tolist()) if self.clip.near_m else None
         self.renders = 0
@@ -240,8 +238,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         """Return what frozen functions read or depend on beside their arguments."""
         # Recordings hold literals of one image's size; a task has none.
         sizes = [dr.width(x) for x in arguments if not isinstance(x, Task)]
-        state = [posed.state() for posed in self._fields]
         view = [self.camera, self.mount, self.jitter_seed, self._near]
+        state = [posed.state() for posed in self._fields]
         return [self.composite, self.stop, view, sizes, state]
 
     def start_gradient(self, poses: bool = False) -> None:
@@ -359,8 +357,10 @@ class FieldSensor(AbstractDifferentiableSensor):
         return [*self.scene, *self.objects]
 
     def _behind(self, direction: mi.Vector3f, ends: Ends | None) -> mi.Color3f:
-        sky = self._fields[0].background
-        return sky(direction) if ends is None else ends.radiance
+        if ends is not None:
+            return ends.radiance
+        none = dr.zeros(mi.Color3f, dr.width(direction))
+        return self._fields[0].background(direction) if self._fields else none
 
     def _develop(
         self, total: March, direction: mi.Vector3f, ends: Ends | None

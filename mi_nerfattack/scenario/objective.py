@@ -95,9 +95,12 @@ class AllTimes(Section):
     at: Literal["all_times"] = "all_times"
     weights: Weights = Field(default=PlainWeights(), validation_alias="(weights)")
 
-    def build(self, cost: StageCost, scenario: Scenario) -> AbstractObjective:
+    def build(
+        self, cost: StageCost, scenario: Scenario, route: Route
+    ) -> AbstractObjective:
         """Sum the cost over time."""
-        steps, dt = scenario.drive.horizon, scenario.vehicle.dt_s
+        dt = scenario.vehicle.dt_s
+        steps = scenario.drive.steps(route, dt)
         return StageSum(cost, self.weights.build(steps, dt))
 
 
@@ -106,7 +109,9 @@ class AtEnd(Section):
 
     at: Literal["end"]
 
-    def build(self, cost: StageCost, scenario: Scenario) -> AbstractObjective:
+    def build(
+        self, cost: StageCost, scenario: Scenario, route: Route
+    ) -> AbstractObjective:
         """Take the cost of the last state."""
         return Terminal(cost)
 
@@ -153,7 +158,7 @@ class AbstractStageTerm(AbstractTerm):
         self, scenario: Scenario, route: Route, dynamics: AbstractDynamics
     ) -> AbstractObjective:
         """Make the term."""
-        return self.at.build(self.cost(route, dynamics), scenario)
+        return self.at.build(self.cost(route, dynamics), scenario, route)
 
     @abstractmethod
     def cost(self, route: Route, dynamics: AbstractDynamics) -> StageCost:
@@ -273,7 +278,7 @@ class ObjectiveSection(Section):
 
         Args:
             scenario: gives horizon, control period and the width of the vehicle.
-            route: the lane centre.
+            route: the lane centre, with the vehicle's speed.
             dynamics: the vehicle, for the number of rows of a state.
 
         Raises:

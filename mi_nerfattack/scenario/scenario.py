@@ -36,6 +36,7 @@ from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import PilotNetSection, PolicySection
 from mi_nerfattack.scenario.section import Location, Section, problems, refuse
 from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
+from mi_nerfattack.vehicle.route.route import Route
 
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
 _MARK = "a line that no file has"
@@ -108,11 +109,35 @@ class CameraSection(Section):
 class DriveSection(Section):
     """What is driven."""
 
-    horizon: Count = 60
+    start_m: NonNegative = 0.0  # along the route: the nominal pose
+    length_m: Positive | None = None  # of a drive; to the end of the route, or one lap
+    horizon: Count | None = None  # control periods of a drive, in place of length_m
     runs: Count = 4  # drives of each case but random
     lateral_sd_m: NonNegative = 0.1
     heading_sd_deg: NonNegative = 0.5
     covariance: tuple[Triple, Triple, Triple] | None = None  # see _check_covariance
+
+    def steps(self, route: Route, period: float) -> int:
+        """Return the control periods of a drive, at least 1.
+
+        As many as a vehicle of the route's speed needs at most for the length.
+
+        Args:
+            route: that is driven, with the vehicle's speed.
+            period: seconds between two controls.
+        """
+        if self.horizon is not None:
+            return self.horizon
+        rest = route.length if route.closed else route.length - self.start_m
+        length = rest if self.length_m is None else self.length_m
+        return max(1, int(length / (route.speed_ms * period) + 1e-6))
+
+    @model_validator(mode="after")
+    def _check_end(self) -> Any:
+        """Refuse two ends."""
+        if self.horizon is not None and self.length_m is not None:
+            refuse("horizon", "stands beside length_m; give one of them, or neither")
+        return self
 
     @model_validator(mode="after")
     def _check_covariance(self) -> Any:
@@ -135,9 +160,10 @@ class DriveSection(Section):
 
 
 class BaselineSection(Section):
-    """Random textures to compare with."""
+    """Random textures, or poses, to compare with."""
 
-    textures: Count | None = None  # as many as attack iterations if left out
+    textures: Count | None = None  # looks; as many as cost what the attack does
+    deployment_textures: Count = 8  # of these, driven with in each deployment
     kind: Literal["noise", "blobs", "flat", "mixed"] = "mixed"
 
 

@@ -61,7 +61,7 @@ class World:
         policy: the policy under test.
         motion: of the vehicle.
         objective: what an attack makes smaller.
-        initial: (runs, 3) initial states, the first one nominal.
+        initial: (runs, 3) initial states, none of which an attack starts from.
     """
 
     scenario: Scenario
@@ -89,6 +89,11 @@ class World:
         )
 
     @property
+    def horizon(self) -> int:
+        """Control periods of a drive."""
+        return self.scenario.drive.steps(self.route, self.scenario.vehicle.dt_s)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """The environments that are driven in, the surrogate first."""
         return SURROGATE, *self.deployments
@@ -101,16 +106,21 @@ class World:
         """Whether an environment must be opened anew for objects of another look."""
         return label != SURROGATE and self.deployments[label].builds_in
 
-    def open(self, label: str) -> AbstractEnvironment:
-        """Make an environment, with the objects as they look and stand at present."""
+    def open(self, label: str, empty: bool = False) -> AbstractEnvironment:
+        """Make an environment, with the objects as they look and stand at present.
+
+        Args:
+            label: of the environment.
+            empty: leave the objects out.
+        """
+        objects = [] if empty else self.surrogate.objects
         if label != SURROGATE:
-            return self.deployments[label].open(self.surrogate.objects)
+            return self.deployments[label].open(objects)
         vehicle = self.scenario.vehicle
         car = vehicle.car()
         rest = vehicle.dt_s, car.max_control, car.control_unit
-        return SurrogateEnvironment(
-            self.surrogate, KinematicVehicle(self.motion, *rest)
-        )
+        sensor = self.surrogate.showing([]) if empty else self.surrogate
+        return SurrogateEnvironment(sensor, KinematicVehicle(self.motion, *rest))
 
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
@@ -144,6 +154,11 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     motion = scenario.vehicle.motion()
     speed = getattr(motion.dynamics, "speed", route.speed_ms)
     route = replace(route, speed_ms=speed)
+    if scenario.drive.start_m >= route.length:
+        raise InputError(
+            f"drive.start_m: {scenario.drive.start_m:g} m; route {route.name!r} is "
+            f"{route.length:.1f} m long, start before its end"
+        )
     objective = scenario.objective.build(scenario, route, motion.dynamics)
     where = Place(
         scene=place.deployment.file,
@@ -209,12 +224,13 @@ def build_attack(world: World) -> GradientAttack:
     rollout = Rollout(
         loop,
         world.objective,
-        scenario.drive.horizon,
+        world.horizon,
         scenario.objective.reduction.build(),
         section.adjoint.build(),
         section.attached,
     )
     poses = initial_states(scenario, world.route, section.poses, 2)
+    poses[0] = world.route.pose_at(scenario.drive.start_m)
     freedom = section.freedom.build()
     return GradientAttack(rollout, world.route, loop.initial(poses), freedom)
 
@@ -246,16 +262,16 @@ def _load_scene(scenario: Scenario) -> Layer:
 def initial_states(
     scenario: Scenario, route: Route, count: int, stream: int
 ) -> np.ndarray:
-    """Draw initial states normally around the route's start.
+    """Draw initial states normally around the nominal pose.
 
     Args:
         scenario: gives seed, and standard deviations or covariance.
-        route: its first point is the nominal pose.
+        route: the nominal pose is its own, `drive.start_m` from its first point.
         count: number of states.
         stream: different streams give independent states.
 
     Returns:
-        (count, 3), metres and radians; the first is the nominal pose itself.
+        (count, 3), metres and radians.
 
     Source: appendix A.4.
     """
@@ -268,7 +284,7 @@ def initial_states(
         values, vectors = np.linalg.eigh(section.covariance)
         factor = vectors * np.sqrt(values.clip(min=0))
         shifts[:] = factor @ rng.standard_normal((3, count))
-    shifts[:, 0] = 0.0
+    shifts[0] += section.start_m
     return route.pose_at(*shifts)
 
 

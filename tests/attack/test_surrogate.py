@@ -58,6 +58,23 @@ def test_images_are_mitsubas(folder, lens, walls, composite):
         assert (error <= 1e-4).mean() >= 0.999
 
 
+def test_without_objects_it_shows_the_rest(folder):
+    """Also where nothing but surfaces is left; equal to a scene that never had them."""
+    description = walled.scene_dict(folder)
+    integrator = description["integrator"]
+    objects = {name: integrator.pop(name) for name in ("far", "near")}
+    fog_alone = dict(integrator)
+    del integrator["scene"]
+    for parts, wanted in ((fog_alone, fog_alone), (integrator, integrator["behind"])):
+        full = {**description, "integrator": {**parts, **objects}}
+        sensor = sensor_of(full).showing([])
+        state = walled.close_loop(sensor).initial(STATES[:1])
+        image = sensor.observe(state, 0).image.numpy()[0]
+        bare = walled.rendered({**description, "integrator": wanted}, STATES[0])
+        assert abs(image - linear_to_srgb_numpy(bare)).max() <= 1e-4
+        assert image.std() > 0.01
+
+
 def rollout(sensor, horizon, attached=False, adjoint=None):
     loop = walled.close_loop(sensor)
     cost = StageSum(toy.square_error)

@@ -24,8 +24,6 @@ from mi_nerfattack.deploy.placement import scene_ground
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
-    NO_OBJECT,
-    RANDOM,
     EvaluateSettings,
     ExpertPolicy,
     drive,
@@ -39,7 +37,7 @@ from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.report.table import card_table
-from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, departure_limit
 from mi_nerfattack.training.presets import EVALUATIONS
 from mi_nerfattack.vehicle.expert import expert_for
 from mi_nerfattack.vehicle.route.route import Route, load_routes

@@ -19,12 +19,11 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report import table
 from mi_nerfattack.report.pages import attack as page
 from mi_nerfattack.report.plots import drives as plots
-from mi_nerfattack.rollout.drive import Drive, departure_limit
+from mi_nerfattack.rollout.drive import CASES, Drive, Lane, departure_limit
 
 #: What `metrics.json` of a run folder holds.
 RUN_ENVIRONMENTS = ("surrogate", "deployment")
-RUN_CASES = ("own", "random", "attack")
-LIMITS = {"straight": 0.85}
+LANES = {"straight": Lane(0.85, 1.75)}
 COST = {"wall_s": 12.5, "peak_memory_mb": 900.0, "renders": 240}
 
 
@@ -53,7 +52,7 @@ def make_document(drives=None):
         make_drive([0.5, 0.9, 1.0], run=1),
         make_drive([1.0, 1.2], case="attack", environment="deployment"),
     ]
-    return metrics.metrics_document({"name": "x"}, 7, drives, LIMITS, COST)
+    return metrics.metrics_document({"name": "x"}, 7, drives, LANES, COST)
 
 
 # Drives and the departure limit
@@ -103,14 +102,14 @@ def test_step_at_the_limit_has_not_departed():
 def test_environments_of_your_own_come_after_ours():
     names = ("zoo", "mine", "deployment", "surrogate")
     drives = [make_drive([0.1], environment=name) for name in names]
-    found = metrics.summarise(drives, LIMITS)["straight"]
+    found = metrics.summarise(drives, LANES)["straight"]
     assert list(found) == ["surrogate", "deployment", "mine", "zoo"]
     assert list(make_document(drives)["routes"]["straight"]) == list(found)
 
 
 def test_sums_by_hand():
     runs = [make_drive([0.5, 0.9, -1.0], run=1), make_drive([0.1, -0.3, 0.2], run=0)]
-    figures = metrics.summarise(runs, LIMITS)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
     assert figures["n"] == 2
     assert figures["cross_track_mean_m"] == pytest.approx(3.0 / 6)
     assert figures["cross_track_max_m"] == 1.0
@@ -125,9 +124,31 @@ def test_sums_by_hand():
     assert (first["steps_departed"], second["steps_departed"]) == (0, 2)
 
 
+def test_time_out_of_the_lane_and_of_return():
+    left = [0.9, 2.0, -1.8, 0.8, 0.9, 0.2]  # out, out with the centre, in, out, in
+    runs = [
+        make_drive(left, run=0),
+        make_drive([0.9] * 4, run=1),
+        make_drive([0.85], run=2),
+    ]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
+    rows = figures["per_run"]
+    assert [row["wheel_out_s"] for row in rows] == pytest.approx([0.4, 0.4, 0])
+    assert [row["centre_out_s"] for row in rows] == pytest.approx([0.2, 0, 0])
+    assert [row["returned_s"] for row in rows] == [pytest.approx(0.6), None, None]
+    assert figures["wheel_out_s"] == pytest.approx(0.8 / 3)
+    assert figures["centre_out_s"] == pytest.approx(0.2 / 3)
+
+
+def test_seconds_are_those_of_the_steps():
+    drive = make_drive([0.0, 1.0, 0.0], time_s=[0.1, 0.6, 0.7])
+    figures = metrics.summarise([drive], LANES)["straight"]["surrogate"]["random"]
+    assert figures["wheel_out_s"] == pytest.approx(0.5)
+
+
 def test_mean_is_over_steps_when_runs_differ_in_length():
     runs = [make_drive([0.0] * 9, run=0), make_drive([1.0], run=1)]
-    figures = metrics.summarise(runs, LIMITS)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
     assert figures["cross_track_mean_m"] == pytest.approx(0.1)
 
 
@@ -135,35 +156,42 @@ def test_interval_of_two_runs_is_their_range():
     # A quarter of the resamples of two runs holds one of them twice: both 2.5 %
     # quantiles of the mean fall on the runs' means themselves.
     runs = [make_drive([0.1, 0.1], run=0), make_drive([0.4, 0.4], run=1)]
-    figures = metrics.summarise(runs, LIMITS)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
     assert figures["cross_track_mean_ci95_m"] == pytest.approx([0.1, 0.4])
+
+
+@pytest.mark.parametrize("case", [name for name in CASES if name != "random"])
+def test_starts_alone_give_no_interval(case):
+    runs = [make_drive([0.1 * run], case=case, run=run) for run in range(3)]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"][case]
+    assert figures["cross_track_mean_ci95_m"] is None
 
 
 def test_interval_covers_the_normal_one():
     rng = np.random.default_rng(5)
     means = rng.uniform(0.1, 0.3, 60)
     runs = [make_drive([mean], run=run) for run, mean in enumerate(means)]
-    figures = metrics.summarise(runs, LIMITS, seed=2)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs, LANES, seed=2)["straight"]["surrogate"]["random"]
     half = 1.96 * means.std() / np.sqrt(60)
     expected = [means.mean() - half, means.mean() + half]
     assert figures["cross_track_mean_ci95_m"] == pytest.approx(expected, abs=0.1 * half)
-    again = metrics.summarise(runs, LIMITS, seed=2)["straight"]["surrogate"]["random"]
+    again = metrics.summarise(runs, LANES, seed=2)["straight"]["surrogate"]["random"]
     assert again == figures
 
 
 def test_interval_of_equal_runs_is_a_point_and_of_one_run_null():
     runs = [make_drive([0.25], run=run) for run in range(4)]
-    figures = metrics.summarise(runs, LIMITS)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
     assert figures["cross_track_mean_ci95_m"] == [0.25, 0.25]
-    figures = metrics.summarise(runs[:1], LIMITS)["straight"]["surrogate"]["random"]
+    figures = metrics.summarise(runs[:1], LANES)["straight"]["surrogate"]["random"]
     assert figures["cross_track_mean_ci95_m"] is None
 
 
-def test_same_run_twice_and_missing_limit_are_refused():
+def test_same_run_twice_and_missing_lane_are_refused():
     with pytest.raises(InputError, match="run 0 twice"):
-        metrics.summarise([make_drive([0.1]), make_drive([0.2])], LIMITS)
-    with pytest.raises(InputError, match="no limit for route 'left'"):
-        metrics.summarise([make_drive([0.1], route="left")], LIMITS)
+        metrics.summarise([make_drive([0.1]), make_drive([0.2])], LANES)
+    with pytest.raises(InputError, match="no lane for route 'left'"):
+        metrics.summarise([make_drive([0.1], route="left")], LANES)
 
 
 def test_document_follows_the_schema(tmp_path):
@@ -171,7 +199,7 @@ def test_document_follows_the_schema(tmp_path):
     files.write_json(tmp_path / "metrics.json", document)
     read = files.read_json(tmp_path / "metrics.json")
     metrics.validate(read)
-    assert (read["schema"], read["seed"], read["scenario"]) == (1, 7, {"name": "x"})
+    assert (read["schema"], read["seed"], read["scenario"]) == (2, 7, {"name": "x"})
     assert read["cost"] == COST
     assert list(read["routes"]["straight"]["surrogate"]) == ["own", "random"]
     case = read["routes"]["straight"]["deployment"]["attack"]
@@ -182,7 +210,9 @@ def test_document_follows_the_schema(tmp_path):
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (("schema",), 2, "metrics.schema"),
+        (("schema",), 1, "metrics.schema"),
+        (("flags",), [1], "metrics.flags.0"),
+        (("saturated_share",), 1.5, "metrics.saturated_share"),
         (("cost", "renders"), 1.5, "metrics.cost.renders"),
         (("cost", "wall_s"), float("nan"), "metrics.cost.wall_s"),
         (("routes",), {}, "metrics.routes"),
@@ -229,7 +259,7 @@ def test_validate_names_a_missing_key():
 
 def test_steps_hold_a_row_per_step(tmp_path):
     drives = [make_drive([0.1, -0.9]), make_drive([1 / 3], case="attack")]
-    table.write_steps(tmp_path / "steps.csv", drives, LIMITS)
+    table.write_steps(tmp_path / "steps.csv", drives, LANES)
     rows = list(csv.DictReader(io.StringIO(files.read_text(tmp_path / "steps.csv"))))
     assert tuple(rows[0]) == table.STEP_COLUMNS
     assert [row["step"] for row in rows] == ["1", "2", "1"]
@@ -244,10 +274,10 @@ def test_metrics_table_fits_80_columns():
     drives = [
         make_drive([123.4, 0.1], environment, case, run, route="roundabout")
         for environment in RUN_ENVIRONMENTS
-        for case in RUN_CASES
+        for case in CASES
         for run in range(100)
     ]
-    figures = metrics.summarise(drives, {"roundabout": 0.85})
+    figures = metrics.summarise(drives, {"roundabout": Lane(0.85, 1.75)})
     console = rich.console.Console(width=80, file=io.StringIO(), color_system=None)
     console.print(table.metrics_table({"routes": figures}))
     text = console.file.getvalue()
@@ -358,7 +388,9 @@ def test_page_is_self_contained_and_escaped(tmp_path):
         make_drive([0.125], route="<b>x</b>"),
         make_drive([1.0], route="<b>x</b>", run=1),
     ]
-    document = metrics.metrics_document({}, 7, drives, {"<b>x</b>": 0.85}, COST)
+    document = metrics.metrics_document(
+        {"name": "<i>"}, 7, drives, {"<b>x</b>": Lane(0.85, 1.75)}, COST
+    )
     title, scenario = 'Plot "1" <script>alert(1)</script>', "a = '</pre>$seed & <i>'"
     path = tmp_path / "report.html"
     page.write_report(
@@ -373,6 +405,7 @@ def test_page_is_self_contained_and_escaped(tmp_path):
     assert title in text
     assert "3.9<1" in text
     assert "0.562" in text
+    assert "<title>&lt;i&gt;</title>" in files.read_text(path)
     assert "<script" not in files.read_text(path)
     assert all(link.startswith("data:") for link in reader.links)
     (source,) = reader.sources

@@ -40,8 +40,9 @@ def leave_out_results(monkeypatch):
     from mi_nerfattack.experiment import results
 
     def only_numbers(
-        output, world, drives, attack, textures, text, cost, ignored, *more
+        output, world, drives, attack, looks, text, effort, ignored, *more
     ):
+        cost = effort().model_dump()
         document = {"cost": cost, "ignored_changes": ignored, "drives": drives}
         files.write_json(output / "metrics.json", {"cost": cost})
         return document

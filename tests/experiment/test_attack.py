@@ -20,6 +20,7 @@ from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.render.rays import March
+from mi_nerfattack.rollout.drive import CASES
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenes import bundled
 
@@ -35,14 +36,21 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     document = json.loads((output / "metrics.json").read_text())
     validate(document)
     route = document["routes"]["line"]
-    counts = {"own": 2, "random": 3, "attack": 2}
-    for environment in ("surrogate", "deployment"):
-        for case, count in counts.items():
-            assert route[environment][case]["n"] == count
-    # frames driven: two batches of 2, 3 random, 3 attacked forward and back; transfer
-    assert document["cost"]["renders"] >= 4 * (2 + 2 + 3 + 6 + 2 + 2 + 3)
+    baseline, cost = document["baseline"], document["cost"]
+    count, few = baseline["textures"], baseline["deployment_textures"]
+    multiple = cost["backward_s"] / cost["forward_s"]
+    assert baseline["backward_multiple"] == pytest.approx(multiple)
+    assert count == round(3 * (1 + multiple)) == len(baseline["objectives"])
+    assert few == min(count, 8)
+    for environment, drawn in (("surrogate", count), ("deployment", few)):
+        counts = {case: drawn if case == "random" else 2 for case in CASES}
+        assert {k: v["n"] for k, v in route[environment].items()} == counts
+    rows = [(run["seed"], run["steps"]) for run in route["surrogate"]["own"]["per_run"]]
+    assert rows == [(1, 4), (2, 4)]
+    # four cases of 2 twice, random looks judged, driven, deployed; 3 there and back
+    assert cost["renders"] >= 4 * (16 + 2 * count + few + 6)
     rows = (output / "steps.csv").read_text().splitlines()
-    assert len(rows) == 1 + 4 * 2 * (2 + 3 + 2)
+    assert len(rows) == 1 + 4 * (16 + count + few)
     attacked = load_grid(output / "objects" / "ball.safetensors")
     original = load_grid(scenario_folder / "object.safetensors")
     change = attacked.texture.numpy() - original.texture.numpy()
@@ -55,10 +63,12 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
         )
         assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
         assert metadata["scenario"] == "kill"
+        bare, _ = read_layers(output / "frames" / f"{environment}_no_object_0000.exr")
+        assert "object" not in bare
     plots = ("overhead", "errors", "convergence", "strip")
     for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000
-    assert "<html" in (output / "report.html").read_text()
+    assert "<title>kill</title>" in (output / "report.html").read_text()
     # a second run into the same folder is refused and changes nothing
     before = (output / "metrics.json").read_bytes()
     again = run(

@@ -22,6 +22,7 @@ from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.drive import CASES
 from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_world
@@ -89,7 +90,7 @@ def test_the_surrogates_drives_are_those_of_the_environment(folder, whole):
             for d in kept
             if (d.environment, d.case, d.run) == ("surrogate", "own", run)
         )
-        horizon = scenario.drive.horizon
+        horizon = world.horizon
         found = drive(environment, policy, world.route, start, 0, horizon)
         assert np.array_equal(found.states, row.states)
         assert np.array_equal(found.controls, row.controls)
@@ -107,20 +108,22 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     document = job(folder, output, (TABLE, SEVERAL)).run()
     validate(document)
     assert server.is_as_before
-    cases = {"own": 2, "random": 2, "attack": 2}
+    cases = dict.fromkeys(CASES, 2)
     environments = document["routes"]["line"]
     assert list(environments) == ["surrogate", "mujoco", "carla", "lit"]
     for found in environments.values():
         assert {case: figures["n"] for case, figures in found.items()} == cases
     replayed = document["replay"]["tape"]
     assert replayed["frames"] == 2 and replayed["control_unit"] == "rad/s"
-    assert set(replayed["cases"]) == {"random", "attack"}
-    assert replayed["cases"]["attack"]["n"] == 1
-    assert replayed["cases"]["attack"]["control_change_max"] > 1e-4
+    assert set(replayed["cases"]) == set(CASES) - {"own"}
+    for case in ("no_object", "best_random", "attack"):
+        assert replayed["cases"][case]["n"] == 1
+        assert replayed["cases"][case]["control_change_mean_ci95"] is None
+        assert replayed["cases"][case]["control_change_max"] > 1e-4
     assert "cross_track" not in json.dumps(document["replay"])
     with (output / "controls.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (1 + 2 + 1)
+    assert len(rows) == 2 * (4 + 2)
     assert all(float(r["change"]) == 0 for r in rows if r["case"] == "own")
     assert "tape" not in (output / "steps.csv").read_text()
     for name in ("strip", "overhead", "errors", "controls_tape"):

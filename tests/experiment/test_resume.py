@@ -52,12 +52,12 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
 @pytest.mark.usefixtures("no_results")
 def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
-    interrupt(folder, output, "surrogate: random", 3)  # in the second of two drives
+    interrupt(folder, output, "surrogate: random", 7)  # 2 of 2, judged, in the drive
     interrupt(folder, output, "deployment: attack", 1, resume=True)
     before = checkpoint_of(output)
     written = {path: path.stat().st_mtime_ns for path in output.glob("drives/*")}
-    # 2 of their own and 2 random ones twice, 2 of the attack
-    assert len(written) == 10
+    # 2 of each case twice, but for the last
+    assert len(written) == 18
 
     def watch(stage, done, total, remark):
         seen.append((stage, done, remark))
@@ -74,10 +74,10 @@ def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     }
     for name, value in checkpoint_of(output).items():
         assert np.array_equal(value, before[name], equal_nan=True), name
-    assert len(list(output.glob("drives/*"))) == 12
+    assert len(list(output.glob("drives/*"))) == 20
     assert all(path.stat().st_mtime_ns == time for path, time in written.items())
-    # 2 + 2 random + attack + 2, twice; the drives that were cut short count too
-    assert document["cost"]["renders"] >= 2 * (2 + 2 + 2) * 2 + 6 * 2 * 2
+    # 2 of each case, twice, 2 judged, the attack; drives that were cut short too
+    assert document["cost"]["renders"] >= 2 * (10 + 10 + 2) + 6 * 2 * 2
     assert_same_drives(document["drives"], whole[1]["drives"])
 
 

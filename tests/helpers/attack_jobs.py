@@ -11,8 +11,9 @@ import pytest
 from helpers import toy_loop as toy
 
 from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import CASES
 
-STAGES = ("own", "random", "attack")
+STAGES = CASES
 
 
 def write_scenario(folder, changes):

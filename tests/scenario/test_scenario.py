@@ -119,6 +119,12 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
             23,
             ["covariance", "lateral_sd_m"],
         ),
+        (
+            "[attack]",
+            "[drive]\nlength_m = 3.0\nhorizon = 60\n[attack]",
+            23,
+            ["horizon", "length_m", "give one of them"],
+        ),
     ],
 )
 def test_errors_name_key_and_line(write, old, new, line, words):
@@ -191,13 +197,31 @@ def test_initial_poses_scatter_by_the_covariance(write, rank):
     scenario, _ = load_scenario(write(MINIMAL.replace("[attack]", text)))
     route = Route("north", 0, np.array([[2.0, 1.0], [2.0, 9.0], [4.0, 20.0]]))
     states = initial_states(scenario, route, 20001, 0)
-    np.testing.assert_allclose(states[0], [2.0, 1.0, np.pi / 2])
     # along the lane is +y, to the left of it -x
-    shifts = (states[1:] - states[0])[:, [1, 0, 2]] * [1, -1, 1]
+    shifts = (states - [2.0, 1.0, np.pi / 2])[:, [1, 0, 2]] * [1, -1, 1]
     deviation = np.sqrt(wanted.diagonal())
     scale = np.outer(deviation, deviation)
     np.testing.assert_allclose(np.cov(shifts.T) / scale, wanted / scale, atol=0.04)
     np.testing.assert_allclose(shifts.mean(axis=0) / deviation, 0, atol=0.04)
+
+
+@pytest.mark.parametrize(
+    ("keys", "closed", "steps"),
+    [
+        ("", False, 46),  # 23.2 m at 5 m/s and 0.1 s
+        ("start_m = 13.2", False, 20),
+        ("start_m = 23.1", False, 1),
+        ("start_m = 13.2\nlength_m = 4.0", False, 8),
+        ("length_m = 0.3", False, 1),
+        ("start_m = 13.2\nhorizon = 7", False, 7),
+        ("start_m = 13.2", True, 86),  # a lap of 43.45 m
+    ],
+)
+def test_drives_end_with_the_route_or_before(write, keys, closed, steps):
+    route = Route("bend", 0, np.array([[0, 0], [3.2, 0], [3.2, 20]]), closed=closed)
+    text = MINIMAL.replace("[attack]", f"[drive]\n{keys}\n[attack]")
+    scenario, _ = load_scenario(write(text))
+    assert scenario.drive.steps(route, 0.1) == steps
 
 
 @pytest.mark.parametrize(

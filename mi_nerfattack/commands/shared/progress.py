@@ -14,9 +14,13 @@ _SPEED_OVER_S = 86_400.0  # a frame can take minutes
 
 
 class StageBars:
-    """A bar a stage on standard error in a terminal; elsewhere a line now and then."""
+    """A bar a stage on standard error in a terminal; elsewhere a line now and then.
 
-    def __init__(self) -> None:
+    Args:
+        started: `time.perf_counter()` from which the printed seconds count.
+    """
+
+    def __init__(self, started: float | None = None) -> None:
         self._console = Console(stderr=True)
         self._bars = Progress(
             TextColumn("{task.description}"),
@@ -28,7 +32,8 @@ class StageBars:
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._start, self._printed = time.monotonic(), 0.0
+        self._start = time.perf_counter() if started is None else started
+        self._printed = float("-inf")
 
     def __enter__(self) -> StageBars:
         self._bars.start()
@@ -70,7 +75,7 @@ class StageBars:
         if kept:
             self._bars.reset(number)
         self._bars.update(number, completed=done, state=state)
-        now, task = time.monotonic(), self._bars.tasks[number]
+        now, task = time.perf_counter(), self._bars.tasks[number]
         is_due = task.finished or now - self._printed >= _PLAIN_EVERY_S
         if is_due and not self._console.is_terminal:
             self._printed = now

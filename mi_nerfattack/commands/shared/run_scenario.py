@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,11 @@ def run_scenario(
             object; None leaves them.
         force: resume although something has changed.
     """
+    started = time.perf_counter()
     from mi_nerfattack.experiment.claim import claimed
 
     with claimed(output, resume):
-        document = _run(path, output, resume, object_field(), force)
+        document = _run(path, output, resume, object_field(), force, started)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
@@ -45,7 +47,12 @@ def run_scenario(
 
 
 def _run(
-    path: Path, output: Path, resume: bool, object_field: Path | None, force: bool
+    path: Path,
+    output: Path,
+    resume: bool,
+    object_field: Path | None,
+    force: bool,
+    started: float,
 ) -> dict[str, Any]:
     """Run a scenario in a folder that is claimed."""
     from mi_nerfattack import variant
@@ -58,21 +65,20 @@ def _run(
     scenario, text = load_scenario(path, object_field)
     variant.ensure()
     policy = build_differentiable(scenario.policy)
-    with StageBars() as bars, one_thread():
+    with StageBars(started) as bars, one_thread():
 
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        job = Job(scenario, text, policy, output, show, bars.say)
+        job = Job(scenario, text, policy, output, show, bars.say, started)
         return job.run_claimed(resume, force)
 
 
 def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
     cost = document["cost"]
     console.print(
-        f"{cost['wall_s']:.0f} s, {cost['renders']} frames, "
-        f"{cost['peak_memory_mb']:.0f} MB at most; "
-        f"{cost['checkpoint_s']:.1f} s of it in checkpoints"
+        f"{cost['wall_s']:.0f} s by the clock, {cost['renders']} frames, "
+        f"{cost['peak_memory_mb']:.0f} MB at most"
     )
     console.print(f"Run folder: {output.resolve()}", soft_wrap=True)
     for name, meaning in (
@@ -81,7 +87,7 @@ def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
         ("strip.png", "what the policy sees"),
         ("attribution*.png", "when and where the failure is made"),
         ("metrics.json, *.csv", "the numbers"),
-        ("objects/", "the attacked fields"),
+        ("objects/", "the fields, as the attack leaves them"),
         ("frames/", "EXR frames with layers"),
     ):
         console.print(f"  {name:24s} {meaning}")

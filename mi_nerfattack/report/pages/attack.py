@@ -15,6 +15,8 @@ _COST_LABELS = {
     "renders": "frames rendered",
     "checkpoint_s": "of the wall time, in checkpoints (s)",
     "processes": "processes, one and one a resumption",
+    "forward_s": "of the wall time, in the attack's drives (s)",
+    "backward_s": "of the wall time, in the passes back through them (s)",
 }
 
 
@@ -36,9 +38,10 @@ def write_report(
     """
     text = render(
         "attack.html.j2",
-        title=f"Attack report: {', '.join(document['routes'])}",
+        title=document["scenario"]["name"],
         seed=document["seed"],
         routes=document["routes"],
+        baseline=document.get("baseline"),
         images=images,
         cost={_COST_LABELS.get(k, k): v for k, v in document["cost"].items()},
         versions=versions,

@@ -1,7 +1,7 @@
 """Plots of drives and of an attack's progress, written as PNG files.
 
-Blue, orange-red and grey stay apart for colour-blind readers (Okabe and Ito 2008) and
-are drawn with different widths and dashes too. Figures are 1200 pixels wide.
+Colours stay apart for colour-blind readers (after Okabe and Ito 2008) and are drawn
+with different widths and dashes too. Figures are 1200 pixels wide.
 """
 
 from __future__ import annotations
@@ -19,22 +19,40 @@ from matplotlib.patches import Patch
 
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, chart, save
-from mi_nerfattack.rollout.drive import CASES, Drive
+from mi_nerfattack.rollout.drive import (
+    ATTACK,
+    BEST_RANDOM,
+    CASES,
+    NO_OBJECT,
+    OWN,
+    RANDOM,
+    Drive,
+)
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "random": {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
-    "own": {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
-    "attack": {
+    RANDOM: {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
+    NO_OBJECT: {"color": "#009E73", "linewidth": 1.2, "zorder": 3.5},
+    OWN: {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
+    BEST_RANDOM: {
+        "color": "#8A4F7D",
+        "linewidth": 1.6,
+        "zorder": 4.5,
+        "linestyle": (0, (1.5, 1)),
+    },
+    ATTACK: {
         "color": "#D55E00",
         "linewidth": 2.0,
         "zorder": 5,
         "linestyle": (0, (5, 1.2)),
     },
 }
-_LABELS = {
-    "own": "own texture",
-    "random": "random texture",
-    "attack": "attack",
+_LABELS = {case: case.replace("_", " ") for case in CASES}
+_DARK = {
+    RANDOM: "#4d4d4d",
+    NO_OBJECT: "#00523c",
+    OWN: "#003f66",
+    BEST_RANDOM: "#4a2a43",
+    ATTACK: "#7a1f00",
 }
 _LANE, _CENTRE, _OBJECT, _LIMIT = "#ececec", "#9a9a9a", "#F0C000", "#000000"
 
@@ -82,7 +100,7 @@ def overhead(
 def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
     """Plot the distance from the lane centre over time, a panel per environment.
 
-    Random textures appear as the range over their runs and its mean, both at each
+    Random looks appear as the range over their runs and its mean, both at each
     time over the runs that last so long; the other cases as a line per run.
 
     Args:
@@ -94,9 +112,9 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
     with chart(path, 3.3) as figure:
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)
         for axis, (environment, group) in zip(grid[0], panels.items(), strict=True):
-            _draw_band(axis, [d for d in group if d.case == "random"])
+            _draw_band(axis, [d for d in group if d.case == RANDOM])
             for drive in sorted(group, key=_drawing_order):
-                if drive.case != "random":
+                if drive.case != RANDOM:
                     axis.plot(drive.time_s, drive.distance_m, **_STYLES[drive.case])
             axis.axhline(limit, color=_LIMIT, linewidth=1, linestyle=":", zorder=2)
             axis.set_title(f"{drives[0].route}: {environment}", loc="left")
@@ -109,10 +127,10 @@ def errors(path: str | Path, drives: Sequence[Drive], limit: float) -> None:
         for case in _cases(drives):
             style = _style(case, linewidth=2)
             handles.append(Line2D([], [], label=_LABELS[case], **style))
-            if case == "random":
-                handles[-1].set_label("random texture, mean")
+            if case == RANDOM:
+                handles[-1].set_label("random, mean")
                 band = {"facecolor": _STYLES[case]["color"], "alpha": 0.25}
-                handles.append(Patch(label="random texture, range", **band))
+                handles.append(Patch(label="random, range", **band))
         label = f"departure limit {limit:.2f} m"
         handles.append(Line2D([], [], color=_LIMIT, linestyle=":", label=label))
         _legend_below(figure, handles)
@@ -123,12 +141,12 @@ def control_change(
 ) -> None:
     """Plot by how much controls differ from those of a drive, step by step.
 
-    Random textures appear as the range over their runs and its mean.
+    Random looks appear as the range over their runs and its mean.
 
     Args:
         path: PNG file.
         drives: of as many steps as `base`.
-        base: the drive past own textures.
+        base: the drive of the case `own`.
         unit: of the control.
     """
     with chart(path, 3.0) as figure:
@@ -137,23 +155,23 @@ def control_change(
             case: np.array(
                 [d.controls - base.controls for d in drives if d.case == case]
             )
-            for case in ("random", "attack")
+            for case in CASES
         }
-        random = changes["random"]
+        random = changes[RANDOM]
         if len(random):
-            band = {"facecolor": _STYLES["random"]["color"], "alpha": 0.25}
+            band = {"facecolor": _STYLES[RANDOM]["color"], "alpha": 0.25}
             axis.fill_between(base.time_s, random.min(0), random.max(0), **band)
-            style = _style("random", linewidth=1.6, label="random texture: range, mean")
+            style = _style(RANDOM, linewidth=1.6, label="random: range, mean")
             axis.plot(base.time_s, random.mean(0), **style)
-        for row in changes["attack"]:
-            style = _style("attack", label=_LABELS["attack"])
-            axis.plot(base.time_s, row, **style)
-        axis.axhline(0, color=_STYLES["own"]["color"], label=_LABELS["own"])
+        for case in (NO_OBJECT, BEST_RANDOM, ATTACK):
+            for row in changes[case]:
+                axis.plot(base.time_s, row, **_style(case, label=_LABELS[case]))
+        axis.axhline(0, color=_STYLES[OWN]["color"], label=_LABELS[OWN])
         axis.set_title(f"Change of control: {base.environment}", loc="left")
         axis.set_xlabel("time (s)")
         axis.set_ylabel(f"change of control ({unit})")
         axis.grid(alpha=0.25)
-        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+        figure.legend(loc="outside lower center", ncols=5, frameon=False)
 
 
 def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -231,9 +249,8 @@ def _draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
 
 
 def _cross(case: str) -> dict[str, Any]:
-    dark = {"random": "#4d4d4d", "own": "#003f66", "attack": "#7a1f00"}
     style = {"linestyle": "none", "marker": "x", "markersize": 4.5, "zorder": 7}
-    return style | {"color": dark[case], "markeredgewidth": 1.2}
+    return style | {"color": _DARK[case], "markeredgewidth": 1.2}
 
 
 def _map_handles(drives: Sequence[Drive], objects: bool, limit: float) -> list[Any]:
@@ -251,7 +268,7 @@ def _map_handles(drives: Sequence[Drive], objects: bool, limit: float) -> list[A
         handles.append(Patch(facecolor=_OBJECT, edgecolor="black", label="object"))
     if any(np.any(drive.departed(limit)) for drive in drives):
         label = f"departed (> {limit:.2f} m)"
-        handles.append(Line2D([], [], label=label, **_cross("attack")))
+        handles.append(Line2D([], [], label=label, **_cross(ATTACK)))
     return handles
 
 
@@ -266,16 +283,16 @@ def _draw_band(axis: Axes, drives: Sequence[Drive]) -> None:
         longest.time_s,
         table.min(axis=0),
         table.max(axis=0),
-        facecolor=_STYLES["random"]["color"],
+        facecolor=_STYLES[RANDOM]["color"],
         alpha=0.25,
         linewidth=0,
         zorder=1,
     )
-    axis.plot(longest.time_s, table.mean(axis=0), **_style("random", linewidth=1.6))
+    axis.plot(longest.time_s, table.mean(axis=0), **_style(RANDOM, linewidth=1.6))
 
 
 def _legend_below(figure: Figure, handles: list[Any]) -> None:
-    columns = 3 if len(handles) in (3, 5, 6) else 4
+    columns = {3: 3, 5: 5, 6: 3, 9: 5, 10: 5}.get(len(handles), 4)
     figure.legend(
         handles=handles, loc="outside lower center", ncols=columns, frameon=False
     )

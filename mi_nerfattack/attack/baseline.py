@@ -1,0 +1,83 @@
+"""Random textures and poses: what an attack is compared with, at its own cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.random_textures import random_texture
+from mi_nerfattack.rollout.cost import Cost
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import OnStep, simulate
+
+
+@dataclass(frozen=True, eq=False)
+class RandomLooks:
+    """Draws of all that an attack may change, by their numbers from 0.
+
+    Args:
+        fields: of the objects.
+        freedom: what the attack may change.
+        kind: of textures, see `random_texture`.
+        seed: of all draws.
+    """
+
+    fields: Sequence[GridField]
+    freedom: Freedom
+    kind: str
+    seed: int
+
+    def textures(self, number: int) -> list[np.ndarray] | None:
+        """Return a texture an object, None if the attack leaves textures alone."""
+        if self.freedom.texture_rate is None:
+            return None
+        sequence = np.random.SeedSequence([self.seed, 1, number])
+        seeds = sequence.generate_state(len(self.fields))
+        return [
+            random_texture(grid, self.kind, int(seed))
+            for grid, seed in zip(self.fields, seeds, strict=True)
+        ]
+
+    def offsets(self, number: int) -> np.ndarray | None:
+        """Return offsets (k, 6), uniform within the attack's limits, or None."""
+        if self.freedom.pose_rate is None:
+            return None
+        rng = np.random.default_rng([self.seed, 3, number])
+        limit = np.repeat([self.freedom.limit_m, self.freedom.limit_rad], 3)
+        drawn = rng.uniform(-limit, limit, (len(self.fields), 6))
+        return self.freedom.project(drawn)
+
+
+def equal_count(iterations: int, backward_multiple: float) -> int:
+    """Return how many drives cost what the iterations of an attack do.
+
+    Args:
+        iterations: each one drive and one pass back through it.
+        backward_multiple: cost of the pass back, in drives.
+    """
+    return max(1, round(iterations * (1 + backward_multiple)))
+
+
+def judge(rollout: Rollout, initial: np.ndarray, on_step: OnStep | None) -> float:
+    """Return an attack's objective for what its sensor shows; costs one drive.
+
+    Args:
+        rollout: of the attack.
+        initial: (m, n) that it starts from.
+        on_step: called after each control period with its index.
+
+    Raises:
+        InputError: the objective is not finite.
+    """
+    drive = simulate(rollout.loop, initial, rollout.horizon, on_step)
+    value = Cost(rollout.objective, rollout.reduction).of(drive)[0]
+    if not np.isfinite(value):
+        raise InputError(
+            f"objective: {value} with a random texture; check policy and costs for NaN"
+        )
+    return float(value)
