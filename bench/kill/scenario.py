@@ -37,7 +37,7 @@ route = "line"
 [[objects]]
 id = "ball"
 field = "object.safetensors"
-position_m = [7.0, 2.4, 1.0]
+position_m = [7.0, 4.2, 1.6]
 scale = 1.5
 [policy]
 file = "policy.safetensors"

@@ -28,6 +28,11 @@ class Attack:
     if it left nothing."""
     force: bool = False
     """With --resume: continue although scenario, files or versions have changed."""
+    anyway: bool = False
+    """Attack although the checks before find that it would prove nothing: the policy
+    leaves its lane by itself, an object is not in view, stands on the lane, in a wall,
+    in the air or in another, or the route is too short. metrics.json keeps what was
+    found as flags."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
@@ -39,5 +44,10 @@ class Attack:
         if self.force and not self.resume:
             raise InputError("--force: says how to resume; give it with --resume")
         return run_scenario(
-            self.scenario, self.output, self.resume, self.json, force=self.force
+            self.scenario,
+            self.output,
+            self.resume,
+            self.json,
+            force=self.force,
+            anyway=self.anyway,
         )

@@ -28,6 +28,8 @@ class Demo:
     """Height of a mesh, metres; the scene shows it 3.3 times as tall."""
     resolution: Literal[64, 128] = 64
     """Finest level of the grid that is fitted to a mesh."""
+    anyway: bool = False
+    """Attack although the object would prove nothing; see attack."""
 
     def run(self) -> int:
         """Run the bundled scenario."""
@@ -42,6 +44,7 @@ class Demo:
             False,
             False,
             lambda: self._object_field(output),
+            anyway=self.anyway,
         )
 
     def _object_field(self, output: Path) -> Path | None:

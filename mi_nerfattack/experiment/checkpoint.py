@@ -26,10 +26,14 @@ REMEDY = (
 
 
 class CheckpointRecord(Record):
-    """What is kept beside the state: cost so far, differences that were ignored."""
+    """What is kept beside the state.
+
+    The cost so far, differences that were ignored, findings of the checks before.
+    """
 
     effort: Effort
     ignored: list[str]
+    flags: list[str] = []
 
 
 class CheckpointFile:
@@ -49,6 +53,8 @@ class CheckpointFile:
         seconds: that this process spent on writing.
         failed: whether the last attempt to write failed.
         ignored: differences that were ignored, over the file's life.
+        flags: findings of the checks before the attack; None as long as this scenario
+            was not checked.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, str]) -> None:
@@ -59,6 +65,7 @@ class CheckpointFile:
         self.seconds = 0.0
         self.failed = False
         self.ignored: list[str] = []
+        self.flags: list[str] | None = None
         self._kept: Kept[CheckpointRecord] | None = None
 
     def read(self, force: bool = False) -> Effort:
@@ -78,6 +85,8 @@ class CheckpointFile:
         if self._kept is None:
             return Effort()
         self.ignored = [*self._kept.record.ignored, *self._kept.ignored]
+        if not self._kept.ignored:
+            self.flags = self._kept.record.flags
         return self._kept.record.effort
 
     @property
@@ -124,7 +133,8 @@ class CheckpointFile:
         tensors = {**attack.tensors(), **random_states()}
         self.failed = True
         try:
-            record = CheckpointRecord(effort=effort, ignored=self.ignored)
+            about = {"ignored": self.ignored, "flags": self.flags or []}
+            record = CheckpointRecord(effort=effort, **about)
             self._unit.write(tensors, record)
         except InputError as err:
             raise InputError(f"{err}\n{self._advice(attack)}") from err

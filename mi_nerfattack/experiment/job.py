@@ -15,6 +15,10 @@ from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import Baseline
+from mi_nerfattack.experiment.checks.before_attack import (
+    first_findings,
+    further_findings,
+)
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.run_folder import RunFolder
@@ -67,12 +71,16 @@ class Job:
     on_notice: OnNotice = _quiet
     started: float = field(default_factory=time.perf_counter)
 
-    def run(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
+    def run(
+        self, resume: bool = False, force: bool = False, anyway: bool = False
+    ) -> dict[str, Any]:
         """Claim the run folder and do the whole job; see :meth:`run_claimed`."""
         with claimed(self.output, resume):
-            return self.run_claimed(resume, force)
+            return self.run_claimed(resume, force, anyway)
 
-    def run_claimed(self, resume: bool = False, force: bool = False) -> dict[str, Any]:
+    def run_claimed(
+        self, resume: bool = False, force: bool = False, anyway: bool = False
+    ) -> dict[str, Any]:
         """Do the whole job and write the run folder, which is claimed.
 
         A scenario that is refused before its first iteration leaves nothing there.
@@ -82,13 +90,15 @@ class Job:
                 beginning if that is nothing.
             force: resume although scenario, files or versions have changed: the
                 attack goes on, the drives are repeated.
+            anyway: go on with a scenario whose attack would prove nothing; what was
+                found stands under ``flags`` in the document.
 
         Returns:
             the document that ``metrics.json`` holds.
 
         Raises:
-            InputError: a file is missing or wrong, or the run in the folder is
-                damaged, or of another scenario or versions.
+            InputError: a file is missing or wrong, an attack would prove nothing, or
+                the run in the folder is damaged, or of another scenario or versions.
             SetupError: the scenario is deterministic and the variant cannot be.
         """
         identity = {**versions(), **self.scenario.identity()}
@@ -105,14 +115,15 @@ class Job:
                 world.open(label).close()
             folder.begin()
             try:
-                return self._work(world, folder, Account(self.started, folder.effort))
+                account = Account(self.started, folder.effort)
+                return self._work(world, folder, account, anyway)
             except InputError as err:
                 if not _is_of_disk(err):
                     folder.withdraw()
                 raise
 
     def _work(
-        self, world: World, folder: RunFolder, account: Account
+        self, world: World, folder: RunFolder, account: Account, anyway: bool
     ) -> dict[str, Any]:
         """Do what is not done yet."""
 
@@ -123,6 +134,7 @@ class Job:
         stages = Stages(world, folder.drives, self.on_progress, effort)
         stages.looks[OWN] = original = world.appearance()
         with closing(stages):
+            flags = self._check(world, folder, stages, anyway)
             for case in (NO_OBJECT, OWN):
                 stages.drive_all(SURROGATE, case)
             attack = self._attack(world, folder, account, effort)
@@ -149,8 +161,29 @@ class Job:
             effort,
             folder.checkpoint.ignored,
             baseline.figures(),
+            flags,
             self._counter(world, "surrogate: attribution", 3),
         )
+
+    def _check(
+        self, world: World, folder: RunFolder, stages: Stages, anyway: bool
+    ) -> list[str]:
+        """Return what makes the attack worthless, unless it was allowed before."""
+        if folder.checkpoint.flags is not None:
+            return folder.checkpoint.flags
+        flags: list[str] = []
+        for check in (first_findings, further_findings):
+            flags += check(world, stages)
+            if flags and not anyway:
+                listed = "\n".join(f"  {line}" for line in flags)
+                raise InputError(
+                    f"an attack would prove nothing:\n{listed}\nmend the scenario, or "
+                    "attack all the same (--anyway)"
+                )
+        for line in flags:
+            self.on_notice(f"warning: {line}")
+        folder.checkpoint.flags = flags
+        return flags
 
     def _counter(self, world: World, stage: str, sweeps: int) -> Callable[[int], None]:
         """Report the progress of some sweeps through a drive, step by step."""

@@ -34,6 +34,7 @@ def write_results(
     effort: Callable[[], Effort],
     ignored: list[str],
     baseline: dict[str, Any],
+    flags: list[str],
     on_step: OnStep | None = None,
 ) -> dict[str, Any]:
     """Write everything but scenario and checkpoint, ``metrics.json`` last but one.
@@ -48,6 +49,7 @@ def write_results(
         effort: tells what the run has cost so far.
         ignored: changes between interruption and resumption that were ignored.
         baseline: figures of the random looks.
+        flags: findings of the checks before the attack.
         on_step: called after each of the 3 x horizon control periods of the
             attribution.
 
@@ -61,7 +63,7 @@ def write_results(
     driven = [drive for drive in drives if drive not in replayed]
     attacked = looks[ATTACK]
     assert attacked is not None, "an attack has objects"
-    more: dict[str, Any] = {"baseline": baseline}
+    more: dict[str, Any] = {"baseline": baseline, "flags": flags}
     unit = scenario.vehicle.car().control_unit
     if replayed:
         more["replay"] = control_changes(replayed, unit, scenario.seed)

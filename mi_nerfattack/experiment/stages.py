@@ -59,7 +59,16 @@ class Stages:
             self.world.show(look)
         for run in range(count):
             if not self._take(label, case, run, count):
-                self._drive(label, case, run, count, case)
+                found = self._drive(label, case, run, count, case)
+                self.drives.append(found)
+
+    def one(self, label: str, case: str, run: int) -> Drive:
+        """Return one of the drives of :meth:`drive_all`, which then finds it kept."""
+        if found := self.kept.take(label, case, run):
+            return found
+        if look := self.looks[case]:
+            self.world.show(look)
+        return self._drive(label, case, run, len(self.world.initial), case)
 
     def drive_random(
         self,
@@ -92,7 +101,8 @@ class Stages:
                         f"{label}: {RANDOM}", done + step + 1, total, "judged"
                     )
                 )
-            self._drive(label, RANDOM, run, count, run, sweeps, objective)
+            found = self._drive(label, RANDOM, run, count, run, sweeps, objective)
+            self.drives.append(found)
         return [self.kept.objective(label, RANDOM, run) for run in range(count)]
 
     def close(self) -> None:
@@ -123,7 +133,7 @@ class Stages:
         look: object,
         sweeps: int = 1,
         objective: float | None = None,
-    ) -> None:
+    ) -> Drive:
         """Drive once, and keep the drive; it is the last sweep of a run."""
         world, scenario = self.world, self.world.scenario
         horizon = world.horizon
@@ -148,7 +158,7 @@ class Stages:
         counted = label == SURROGATE and not empty  # by the surrogate itself
         self.renders += 0 if counted else len(found.states)
         self.kept.add(found, self.effort(), objective)
-        self.drives.append(found)
+        return found
 
     def _environment(
         self, label: str, look: object, empty: bool

@@ -44,6 +44,7 @@ def leave_out_results(monkeypatch):
     ):
         cost = effort().model_dump()
         document = {"cost": cost, "ignored_changes": ignored, "drives": drives}
+        document["flags"] = more[1]
         files.write_json(output / "metrics.json", {"cost": cost})
         return document
 

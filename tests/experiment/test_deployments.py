@@ -57,7 +57,7 @@ def with_recording(source, folder):
     camera = from_fov(toy.WIDTH, toy.HEIGHT, 90.0)
     states = np.array([[0.5 * k - 20, 0.1, 0.0] for k in range(3)])
     path = folder / "scenario.toml"
-    path.write_text(path.read_text().replace("[7.0, 2.4, 1.0]", "[-15.0, 1.0, 1.0]"))
+    path.write_text(path.read_text().replace("[7.0, 4.2, 1.6]", "[-15.0, 2.6, 1.6]"))
     scenario, _ = load_scenario(path)
     poses = mount_matrix(states, scenario.camera.build()[1])
     images = np.full((3, toy.HEIGHT, toy.WIDTH, 3), 90, np.uint8)

@@ -84,7 +84,7 @@ def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
     interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     other = ('"object.safetensors"', '"scene.safetensors"')
     with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*this run needs"):
-        job(folder, output, other).run(resume=True, force=True)
+        job(folder, output, other).run(resume=True, force=True, anyway=True)
 
 
 def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):

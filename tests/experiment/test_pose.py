@@ -70,7 +70,7 @@ def test_a_run_says_where_the_objects_stand(scenario_folder, tmp_path):
     pose = document["object_poses"]["ball"]
     shift = np.array(pose["shift_m"])
     assert shift[:2].any() and shift[2] == 0
-    np.testing.assert_allclose(pose["position_m"], np.add([7.0, 2.4, 1.0], shift))
+    np.testing.assert_allclose(pose["position_m"], np.add([7.0, 4.2, 1.6], shift))
 
 
 def test_attribution_says_that_the_texture_was_not_attacked(tmp_path):

@@ -10,9 +10,10 @@ from helpers.attack_jobs import write_scenario
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
+from mi_nerfattack.experiment.checks.before_attack import place_findings
 from mi_nerfattack.io.exr import read_layers
 from mi_nerfattack.scenario.scenario import load_scenario
-from mi_nerfattack.scenario.world import build_surrogate
+from mi_nerfattack.scenario.world import build_surrogate, build_world
 from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -24,7 +25,7 @@ XML = """\
         <volume type="grid_field" id="ball">
             <string name="filename" value="object.safetensors"/>
             <transform name="to_world">
-                <scale value="1.5"/><translate x="7" y="2.4" z="1"/>
+                <scale value="1.5"/><translate x="7" y="4.2" z="1.6"/>
             </transform>
         </volume>
         <volume type="grid_field" id="scene">
@@ -45,12 +46,12 @@ XML = """\
 WALL = """\
     <shape type="rectangle" id="wall">
         <transform name="to_world">
-            <rotate y="1" angle="-90"/><translate x="6" y="2.4" z="1"/>
+            <rotate y="1" angle="-90"/><translate x="6" y="4.2" z="1.6"/>
         </transform>
     </shape>
 """
 FIELD, OBJECT = '[scene]\nfield = "scene.safetensors"', 'field = "object.safetensors"\n'
-PLACED = "position_m = [7.0, 2.4, 1.0]\nscale = 1.5\n"
+PLACED = "position_m = [7.0, 4.2, 1.6]\nscale = 1.5\n"
 NAMED = {FIELD: '[scene]\nsurrogate = "surrogate.xml"', OBJECT + PLACED: ""}
 
 
@@ -114,6 +115,17 @@ def test_attached_with_surfaces_is_refused_before_the_first_drive(load):
     scenario = load({**NAMED, "[attack]": "[attack]\nattached = true"}, more=WALL)
     with pytest.raises(InputError, match="surrogate.xml: surfaces .*attached to false"):
         build_surrogate(scenario)
+
+
+def test_objects_of_the_xml_are_checked_where_they_stand(load, tmp_path):
+    scenario = load()
+    world = build_world(scenario, scenario.policy.build())
+    assert not list(place_findings(world))
+    xml = tmp_path / "surrogate.xml"
+    xml.write_text(xml.read_text().replace('y="4.2"', 'y="2"'))
+    world = build_world(scenario, scenario.policy.build())
+    (found,) = place_findings(world)
+    assert "ball stands on the lane" in found
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ def run_scenario(
     as_json: bool,
     object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
+    anyway: bool = False,
 ) -> int:
     """Run a scenario with a progress bar on stderr, and print its table.
 
@@ -27,12 +28,14 @@ def run_scenario(
         object_field: makes, or names, the grid field that replaces the one of every
             object; None leaves them.
         force: resume although something has changed.
+        anyway: attack although it would prove nothing.
     """
     started = time.perf_counter()
     from mi_nerfattack.experiment.claim import claimed
 
     with claimed(output, resume):
-        document = _run(path, output, resume, object_field(), force, started)
+        how = {"resume": resume, "force": force, "anyway": anyway}
+        document = _run(path, output, object_field(), started, **how)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
@@ -49,12 +52,11 @@ def run_scenario(
 def _run(
     path: Path,
     output: Path,
-    resume: bool,
     object_field: Path | None,
-    force: bool,
     started: float,
+    **how: bool,
 ) -> dict[str, Any]:
-    """Run a scenario in a folder that is claimed."""
+    """Run a scenario in a folder that is claimed, as `Job.run_claimed` is told."""
     from mi_nerfattack import variant
     from mi_nerfattack.backend.threads import one_thread
     from mi_nerfattack.commands.shared.progress import StageBars
@@ -71,7 +73,7 @@ def _run(
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
         job = Job(scenario, text, policy, output, show, bars.say, started)
-        return job.run_claimed(resume, force)
+        return job.run_claimed(**how)
 
 
 def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:

@@ -1,0 +1,153 @@
+"""What makes an attack worthless, told before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mi_nerfattack.experiment.checks.standing import (
+    lane_findings,
+    meeting_findings,
+    scene_findings,
+    solids_of,
+)
+from mi_nerfattack.experiment.stages import Stages
+from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
+from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.world import World
+from mi_nerfattack.vehicle.state import to_state
+
+#: A pixel shows an object where its texture can change the value by so much of 1; it
+#: is in view where such pixels are this share of a picture, in this share of pictures.
+CHANGE, PIXELS, PICTURES = 0.1, 0.001, 0.05
+
+_MOST_PICTURES = 20
+_RAW = 10.0  # a raw colour whose sigmoid is 1, whatever the levels
+_OVER_M = 1.0  # beyond the end of a route, since starts are scattered
+_MESHES = ("mitsuba", "mujoco", "mujoco_gl")  # environments of the scene's meshes
+
+
+def first_findings(world: World, stages: Stages) -> Iterator[str]:
+    """Check what one drive in each environment and the geometry tell.
+
+    The policy keeps its lane from the first start in every environment, objects in
+    their own textures; it comes to no end of the route; every object is in view;
+    objects stand beside the lane, on the ground, in the open and apart.
+
+    Args:
+        world: objects look and stand as the scenario says.
+        stages: makes the drives, or has them.
+
+    Yields:
+        a sentence each: what, where, and the remedy.
+    """
+    first = stages.one(SURROGATE, OWN, 0)
+    yield from departure_findings(world, [first])
+    for label in world.deployments:
+        if not world.is_open_loop(label):
+            yield from departure_findings(world, [stages.one(label, OWN, 0)])
+    yield from view_findings(world, first)
+    yield from horizon_findings(world, first)
+    yield from place_findings(world)
+
+
+def further_findings(world: World, stages: Stages) -> Iterator[str]:
+    """Check that the policy keeps its lane from the other starts of the surrogate.
+
+    Args and Yields: as :func:`first_findings`.
+    """
+    starts = range(1, len(world.initial))
+    yield from departure_findings(
+        world, [stages.one(SURROGATE, OWN, k) for k in starts]
+    )
+
+
+def departure_findings(world: World, drives: list[Drive]) -> Iterator[str]:
+    """Tell of drives that leave the lane though nothing is attacked."""
+    width = world.scenario.vehicle.width_m
+    limit = departure_limit(world.route.lane_width_m, width)
+    left = [drive for drive in drives if drive.departed(limit).any()]
+    if not left:
+        return
+    worst = max(left, key=lambda drive: drive.distance_m.max())
+    step = int(worst.departed(limit).argmax())
+    x, y = worst.states[1 + step, :2]
+    runs = ", ".join(str(drive.run) for drive in left)
+    yield (
+        f"the policy leaves its lane before anything is attacked: in "
+        f"{worst.environment}, run {runs}, objects in their own textures, it comes to "
+        f"{worst.distance_m.max():.2f} m from the lane's centre, and beyond "
+        f"{limit:.2f} m after {worst.time_s[step]:.1f} s at ({x:.1f}, {y:.1f}) m; give "
+        "a policy that keeps it, or another route, start or object"
+    )
+
+
+def horizon_findings(world: World, first: Drive) -> Iterator[str]:
+    """Tell of a horizon that an open route is too short for."""
+    route = world.route
+    if route.closed:
+        return
+    over = route.project_numpy(first.states[1:]).arc_length - route.length
+    if over[-1] > _OVER_M:
+        step = int((over > 0).argmax())
+        yield (
+            f"the drive of {len(over)} steps ends {over[-1]:.1f} m beyond route "
+            f"{route.name!r} of {route.length:.1f} m, whose end is passed after "
+            f"{first.time_s[step]:.1f} s; lower drive.horizon to {max(step, 1)}, leave "
+            "it and length_m out, or take a longer route"
+        )
+
+
+def view_findings(world: World, first: Drive) -> Iterator[str]:
+    """Tell of objects whose texture shows in too few pictures of a drive."""
+    steps = np.arange(len(first.controls))
+    steps = steps[:: -(-len(steps) // _MOST_PICTURES)]
+    needed = int(np.ceil(PICTURES * len(steps)))
+    original = world.appearance()
+    try:
+        for k, item in enumerate(world.scenario.objects):
+            seen, most = 0, 0.0
+            for step in steps:
+                share = _share_shown(world, k, first.states[step], int(step))
+                seen, most = seen + (share >= PIXELS), max(most, share)
+                if seen == needed:
+                    break
+            else:
+                yield (
+                    f"{item.id} is not in view: along the drive of "
+                    f"{first.time_s[-1]:.1f} s its texture changes at most "
+                    f"{100 * most:.2f} % of the pixels, in {seen} of {len(steps)} "
+                    f"pictures {100 * PIXELS:g} % or more, and {needed} are needed; "
+                    "move it into view, or the start towards it"
+                )
+    finally:
+        world.show(original)
+
+
+def _share_shown(world: World, k: int, pose: np.ndarray, step: int) -> float:
+    """Return the share of the pixels that the texture of object k can change."""
+    sensor, field = world.surrogate, world.fields[k]
+    state = to_state(pose[None])
+    texture = np.full((field.n_vertices, 3), _RAW, np.float32)
+    field.set_parameter("texture", texture)
+    seen = sensor.observe(state, step)
+    field.set_parameter("texture", -texture)
+    other = sensor.observe(state, step)
+    change = np.abs(seen.image.numpy() - other.image.numpy()).max(-1)
+    return float((change >= CHANGE).mean())
+
+
+def place_findings(world: World) -> Iterator[str]:
+    """Tell of objects that stand where none can be driven past."""
+    scenario = world.scenario
+    names = [item.id for item in scenario.objects]
+    objects = dict(zip(names, world.surrogate.objects, strict=True))
+    solids = solids_of(objects)
+    freedom = scenario.attack.freedom.build()
+    yield from lane_findings(solids, world.route, scenario.vehicle.width_m, freedom)
+    yield from meeting_findings(solids)
+    if any(item.environment in _MESHES for item in world.deployments.values()):
+        file = scenario.scene.deployment.file
+        yield from scene_findings(solids, world.route, load_scene(file), file.name)
