@@ -133,7 +133,7 @@ class Checkpointed(AbstractAdjoint):
                 seen = sensor.observe(drive.states[index], index)
                 kept.append((sensor.keep(seen), memory))
                 if index + 1 < end:
-                    image = loop.shown(seen)
+                    image = loop.shown(seen, index)
                     _, memory = loop.policy.step(image, loop.goal, memory)
                 del seen
             for index in reversed(range(start, end)):

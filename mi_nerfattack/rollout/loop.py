@@ -1,8 +1,9 @@
 """The closed loop: sensor, policy, vehicle, sensor, ...
 
 A policy gets images of eight bits, as a camera gives them and every environment does:
-``round(255 x) / 255`` of what the sensor renders. The derivative of this rounding is
-taken as 1 (*straight through*); its true one is 0 almost everywhere.
+``round(255 x) / 255`` of what the sensor renders, after what disturbs it. The
+derivative of this rounding is taken as 1 (*straight through*); its true one is 0 almost
+everywhere.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
@@ -42,6 +44,7 @@ class ClosedLoop:
             does, the control is 0.
         eight_bit: round images as a camera does; without it the policy gets what the
             sensor renders, and derivatives equal finite differences.
+        disturbance: of the sensor's images, before they are rounded; a row a vehicle.
     """
 
     sensor: AbstractSensor
@@ -53,6 +56,7 @@ class ClosedLoop:
     substeps: int = 1
     delay: int = 0
     eight_bit: bool = True
+    disturbance: Disturbance = Disturbance()
     transition: Transition = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -65,16 +69,29 @@ class ClosedLoop:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""
         return to_state(self.dynamics.extend(np.atleast_2d(poses)))
 
-    def shown(self, observation: Observation) -> Any:
+    def shown(self, observation: Observation, step: int) -> Any:
         """Return the image that the policy gets, (n, height, width, 3), evaluated."""
         image = observation.image
-        if not self.eight_bit:
-            return image
-        # a literal would be multiplied by its inverse, which is off in the last bit
-        most = dr.opaque(type(image.array), 255)
-        rounded = type(image)(dr.round(most * image.array) / most, image.shape)
-        dr.eval(rounded)
-        return rounded
+        if self.disturbance:
+            image = self.disturbance.apply(image, step)
+        if self.eight_bit:
+            # a literal would be multiplied by its inverse, which is off in the last bit
+            most = dr.opaque(type(image.array), 255)
+            image = type(image)(dr.round(most * image.array) / most, image.shape)
+        dr.eval(image)
+        return image
+
+    def shown_vjp(self, observation: Observation, step: int, d_shown: Any) -> Any:
+        """Return the derivative by the sensor's image from that by the policy's."""
+        if not self.disturbance:
+            return d_shown
+        return self.disturbance.vjp(observation.image, step, d_shown)
+
+    def shown_jvp(self, observation: Observation, step: int, t_image: Any) -> Any:
+        """Return the tangent of the policy's image from that of the sensor's."""
+        if not self.disturbance:
+            return t_image
+        return self.disturbance.jvp(observation.image, step, t_image)
 
 
 @dataclass(frozen=True)
@@ -168,7 +185,8 @@ def simulate(
     for index in range(horizon):
         seen = loop.sensor.observe(states[-1], index)
         step = Step(index, states[-1], seen, memory)
-        control, memory = loop.policy.step(loop.shown(seen), loop.goal, memory)
+        image = loop.shown(seen, index)
+        control, memory = loop.policy.step(image, loop.goal, memory)
         controls.append(dr.value_t(type(initial))(control))
         older, newer = loop.transition.controls(controls, index, initial)
         states.append(loop.transition.advance(states[-1], older, newer))

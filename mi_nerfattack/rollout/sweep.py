@@ -137,13 +137,14 @@ class Sweep:
         d_state, *d_pair = loop.transition.vjp(step.state, older, newer, d_after)
         for source, value in zip(loop.transition.sources(index), d_pair, strict=True):
             self.pending[source] = self.pending.get(source, 0) + value
-        image = loop.shown(step.observation)
+        image = loop.shown(step.observation, index)
         none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
         dr.eval(cotangent)
         d_image, self.d_memory = loop.policy.step_vjp(
             image, loop.goal, step.memory, cotangent, self.d_memory
         )
+        d_image = loop.shown_vjp(step.observation, index, d_image)
         by_pose = differentiable(loop).vjp(
             step.observation, step.state, d_image, self.attached
         )
@@ -224,7 +225,8 @@ def forward(
         state = drive.states[index]
         seen = sensor.observe(state, index)
         t_image = sensor.jvp(seen, state, tangent if attached else None)
-        image = loop.shown(seen)
+        t_image = loop.shown_jvp(seen, index, t_image)
+        image = loop.shown(seen, index)
         t_control, t_memory = loop.policy.step_jvp(
             image, loop.goal, memory, t_image, t_memory
         )

@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from mi_nerfattack.attack.freedom import Freedom
-from mi_nerfattack.ranges import Count, Positive
+from mi_nerfattack.ranges import Count, NonNegative, Positive
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
     AbstractAdjoint,
     Checkpointed,
@@ -100,5 +101,13 @@ class AttackSection(Section):
     )
     attached: bool = False
     jitter: bool = False
+    exposure_ev_sd: NonNegative = 0.0  # of the poses' drives, powers of two
+    blur_px_sd: NonNegative = 0.0  # of the number whose size blurs a drive
+    noise_sd: NonNegative = 0.0  # of each frame, sRGB in [0, 1]
     checkpoint_every: Count = 10
     deterministic: bool = False  # equal bits from run to run, on one thread
+
+    def disturbance(self, seed: int) -> Disturbance:
+        """Make what the attack's images go through."""
+        sizes = self.exposure_ev_sd, self.blur_px_sd, self.noise_sd
+        return Disturbance(*sizes, seed)

@@ -220,7 +220,8 @@ def build_attack(world: World) -> GradientAttack:
         TypeError: the policy has no derivatives.
     """
     scenario, section = world.scenario, world.scenario.attack
-    loop = world.loop(world.surrogate)
+    disturbance = section.disturbance(scenario.seed)
+    loop = replace(world.loop(world.surrogate), disturbance=disturbance)
     rollout = Rollout(
         loop,
         world.objective,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.attack_jobs import (
+    ROBUST,
     STAGES,
     assert_same_drives,
     assert_same_state,
@@ -29,7 +30,7 @@ from mi_nerfattack.errors import InputError, SetupError
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-FIFTY = ("iterations = 6", "iterations = 50")
+FIFTY = ("iterations = 6", "iterations = 50" + ROBUST)
 
 
 @pytest.mark.usefixtures("no_results")

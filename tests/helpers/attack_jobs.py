@@ -13,6 +13,14 @@ from helpers import toy_loop as toy
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import CASES
 
+#: Keys of `[attack]` by which everything that can be drawn is.
+ROBUST = """
+poses = 3
+jitter = true
+exposure_ev_sd = 0.5
+blur_px_sd = 0.8
+noise_sd = 0.02
+"""
 STAGES = CASES
 
 

@@ -8,6 +8,7 @@ from helpers.small_fields import vertices
 
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
@@ -56,7 +57,7 @@ class SmoothPolicy(torch.nn.Module):
 
 
 def make_loop(
-    integrator=None, jitter_seed=None, coarse=False, composite=None
+    integrator=None, jitter_seed=None, coarse=False, composite=None, disturbance=None
 ) -> tuple[ClosedLoop, GridField]:
     """Return a loop through a foggy scene with one object, and the object's field.
 
@@ -83,6 +84,7 @@ def make_loop(
         integrator or ExplicitEuler(),
         DT,
         eight_bit=False,  # derivatives are compared with finite differences
+        disturbance=disturbance or Disturbance(),
     )
     return loop, item
 

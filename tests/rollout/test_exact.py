@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import analytic_loop as analytic
+from helpers.derivatives import central_difference
 from helpers.rollouts import (
     ADJOINTS,
     Wave,
@@ -19,6 +20,7 @@ from helpers.rollouts import (
     wave_in_torch,
 )
 
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.reduction import Worst
@@ -94,12 +96,31 @@ def test_images_of_eight_bits_are_differentiated_straight_through(name, rng):
     assert forward == pytest.approx(inner, rel=1e-9)
 
 
+@pytest.mark.parametrize("name", ADJOINTS)
+def test_disturbed_drives_are_differentiated_as_they_were(name, rng):
+    loop, _ = analytic.make_pair()
+    loop = replace(loop, disturbance=Disturbance(0.4, 0.5, 0.03, seed=2))
+    rollout = Rollout(loop, Wave(), 5, adjoint=ADJOINTS[name], attached=True)
+    initial = analytic.random_poses(3)
+    (base,), along = analytic.random_textures(), rng.normal(size=initial.shape)
+    direction = rng.normal(size=base.shape)
+    found = rollout.gradient(rollout.run(to_state(initial)))
+    expected = (found.textures[0].numpy() * direction).sum()
+    expected += (np.array(found.initial).T * along).sum()
+
+    def value(s):
+        loop.sensor.set_textures([base + s * direction])
+        return rollout.run(to_state(initial + s * along)).value
+
+    assert central_difference(value, 1e-5) == pytest.approx(expected, rel=1e-6)
+
+
 def test_images_of_eight_bits_are_those_of_files():
     loop = replace(analytic.make_pair()[0], eight_bit=True)
     levels = np.arange(256, dtype=np.uint8)
     shifts = np.array([-0.49, 0.0, 0.49])[:, None] / 255
     image = mi.TensorXf((levels / 255 + shifts).astype(np.float32))
-    shown = np.array(loop.shown(Observation(image)))
+    shown = np.array(loop.shown(Observation(image), 0))
     assert (shown == np.divide(levels, 255, dtype=np.float32)).all()
 
 

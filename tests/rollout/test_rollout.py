@@ -24,6 +24,7 @@ from helpers.rollouts import (
     unit,
 )
 
+from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.rollout import sweep
@@ -34,6 +35,9 @@ from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
+DISTURBANCE = Disturbance(exposure_ev_sd=0.5, blur_px_sd=0.8, noise_sd=0.02, seed=3)
+POSES = np.array([[0.0, 0.35, 0.02], [0.1, 0.2, -0.03]])
+
 
 @pytest.mark.parametrize(
     ("horizon", "changes"),
@@ -42,6 +46,7 @@ pytestmark = pytest.mark.usefixtures("variant")
         (3, {"integrator": ImplicitMidpoint()}),
         (3, {"jitter_seed": 7}),
         (3, {"composite": InterleavedComposite()}),
+        (3, {"jitter_seed": 7, "disturbance": DISTURBANCE}),
     ],
 )
 def test_attached_gradient_is_that_of_the_whole_loop(horizon, changes, rng):
@@ -53,6 +58,33 @@ def test_attached_gradient_is_that_of_the_whole_loop(horizon, changes, rng):
         value = along_texture(rollout, item, direction)
         expected = float((found * direction).sum())
         assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
+
+
+class HeldSensor(AbstractSensor):
+    """Sees from where a drive was, whatever the state is."""
+
+    def __init__(self, sensor, drive):
+        self.sensor, self.states = sensor, drive.states
+
+    def observe(self, state, step):
+        return self.sensor.observe(self.states[step], step)
+
+
+def test_detached_gradient_of_disturbed_drives_holds_the_camera_path(rng):
+    loop, item = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
+    rollout = make_rollout(loop, 4)
+    evaluation = rollout.run(loop.initial(POSES))
+    found = rollout.gradient(evaluation).textures[0].numpy().astype(float)
+    held = replace(loop, sensor=HeldSensor(loop.sensor, evaluation.trajectory))
+    base, direction = toy.texture_of(item), unit(rng.normal(size=found.shape))
+    direction = unit(unit(found) + 0.5 * direction)
+
+    def value(s):
+        loop.sensor.set_textures([(base + s * direction).astype(np.float32)])
+        return objective(make_rollout(held, 4), POSES)
+
+    expected = float((found * direction).sum())
+    assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
 def test_attached_gradient_by_the_initial_state():
@@ -113,7 +145,7 @@ def test_the_interleaved_composite_has_no_ray_tangents():
 
 @pytest.mark.parametrize("attached", [True, False])
 def test_forward_and_reverse_mode_are_transposes(rng, attached):
-    loop, _ = toy.make_loop()
+    loop, _ = toy.make_loop(disturbance=DISTURBANCE)
     rollout = make_rollout(loop, 4, attached)
     evaluation = rollout.run(loop.initial(INITIAL))
     found = rollout.gradient(evaluation)
@@ -159,20 +191,20 @@ def test_jitter_is_replayed():
 
 
 def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
-    loop, _ = toy.make_loop()
+    loop, _ = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
     found = {}
     for adjoint in ADJOINTS:
-        gradient(make_rollout(loop, 4, adjoint=adjoint))
+        gradient(make_rollout(loop, 4, adjoint=adjoint), POSES)
         with nothing_compiled():
             rollout = make_rollout(loop, 4, adjoint=adjoint)
-            found[adjoint] = texture_gradient(rollout, INITIAL + 0.07)
+            found[adjoint] = texture_gradient(rollout, POSES + 0.07)
     for name in ("kept", "checkpointed"):
         error = np.linalg.norm(found[name] - found["replay"])
         assert error <= 1e-6 * np.linalg.norm(found["replay"])
 
 
 def test_memory_does_not_grow_with_the_horizon():
-    loop, _ = toy.make_loop()
+    loop, _ = toy.make_loop(disturbance=DISTURBANCE)
     backend = dr.backend_v(mi.Float)
 
     def peak(horizon):

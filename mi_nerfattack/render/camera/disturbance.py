@@ -1,0 +1,240 @@
+"""What a camera adds to an image: blur, exposure and noise, and their derivatives.
+
+An image is decoded to linear light, blurred, multiplied by the exposure, clipped,
+encoded as sRGB, and noise is added: the order in a camera, whose optics blur light
+before the sensor counts it. Noise has one standard deviation in sRGB values: that of
+counted photons grows as the root of the light, and the sRGB curve is nearly a root,
+which makes it constant (Anscombe 1948; Foi et al. 2008 on sensors). It is what
+policies are trained with, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.ranges import NonNegative, Whole, checked
+
+#: Standard deviations at which the blur's kernel ends.
+_TRUNCATE = 4.0
+_STREAM = 3  # of the seed; initial poses have others
+
+
+@dataclass(frozen=True)
+@checked("Disturbance")
+class Disturbance:
+    """Blur and exposure drawn for each drive of a batch, noise for each frame.
+
+    Everything drawn is a function of the seed, the row of the batch and the step:
+    derivatives see the same numbers, and nothing is kept. Parts of size 0 are left out.
+
+    Cost: some launches of kernels over the image's values, and as many to
+    differentiate.
+
+    Args:
+        exposure_ev_sd: standard deviation of the exposure, powers of two; normal.
+        blur_px_sd: of the normal number whose size is the blur's standard deviation.
+        noise_sd: standard deviation of the noise, sRGB in [0, 1]; normal, independent
+            of pixel, channel and frame.
+        seed: of all draws.
+
+    Source: Athalye et al. 2018, expectation over transformation.
+    """
+
+    exposure_ev_sd: NonNegative = 0.0
+    blur_px_sd: NonNegative = 0.0
+    noise_sd: NonNegative = 0.0
+    seed: Whole = 0
+
+    def __bool__(self) -> bool:
+        """Tell whether it changes anything."""
+        return any((self.exposure_ev_sd, self.blur_px_sd, self.noise_sd))
+
+    def draws(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the drives' exposures, powers of two, and blurs, pixels; (count,)."""
+        normal = np.random.default_rng([self.seed, _STREAM]).normal(size=(count, 2))
+        return self.exposure_ev_sd * normal[:, 0], self.blur_px_sd * abs(normal[:, 1])
+
+    def apply(self, image: Any, step: int) -> Any:
+        """Disturb the images of a batch.
+
+        Args:
+            image: tensor (n, height, width, 3), sRGB in [0, 1], a row a drive.
+            step: index of the control period, from 0.
+
+        Returns:
+            a tensor like it; differentiable.
+        """
+        exposures, blurs = self.draws(image.shape[0])
+        return disturbed(image, exposures, blurs, self.noise_sd, self.seed, step)
+
+    def vjp(self, image: Any, step: int, d_shown: Any) -> Any:
+        """Return the derivative by the image from the one by what is shown.
+
+        Args:
+            image: as given to :meth:`apply`.
+            step: likewise.
+            d_shown: derivative of the objective by its result, of the same shape.
+        """
+        with dr.resume_grad():
+            leaf = type(image)(dr.detach(image))
+            dr.enable_grad(leaf)
+            shown = self.apply(leaf, step).array
+            dr.backward_from(shown * type(shown)(d_shown.array))
+            result = dr.grad(leaf)
+        dr.eval(result)
+        return result
+
+    def jvp(self, image: Any, step: int, t_image: Any) -> Any:
+        """Return the tangent of what is shown from the one of the image."""
+        with dr.resume_grad():
+            leaf = type(image)(dr.detach(image))
+            dr.enable_grad(leaf)
+            dr.set_grad(leaf, t_image)
+            return dr.forward_to(self.apply(leaf, step))
+
+
+def disturbed(
+    image: Any,
+    exposures: np.ndarray,
+    blurs: np.ndarray,
+    noise_sd: float,
+    seed: int,
+    step: int,
+) -> Any:
+    """Blur and expose images, and add noise.
+
+    Args:
+        image: tensor (n, height, width, 3), sRGB in [0, 1].
+        exposures: (n,), powers of two.
+        blurs: (n,), standard deviations, pixels.
+        noise_sd: standard deviation of the noise, sRGB in [0, 1].
+        seed: of the noise.
+        step: likewise.
+
+    Returns:
+        a tensor like it; differentiable.
+    """
+    kind, shape, value = type(image.array), image.shape, image.array
+    if exposures.any() or blurs.any():
+        value = srgb_to_linear(value)
+        if blurs.any():
+            value = blur(value, shape, blurs)
+        gain = _uploaded(kind, 2.0**exposures)
+        value = linear_to_srgb(value * dr.gather(kind, gain, _drive(value, shape)))
+    if noise_sd:
+        noise = standard_normal(kind, shape, seed, step)
+        value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
+        value = dr.clip(value, 0, 1)
+    return type(image)(value, shape)
+
+
+def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:
+    """Convolve images with Gaussians; differentiable.
+
+    Edges are mirrored, without their outermost pixel twice over: this makes the matrix
+    of the convolution symmetric, so that it is its own transpose.
+
+    Args:
+        value: flat values of a tensor of that shape.
+        shape: (n, height, width, 3).
+        blurs: (n,), standard deviations, pixels.
+    """
+    reach = max(1, int(_TRUNCATE * blurs.max() + 0.5))
+    offsets = np.arange(reach + 1)
+    weights = np.exp(-0.5 * (offsets / np.maximum(blurs, 1e-3)[:, None]) ** 2)
+    weights /= 2 * weights.sum(1, keepdims=True) - weights[:, :1]
+    table = _uploaded(type(value), weights.ravel())
+    return dr.custom(_Blur, value, _Kernel(shape, table, reach))
+
+
+class _Kernel:
+    """Weights by drive and distance, which Dr.Jit does not look into for arrays."""
+
+    def __init__(self, shape: tuple[int, ...], table: Any, reach: int) -> None:
+        self.shape, self.table, self.reach = shape, table, reach
+
+    def both_ways(self, value: Any) -> Any:
+        """Convolve along rows, then along columns."""
+        _, height, width, channels = self.shape
+        dr.eval(value)  # is gathered from
+        value = self._along(value, channels, width)
+        dr.eval(value)
+        return self._along(value, channels * width, height)
+
+    @dr.syntax
+    def _along(self, value: Any, stride: int, length: int) -> Any:
+        kind = type(value)
+        integer = dr.int32_array_t(kind)
+        index = integer(dr.arange(dr.uint32_array_t(kind), dr.width(value)))
+        place = index // stride % length
+        first = index - place * stride
+        reach = dr.opaque(integer, self.reach)
+        row = _drive(value, self.shape) * (reach + 1)
+        offset = integer(-reach)
+        total = kind(0)
+        while offset <= reach:
+            source = place + offset
+            source = dr.select(source < 0, -1 - source, source) % (2 * length)
+            source = dr.select(source < length, source, 2 * length - 1 - source)
+            weight = dr.gather(kind, self.table, row + dr.abs(offset))
+            total += weight * dr.gather(kind, value, first + source * stride)
+            offset += 1
+        return total
+
+
+class _Blur(dr.CustomOp):
+    """A linear map that is its own transpose."""
+
+    def eval(self, value: Any, kernel: _Kernel) -> Any:
+        self.kernel = kernel
+        return kernel.both_ways(value)
+
+    def forward(self) -> None:
+        self.set_grad_out(self.kernel.both_ways(self.grad_in("value")))
+
+    def backward(self) -> None:
+        self.set_grad_in("value", self.kernel.both_ways(self.grad_out()))
+
+
+def standard_normal(kind: Any, shape: tuple[int, ...], seed: int, step: int) -> Any:
+    """Draw normal numbers by counters (TEA), a function of seed, row and step.
+
+    Args:
+        kind: type of the result.
+        shape: (n, ...), of a row a drive.
+        seed: of all.
+        step: index of the control period.
+
+    Returns:
+        flat values, mean 0 and variance 1, at most 5.9.
+
+    Source: Zafar et al. 2010; Box and Muller 1958.
+    """
+    (key,) = np.random.SeedSequence([seed, _STREAM]).generate_state(1)
+    size = int(np.prod(shape[1:]))
+    index = dr.arange(mi.UInt32, shape[0] * size)
+    key = mi.sample_tea_32(dr.opaque(mi.UInt32, int(key)), dr.opaque(mi.UInt32, step))
+    key = mi.sample_tea_32(key[0], index // size)
+    first, second = mi.sample_tea_32(key[0], index % size)
+    scale = 2.0**-24  # 24 bits, as single precision holds them
+    radius = dr.sqrt(-2 * dr.log((kind(first >> 8) + 0.5) * scale))
+    return radius * dr.cos(2 * dr.pi * scale * kind(second >> 8))
+
+
+def _drive(value: Any, shape: tuple[int, ...]) -> Any:
+    """Return the row of the batch that each flat value belongs to."""
+    index = dr.arange(dr.uint32_array_t(type(value)), dr.width(value))
+    return index // int(np.prod(shape[1:]))
+
+
+def _uploaded(kind: Any, values: np.ndarray) -> Any:
+    """Make an array whose numbers, and their alignment, kernels do not depend on."""
+    result = kind(values.tolist())
+    dr.make_opaque(result)
+    return result

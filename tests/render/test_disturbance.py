@@ -1,0 +1,132 @@
+"""What a camera adds to images, and its derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.analytic_loop import row_type, tensor, tensor_type
+from helpers.derivatives import central_difference
+from helpers.kernels import nothing_compiled
+from scipy.ndimage import gaussian_filter
+
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.disturbance import (
+    Disturbance,
+    blur,
+    standard_normal,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SHAPE = (3, 5, 9, 3)
+ALL = Disturbance(exposure_ev_sd=0.9, blur_px_sd=0.6, noise_sd=0.04, seed=7)
+SIZES = ("exposure_ev_sd", "blur_px_sd", "noise_sd")
+
+
+@pytest.fixture
+def image(rng):
+    return rng.uniform(0, 1, SHAPE)
+
+
+def blurred(image, blurs, reach):
+    rows = [
+        gaussian_filter(row, (s, s, 0), mode="reflect", radius=(reach, reach, 0))
+        if s
+        else row
+        for row, s in zip(image, blurs, strict=True)
+    ]
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("largest", [0.02, 2.3, 5.0])  # beyond the image, too
+def test_blur_is_that_of_scipy(image, largest):
+    blurs = np.array([0.0, 0.4 * largest, largest])
+    found = np.array(blur(row_type()(image.ravel()), SHAPE, blurs)).reshape(SHAPE)
+    reach = max(1, int(4 * largest + 0.5))
+    np.testing.assert_allclose(found, blurred(image, blurs, reach), atol=1e-14)
+
+
+def test_light_is_blurred_and_exposed_and_values_get_noise(image):
+    exposures, blurs = ALL.draws(3)
+    light = blurred(srgb_to_linear_numpy(image), blurs, int(4 * blurs.max() + 0.5))
+    value = linear_to_srgb_numpy(light * 2.0 ** exposures[:, None, None, None])
+    noise = np.array(standard_normal(row_type(), SHAPE, 7, 2)).reshape(SHAPE)
+    expected = np.clip(value + 0.04 * noise, 0, 1)
+    given = tensor(image)
+    for _ in range(2):  # the image stays as it is
+        found = np.array(ALL.apply(given, 2))
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert (expected == 1).any() and (value > 1 - 1e-9).any()  # some is clipped
+
+
+def test_exposures_and_blurs_are_normal_and_half_normal():
+    exposures, blurs = ALL.draws(20000)
+    assert exposures.std() == pytest.approx(0.9, rel=0.03)
+    assert abs(exposures.mean()) < 0.025 and blurs.min() >= 0
+    assert np.sqrt((blurs**2).mean()) == pytest.approx(0.6, rel=0.03)
+    assert abs(np.corrcoef(exposures, blurs)[0, 1]) < 0.03
+    for few, many in zip(ALL.draws(2), ALL.draws(5), strict=True):
+        assert np.array_equal(few, many[:2])  # a drive's own, whatever the batch
+
+
+def test_noise_is_normal_and_independent_of_pixel_row_step_and_seed():
+    shape = (2, 60, 90, 3)
+
+    def draw(seed, step):
+        return np.array(standard_normal(mi.Float, shape, seed, step)).reshape(shape)
+
+    first = draw(5, 3)
+    fields = [first[0], first[1], draw(5, 4)[0], draw(6, 3)[0]]
+    moments = [(first**k).mean() for k in (1, 2, 3, 4)]
+    np.testing.assert_allclose(moments, [0, 1, 0, 3], atol=0.12)
+    flat = np.stack([field.ravel() for field in fields])
+    flat = np.vstack([flat, np.roll(flat[0], 1), np.roll(flat[0], 3)])
+    correlations = np.corrcoef(flat) - np.eye(6)
+    assert np.abs(correlations).max() < 4 / np.sqrt(flat.shape[1])
+    assert np.array_equal(draw(5, 3), first)
+
+
+@pytest.mark.parametrize("parts", [SIZES, *((name,) for name in SIZES)])
+def test_derivatives_are_exact(image, rng, parts):
+    kept = {name: getattr(ALL, name) for name in parts}
+    disturbance = Disturbance(seed=7, **kept)
+    given, weight = tensor(image), rng.normal(size=SHAPE)
+    by_image = np.array(disturbance.vjp(given, 1, tensor(weight)))
+    along = rng.normal(size=SHAPE)
+    expected = (by_image * along).sum()
+    tangent = np.array(disturbance.jvp(given, 1, tensor(along)))
+    assert (tangent * weight).sum() == pytest.approx(expected, rel=1e-12)
+
+    def value(s):
+        return (
+            np.array(disturbance.apply(tensor(image + s * along), 1)) * weight
+        ).sum()
+
+    assert central_difference(value, 1e-6) == pytest.approx(expected, rel=1e-7)
+
+
+def test_other_seeds_and_steps_compile_nothing():
+    # memory of NumPy's may be aligned in any way, for which there are other kernels
+    given = mi.TensorXf(dr.linspace(mi.Float, 0, 1, int(np.prod(SHAPE))), SHAPE)
+    dr.eval(given)
+
+    def work(disturbance, step):
+        np.array(disturbance.apply(given, step))
+        np.array(disturbance.vjp(given, step, given))
+
+    work(ALL, 0)
+    with nothing_compiled():
+        work(replace(ALL, seed=8, noise_sd=0.1, blur_px_sd=3.0), 5)
+
+
+def test_nothing_is_disturbed_by_default_and_sizes_are_checked(image):
+    assert not Disturbance(seed=3)
+    found = np.array(Disturbance().apply(tensor_type()(image), 0))
+    assert np.array_equal(found, image)
+    with pytest.raises(InputError, match="Disturbance.noise_sd: -0.1; must be"):
+        Disturbance(noise_sd=-0.1)
