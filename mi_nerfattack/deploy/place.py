@@ -9,7 +9,7 @@ from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.ranges import Count, Finite, Seconds, checked
+from mi_nerfattack.ranges import Count, Finite, NonNegative, Seconds, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
 
@@ -56,6 +56,8 @@ class Conditions:
         sky: time of day, key of `DAYLIGHT`: "day" (the file's), "morning", "noon",
             "evening", "overcast".
         exposure_ev: of the camera, in powers of two.
+        blur_px: standard deviation of the camera's Gaussian blur, pixels.
+        noise_sd: standard deviation of its noise, of sRGB values in [0, 1].
         spp: samples per pixel of path-traced images.
         built_in: objects with geometry, lit and shadowed by the environment.
     """
@@ -64,6 +66,8 @@ class Conditions:
     exposure_ev: Finite = 0.0
     spp: Count = 16
     built_in: tuple[BuiltInObject, ...] = ()
+    blur_px: NonNegative = 0.0
+    noise_sd: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         """Check the sky."""

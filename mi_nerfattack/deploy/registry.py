@@ -9,7 +9,11 @@ from mi_nerfattack.deploy.built_in import built_in_shapes
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.simulated import SimulatedEnvironment, SurrogateEnvironment
+from mi_nerfattack.deploy.simulated import (
+    AbstractSimulation,
+    SimulatedEnvironment,
+    SurrogateEnvironment,
+)
 from mi_nerfattack.deploy.vehicle import AbstractVehicle
 from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
@@ -80,6 +84,7 @@ def _carla(place: Place, conditions: Conditions) -> AbstractEnvironment:
     from mi_nerfattack.deploy.carla.session import CarlaServer
 
     _refuse_built_in("carla", conditions)
+    _refuse_disturbed("carla", conditions)
     server = CarlaServer.parse(place.server, weather=_CARLA_WEATHER[conditions.sky])
     driver = KinematicDriver(kinematic_vehicle(place))
     exposure = {"exposure_compensation": str(conditions.exposure_ev)}
@@ -105,6 +110,7 @@ def _replay(place: Place, conditions: Conditions) -> AbstractEnvironment:
             "video or an MCAP log"
         )
     _refuse_built_in("replay", conditions)
+    _refuse_disturbed("replay", conditions)
     recording = open_recording(place.recording, place.camera, place.mount, place.period)
     car = place.car
     return ReplayEnvironment(
@@ -117,6 +123,14 @@ def _refuse_built_in(name: str, conditions: Conditions) -> None:
         raise InputError(
             f"environment {name!r}: takes no built-in objects; show fields, which it "
             "pastes or composes"
+        )
+
+
+def _refuse_disturbed(name: str, conditions: Conditions) -> None:
+    if conditions.blur_px or conditions.noise_sd:
+        raise InputError(
+            f"environment {name!r}: takes no blur_px and no noise_sd; its images are "
+            "shown as they come, leave both 0"
         )
 
 
@@ -163,7 +177,12 @@ def make_environment(
     if name not in ENVIRONMENTS:
         known = ", ".join(ENVIRONMENTS)
         raise InputError(f"environment: {name!r}; one of {known}")
-    return ENVIRONMENTS[name](place, conditions or Conditions())
+    conditions = conditions or Conditions()
+    environment = ENVIRONMENTS[name](place, conditions)
+    if isinstance(environment, AbstractSimulation):
+        environment.blur_px = conditions.blur_px
+        environment.noise_sd = conditions.noise_sd
+    return environment
 
 
 def environment_versions(name: str) -> dict[str, str]:

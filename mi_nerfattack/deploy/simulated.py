@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,7 @@ from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
 from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.disturbance import disturbed
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.route.route import Route
@@ -39,6 +41,7 @@ class AbstractSimulation(AbstractEnvironment):
         self.period, self.max_control = period, vehicle.max_control
         self.control_unit = vehicle.control_unit
         self._seed, self._steps = 0, -1
+        self.blur_px, self.noise_sd = 0.0, 0.0  # of the camera
 
     def reset(
         self, route: Route, pose: np.ndarray | None = None, seed: int = 0
@@ -49,7 +52,7 @@ class AbstractSimulation(AbstractEnvironment):
             raise InputError(f"seed: {seed}; at least 0")
         self.vehicle.reset(start, route.speed_ms, seed)
         self._seed, self._steps = seed, 0
-        return self._observe()
+        return self._disturbed(self._observe())
 
     def step(self, control: float) -> CameraFrame:
         """Drive one period and render."""
@@ -57,12 +60,21 @@ class AbstractSimulation(AbstractEnvironment):
             raise InputError(f"environment {self.name!r}: step comes after reset")
         self.vehicle.advance(float(control))
         self._steps += 1
-        return self._observe()
+        return self._disturbed(self._observe())
 
     @property
     def state(self) -> np.ndarray:
         """State (m,) of the vehicle."""
         return self.vehicle.state
+
+    def _disturbed(self, frame: CameraFrame) -> CameraFrame:
+        """Blur the image of a frame and add noise, in eight bits."""
+        if not (self.blur_px or self.noise_sd):
+            return frame
+        image = mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
+        zero, draw = np.zeros(1), (self.noise_sd, self._seed, self._steps)
+        seen = np.array(disturbed(image, zero, zero + self.blur_px, *draw))[0]
+        return replace(frame, image=np.round(255 * seen).astype(np.uint8))
 
     @abstractmethod
     def _observe(self) -> CameraFrame:

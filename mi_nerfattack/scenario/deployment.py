@@ -13,7 +13,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.ranges import Count, Finite
+from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section
@@ -43,6 +43,8 @@ class RenderedDeployment(AbstractDeploymentSection):
     spp: Count = 16
     sky: Sky = "day"
     exposure_ev: Finite = 0.0
+    blur_px: NonNegative = 0.0
+    noise_sd: NonNegative = 0.0
     objects: Objects = "pasted"
 
 
@@ -52,6 +54,8 @@ class RasterisedDeployment(AbstractDeploymentSection):
     environment: Literal["mujoco_gl"]
     sky: Sky = "day"
     exposure_ev: Finite = 0.0
+    blur_px: NonNegative = 0.0
+    noise_sd: NonNegative = 0.0
     objects: Objects = "pasted"
 
 
@@ -166,7 +170,7 @@ def deployments(
     found = {}
     for label, section in labelled(given):
         values = section.model_dump()
-        names = ("sky", "exposure_ev", "spp")
+        names = ("sky", "exposure_ev", "spp", "blur_px", "noise_sd")
         conditions = Conditions(**{n: values[n] for n in names if n in values})
         name, builds_in = values["environment"], values.get("objects") == "built-in"
         found[label] = Deployment(name, section.place(place), conditions, builds_in)

@@ -13,8 +13,13 @@ from helpers.blank_view import blank_environment
 from helpers.kernels import nothing_compiled
 from helpers.small_fields import blob, small_ngp
 from helpers.tiny_place import write_place
+from scipy.ndimage import gaussian_filter
 
-from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.backend.colour import (
+    linear_to_srgb_numpy,
+    linear_to_uint8,
+    srgb_to_linear_numpy,
+)
 from mi_nerfattack.deploy.car import CAR, SMALL_CAR
 from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, bundled_place
@@ -186,6 +191,25 @@ def test_wall_of_known_radiance_at_known_distance(exposure_ev):
     assert (frame.image[:, 0] == 0).all()
 
 
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_a_camera_blurs_light_and_adds_noise_to_values(name, tmp_path):
+    place, conditions = write_place(tmp_path), Conditions(spp=1)
+    clear = make_environment(name, place, conditions).reset(a_route(), None, 5)
+    worse = replace(conditions, blur_px=1.5, noise_sd=0.05)
+    environment = make_environment(name, place, worse)
+    frame = environment.reset(a_route(), None, 5)
+    light = srgb_to_linear_numpy(clear.image / 255)
+    blurred = gaussian_filter(light, (1.5, 1.5, 0), mode="reflect")
+    noise = frame.image / 255 - linear_to_srgb_numpy(blurred)
+    unclipped = noise[(frame.image > 0) & (frame.image < 255)]
+    assert unclipped.size > 200
+    assert unclipped.std() == pytest.approx(0.05, rel=0.15)
+    assert abs(unclipped.mean()) < 0.01
+    assert (frame.depth == clear.depth).all()
+    assert (environment.reset(a_route(), None, 5).image == frame.image).all()
+    assert (environment.reset(a_route(), None, 6).image != frame.image).any()
+
+
 def test_any_number_of_samples_is_split_into_powers_of_two():
     for spp in range(1, 70):
         parts = _parts(spp)
@@ -278,6 +302,10 @@ def test_environments_that_cannot_be_made(tmp_path, monkeypatch):
         built_in = Conditions(built_in=(object(),))
         with pytest.raises(InputError, match=f"'{name}': takes no built-in objects"):
             make_environment(name, replace(place, recording=tmp_path), built_in)
+    for name in ("carla", "replay"):
+        with pytest.raises(InputError, match=f"'{name}': takes no blur_px and no"):
+            noisy = Conditions(noise_sd=0.1)
+            make_environment(name, replace(place, recording=tmp_path), noisy)
     monkeypatch.setitem(sys.modules, "carla", None)
     with pytest.raises(InputError, match=r"'carla': its client .*pip .*\[carla\]'"):
         make_environment("carla", place)

@@ -9,8 +9,9 @@ import pytest
 from helpers.scenario_text import HEAD, write_named_files
 
 from mi_nerfattack.deploy.car import CAR
+from mi_nerfattack.deploy.place import Conditions, bundled_place
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.scenario.deployment import labelled
+from mi_nerfattack.scenario.deployment import deployments, labelled
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.vehicle import AckermannSection
 
@@ -98,6 +99,17 @@ def test_values_count_to_the_identity(load, tmp_path):
 def test_refusals_name_key_and_remedy(load, text, message):
     with pytest.raises(InputError, match=message):
         load(text)
+
+
+def test_conditions_are_those_of_the_table(load):
+    given = {"sky": "noon", "exposure_ev": -0.5, "blur_px": 0.5, "noise_sd": 0.1}
+    keys = "\n".join(f"{name} = {value!r}" for name, value in given.items())
+    for environment, more in (("mitsuba", {"spp": 4}), ("mujoco_gl", {})):
+        head = f'[deployment]\nenvironment = "{environment}"\n{keys}\n'
+        more_keys = "".join(f"{name} = {value}\n" for name, value in more.items())
+        section = load(head + more_keys)[0].deployment
+        found = deployments(section, bundled_place())["deployment"].conditions
+        assert found == Conditions(**given, **more)
 
 
 def test_the_car_with_wheels_is_the_vehicles_size(load):
