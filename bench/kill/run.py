@@ -252,7 +252,10 @@ class Campaign:
                 self.failures.append(f"{output.name}: {lost} iterations lost")
         for stage in {name for name, _, _ in life.lines} - _NOT_DRIVES:
             first = life.first(stage)
-            if first is not None and seen.done(stage) - first > HORIZON:
+            unit = HORIZON * (
+                2 if stage == "surrogate: random" else 1
+            )  # judged, driven
+            if first is not None and seen.done(stage) - first > unit:
                 self.failures.append(f"{output.name}: {stage}: drives were repeated")
         if any(map(locks.is_partial, output.rglob(".*.tmp"))) and life.complete:
             self.failures.append(f"{output.name}: temporary files are left")

@@ -76,13 +76,13 @@ def metrics_table(document: Mapping[str, Any]) -> rich.table.Table:
 
     Returns:
         A row per route, environment and case: `wheel out` is the time beyond the limit,
-        mean over the runs, `left` how many runs had such a time.
+        mean over the runs, `drives out` how many runs had such a time.
     """
     table = _distances()
     table.add_column("route", overflow="fold", max_width=14)
     for name in ("environment", "case"):
         table.add_column(name, no_wrap=True)
-    for name in ("runs", "mean\n(m)", "max\n(m)", "wheel\nout (s)", "left"):
+    for name in ("runs", "mean\n(m)", "max\n(m)", "wheel\nout (s)", "drives\nout"):
         table.add_column(name, justify="right", no_wrap=True)
     for route, environments in document["routes"].items():
         for environment, cases in environments.items():

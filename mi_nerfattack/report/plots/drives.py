@@ -31,7 +31,7 @@ from mi_nerfattack.rollout.drive import (
 
 _STYLES: dict[str, dict[str, Any]] = {
     RANDOM: {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
-    NO_OBJECT: {"color": "#009E73", "linewidth": 1.2, "zorder": 3.5},
+    NO_OBJECT: {"color": "#00C48F", "linewidth": 0.9, "zorder": 4.2},
     OWN: {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
     BEST_RANDOM: {
         "color": "#8A4F7D",
