@@ -14,6 +14,7 @@ from bench.commands.speed import (
     BenchRender,
     BenchSteps,
 )
+from bench.commands.study import BenchStudy
 from bench.commands.training import BenchCollect, BenchDagger
 from mi_nerfattack import cli
 
@@ -28,6 +29,7 @@ COMMANDS = {
     "circle": BenchCircle,
     "collect": BenchCollect,
     "dagger": BenchDagger,
+    "study": BenchStudy,
 }
 
 

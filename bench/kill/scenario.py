@@ -45,7 +45,7 @@ file = "policy.safetensors"
 horizon = {HORIZON}
 runs = {RUNS}
 [attack]
-iterations = 30
+max_iterations = 30
 learning_rate = 0.5
 checkpoint_every = {EVERY}
 deterministic = true

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.attack.colours import AbstractColouring, Colours
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -16,7 +19,8 @@ class Freedom:
     """Parameters of an attack and their learning rates.
 
     Attributes:
-        texture_rate: Adam's, in units of the raw colours; None leaves textures alone.
+        texture_rate: Adam's, in colours (sRGB in 0 to 1); None leaves textures alone.
+        colouring: makes what is stepped in, of each object's field.
         pose_rate: Adam's, in metres and radians; None leaves poses alone.
         axes: of `AXES`, along and about which objects may move (world axes).
         limit_m: largest shift along an axis; offsets are projected onto it after each
@@ -27,11 +31,12 @@ class Freedom:
         InputError: nothing is left to change, or an axis is unknown.
     """
 
-    texture_rate: float | None = 0.3
+    texture_rate: float | None = 0.1
     pose_rate: float | None = None
     axes: tuple[str, ...] = ("x", "y", "yaw")
     limit_m: float = 1.0
     limit_rad: float = 0.5
+    colouring: Callable[[GridField], AbstractColouring] = Colours
 
     def __post_init__(self) -> None:
         if self.texture_rate is None and self.pose_rate is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,7 +12,9 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from mi_nerfattack.attack.colours import AbstractColouring
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.function import Evaluation, Rollout
@@ -55,6 +58,7 @@ class GradientAttack:
         route: the lane centre, for the record.
         initial: (m, n) initial states.
         freedom: what may change.
+        schedule: of the learning rates; constant by default.
 
     Attributes:
         history: a record an iteration.
@@ -70,31 +74,48 @@ class GradientAttack:
         route: Route,
         initial: Any,
         freedom: Freedom | None = None,
+        schedule: Schedule | None = None,
     ) -> None:
         self.rollout = rollout
         self.route = route
         self.initial = initial
         self.freedom = freedom or Freedom()
+        self.schedule = schedule or Schedule(sys.maxsize)
         self.sensor = differentiable(rollout.loop)
         self.history: list[IterationRecord] = []
         self.best_objective = np.inf
         self.best_mean_m = 0.0
         self.best = self._textures()
-        rate = self.freedom.texture_rate or self.freedom.pose_rate or 0.0
-        self.optimiser = Adam(lr=rate)
+        self.optimiser = Adam(lr=1.0)
+        self._colourings: dict[str, AbstractColouring] = {}
         if self.freedom.texture_rate is not None:
-            for i, texture in enumerate(self.sensor.textures()):
-                self.optimiser[str(i)] = texture
+            for i, field in enumerate(self.sensor.fields):
+                colouring = self.freedom.colouring(field)
+                self._colourings[str(i)] = colouring
+                self.optimiser[str(i)] = _tensor(colouring.start)
         self.best_offsets = self._offsets()
         self.whole = True
         if self.freedom.pose_rate is not None:
             self.optimiser[OFFSETS] = _tensor(self.best_offsets)
-            self.optimiser.set_learning_rate({OFFSETS: self.freedom.pose_rate})
 
     @property
     def iteration(self) -> int:
         """Number of finished iterations."""
         return len(self.history)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the schedule ends here."""
+        return self.schedule.is_over(self._objectives)
+
+    @property
+    def has_converged(self) -> bool:
+        """Whether there was nothing more to gain at the full rates."""
+        return self.schedule.has_converged(self._objectives)
+
+    @property
+    def _objectives(self) -> list[float]:
+        return [record.objective for record in self.history]
 
     def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
         """Do one iteration.
@@ -152,7 +173,14 @@ class GradientAttack:
 
     def _values(self, gradient: Gradient) -> dict[str, Any]:
         """Return the gradient by the optimiser's keys, checked."""
-        values = {str(i): value for i, value in enumerate(gradient.textures)}
+        values = {
+            key: _tensor(
+                colouring.gradient(
+                    self._parameters(key), gradient.textures[int(key)].numpy()
+                )
+            )
+            for key, colouring in self._colourings.items()
+        }
         if gradient.offsets is not None:
             values[OFFSETS] = _tensor(gradient.offsets * self.freedom.mask)
         values = {key: values[key] for key in self.optimiser}
@@ -166,9 +194,15 @@ class GradientAttack:
         return values
 
     def _update(self, values: dict[str, Any]) -> None:
+        share = self.schedule.rate(self._objectives)
+        full = {key: self.freedom.texture_rate or 0.0 for key in values}
+        full[OFFSETS] = self.freedom.pose_rate or 0.0
+        self.optimiser.set_learning_rate({key: share * full[key] for key in values})
         for key, value in values.items():
             dr.set_grad(self.optimiser[key], value)
         self.optimiser.step()
+        for key, colouring in self._colourings.items():
+            self.optimiser[key] = _tensor(colouring.project(self._parameters(key)))
         if OFFSETS in values:
             moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
             self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
@@ -176,11 +210,18 @@ class GradientAttack:
     def _install(self) -> None:
         """Give the sensor the optimiser's parameters."""
         if self.freedom.texture_rate is not None:
-            keys = map(str, range(len(self.best)))
-            self.sensor.set_textures([dr.detach(self.optimiser[key]) for key in keys])
+            self.sensor.set_textures(
+                [
+                    _tensor(colouring.texture(self._parameters(key)))
+                    for key, colouring in self._colourings.items()
+                ]
+            )
         if self.freedom.pose_rate is not None:
             offsets = dr.detach(self.optimiser[OFFSETS])
             self.sensor.set_offsets(np.array(offsets, np.float64))
+
+    def _parameters(self, key: str) -> np.ndarray:
+        return dr.detach(self.optimiser[key]).numpy()
 
     def _textures(self) -> list[np.ndarray]:
         return [texture.numpy().copy() for texture in self.sensor.textures()]

@@ -214,7 +214,7 @@ class Job:
             checkpoint.save(attack, effort())
         try:
             with held_interrupts() as check:
-                while attack.iteration < section.iterations:
+                while not attack.is_over:
                     self._iterate(attack, account, check)
                     if attack.iteration % section.checkpoint_every == 0:
                         checkpoint.save(attack, effort())
@@ -231,7 +231,7 @@ class Job:
         self, attack: GradientAttack, account: Account, check: Callable[[], None]
     ) -> None:
         horizon = attack.rollout.horizon
-        total = 2 * horizon * self.scenario.attack.iterations
+        total = 2 * horizon * self.scenario.attack.max_iterations
         done = 2 * horizon * attack.iteration
         remark = f"iteration {attack.iteration + 1}"
         if attack.history:

@@ -45,6 +45,21 @@ class GridLayout:
         return level_growth(self.levels, self.base_resolution, self.max_resolution)
 
 
+@dataclass(frozen=True)
+class GridLevel:
+    """One level of a grid field.
+
+    Attributes:
+        scale: its vertex i lies at i / scale along an edge of the unit cube.
+        resolution: vertices along an edge.
+        vertices: which of the field's they are, x the fastest.
+    """
+
+    scale: float
+    resolution: int
+    vertices: slice
+
+
 class GridField(AbstractField):
     """Multi-resolution grid without decoder and without view dependence.
 
@@ -175,6 +190,16 @@ class GridField(AbstractField):
         colour = mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in (r, g, b)])
         return density & active, srgb_to_linear(colour) & active
 
+    def levels(self) -> list[GridLevel]:
+        """Return the levels, the coarsest first."""
+        found = []
+        for index in range(self.layout.levels):
+            scale = self.encoding._level_scale(index)
+            n = self.encoding._resolution(scale)
+            start = self.encoding.level_offset(index)
+            found.append(GridLevel(scale, n, slice(start, start + n**3)))
+        return found
+
     def density_bound(self) -> float:
         """Bound the density by the vertices around each block of a 64^3 partition.
 
@@ -185,11 +210,9 @@ class GridField(AbstractField):
         blocks = 64
         edges = np.arange(blocks + 1) / blocks
         total = np.zeros((blocks,) * 3)
-        for level in range(self.layout.levels):
-            scale = self.encoding._level_scale(level)
-            n = self.encoding._resolution(scale)
-            start = self.encoding.level_offset(level)
-            values = raw[start : start + n**3].reshape(n, n, n)
+        for level in self.levels():
+            scale, n = level.scale, level.resolution
+            values = raw[level.vertices].reshape(n, n, n)
             low = np.floor(edges[:-1] * scale).astype(int)
             high = np.minimum(np.floor(edges[1:] * scale).astype(int) + 1, n - 1)
             for axis in range(3):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.render.surroundings import Ends
@@ -75,6 +77,11 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Args:
             poses: whether to accumulate those of the objects' poses, too.
         """
+
+    @property
+    @abstractmethod
+    def fields(self) -> Sequence[GridField]:
+        """The fields whose textures are attacked."""
 
     @abstractmethod
     def texture_gradients(self) -> list[Any]:

@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from mi_nerfattack.attack.freedom import Freedom
-from mi_nerfattack.ranges import Count, NonNegative, Positive
+from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.ranges import Count, NonNegative, Positive, SomeShare
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
     AbstractAdjoint,
@@ -46,7 +47,7 @@ class TextureFreedom(Section):
     """Textures may change."""
 
     parameters: Literal["texture"] = "texture"
-    learning_rate: Positive = 0.3
+    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
@@ -81,7 +82,7 @@ class BothFreedom(AbstractPoseFreedom):
     """Textures may change, too."""
 
     parameters: Literal["both"]
-    learning_rate: Positive = 0.3
+    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
@@ -91,7 +92,8 @@ class BothFreedom(AbstractPoseFreedom):
 class AttackSection(Section):
     """How textures and poses are optimised."""
 
-    iterations: Count = 20
+    max_iterations: Count = 48  # fewer where the attack converges before
+    final_rate: SomeShare = 0.1  # of the learning rates, at the end
     poses: Count = 1  # initial poses of an iteration; the first is nominal
     freedom: Annotated[
         TextureFreedom | PoseFreedom | BothFreedom, Kinds("parameters")
@@ -111,3 +113,8 @@ class AttackSection(Section):
         """Make what the attack's images go through."""
         sizes = self.exposure_ev_sd, self.blur_px_sd, self.noise_sd
         return Disturbance(*sizes, seed)
+
+    @property
+    def schedule(self) -> Schedule:
+        """Of the learning rates."""
+        return Schedule(self.max_iterations, self.final_rate)

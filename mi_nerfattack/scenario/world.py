@@ -233,7 +233,8 @@ def build_attack(world: World) -> GradientAttack:
     poses = initial_states(scenario, world.route, section.poses, 2)
     poses[0] = world.route.pose_at(scenario.drive.start_m)
     freedom = section.freedom.build()
-    return GradientAttack(rollout, world.route, loop.initial(poses), freedom)
+    initial = loop.initial(poses)
+    return GradientAttack(rollout, world.route, initial, freedom, section.schedule)
 
 
 def _load_scene(scenario: Scenario) -> Layer:

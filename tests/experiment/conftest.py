@@ -16,7 +16,7 @@ def scenario_folder(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     changes = {
         "horizon = 2": "horizon = 4",
-        "iterations = 30": "iterations = 3",
+        "max_iterations = 30": "max_iterations = 3",
         "checkpoint_every = 3\ndeterministic = true": "checkpoint_every = 1",
         "[baseline]\ntextures = 4\n": "",
     }
@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     camera = f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]"
     changes = {
-        "iterations = 30": "iterations = 6",
+        "max_iterations = 30": "max_iterations = 6",
         "textures = 4": "textures = 2",
         "[drive]": camera,
     }

@@ -81,7 +81,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
 @pytest.mark.slow
 def test_interrupted_attack_resumes(scenario_folder, tmp_path):
     output, other = tmp_path / "run", scenario_folder / "scenario.toml"
-    text = other.read_text().replace("iterations = 3", "iterations = 10")
+    text = other.read_text().replace("max_iterations = 3", "max_iterations = 10")
     path = scenario_folder / "long.toml"
     path.write_text(text + "[baseline]\ntextures = 1\n")
     process = subprocess.Popen(
@@ -118,7 +118,7 @@ def test_interrupted_attack_resumes(scenario_folder, tmp_path):
     ("change", "words"),
     [
         (("scene.safetensors", "absent.safetensors"), ["absent.safetensors"]),
-        (("iterations = 3", "iteratons = 3"), ["iteratons", ":19"]),
+        (("max_iterations = 3", "max_iteratons = 3"), ["max_iteratons", ":19"]),
         (('route = "line"', 'route = "loop"'), ["loop", "line"]),
         (("object.safetensors", "truncated.safetensors"), ["truncated.safetensors"]),
         (("object.safetensors", "nan.safetensors"), ["nan.safetensors", "texture"]),

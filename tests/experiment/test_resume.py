@@ -30,7 +30,10 @@ from mi_nerfattack.errors import InputError, SetupError
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-FIFTY = ("iterations = 6", "iterations = 50" + ROBUST)
+FIFTY = (  # without converging before
+    "max_iterations = 6\nlearning_rate = 0.5",
+    "max_iterations = 50\nlearning_rate = 0.01" + ROBUST,
+)
 
 
 @pytest.mark.usefixtures("no_results")

@@ -67,6 +67,8 @@ class AnalyticSensor(AbstractDifferentiableSensor):
     random numbers.
     """
 
+    fields = ()
+
     def __init__(self, textures: list[np.ndarray]) -> None:
         self._textures = [tensor(texture) for texture in textures]
         self._offsets = np.zeros((len(textures), 6))

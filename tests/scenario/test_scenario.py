@@ -37,7 +37,7 @@ scale = 2.0
 [policy]
 file = "policy.safetensors"
 [attack]
-iterations = 3
+max_iterations = 3
 """
 
 
@@ -54,7 +54,7 @@ def write(tmp_path):
 def test_defaults_and_text(write):
     scenario, text = load_scenario(write(MINIMAL))
     assert text == MINIMAL
-    assert scenario.attack.iterations == 3
+    assert scenario.attack.max_iterations == 3
     assert scenario.camera.width == 200 and scenario.camera.height == 66
     assert [item.scale for item in scenario.objects] == [1.0, 2.0]
 
@@ -76,9 +76,14 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
-        ("iterations = 3", "iteratons = 3", 22, ["iteratons", "unknown", "iterations"]),
-        ("iterations = 3", "iterations = 0", 22, ["iterations", "0"]),
-        ("iterations = 3", 'iterations = "3"', 22, ["iterations"]),
+        (
+            "max_iterations = 3",
+            "max_iteratons = 3",
+            22,
+            ["max_iteratons", "unknown", "max_iterations"],
+        ),
+        ("max_iterations = 3", "max_iterations = 0", 22, ["max_iterations", "0"]),
+        ("max_iterations = 3", 'max_iterations = "3"', 22, ["max_iterations"]),
         ("scale = 2.0", "scale = -2.0", 17, ["scale", "-2"]),
         ("scale = 2.0", "scale = nan", 17, ["scale"]),
         ('route = "right"\n', "", 2, ["route", "required"]),
@@ -89,7 +94,7 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
         ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
         (
             "[attack]",
-            '[attack]\nparameters = "pose"\nlearning_rate = 0.1',
+            '[attack]\nparameters = "pose"\nlearning_rate = 0.2',
             23,
             ["learning_rate", "pose"],
         ),
@@ -250,11 +255,15 @@ def test_every_form_of_toml_replays_anywhere(write, tmp_path, old, new):
     ("old", "new", "line"),
     [
         ('[policy]\nfile = "p', 'policy = { file = "a.onnx", batch = 2 }\n#', 19),
-        ('name = "test"', 'attack.iterations = 0\nname = "test"', 1),
+        ('name = "test"', 'attack.max_iterations = 0\nname = "test"', 1),
         ("[attack]", '[policy.preprocess]\nmean = [\n  0.5,\n  "a",\n]\n[attack]', 22),
-        ("iterations = 3", "iterations = 3\nmean.x = 1", 23),
-        ("iterations = 3", "iterations = 3\nmean.x = 1\nseed = 3\nmean.y = 1", 23),
-        ("[attack]\niterations = 3", "[mean.x]\ny = 1", 21),
+        ("max_iterations = 3", "max_iterations = 3\nmean.x = 1", 23),
+        (
+            "max_iterations = 3",
+            "max_iterations = 3\nmean.x = 1\nseed = 3\nmean.y = 1",
+            23,
+        ),
+        ("[attack]\nmax_iterations = 3", "[mean.x]\ny = 1", 21),
     ],
 )
 def test_lines_of_every_form(write, old, new, line):

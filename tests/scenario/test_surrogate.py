@@ -133,7 +133,10 @@ def test_attack_writes_its_run_folder(load, tmp_path):
     """With a wall before the object; the texture moves, layers are there."""
     from mi_nerfattack.experiment.job import Job
 
-    fewer = {"iterations = 30": "iterations = 1", "textures = 4": "textures = 1"}
+    fewer = {
+        "max_iterations = 30": "max_iterations = 1",
+        "textures = 4": "textures = 1",
+    }
     scenario = load({**NAMED, **fewer}, more=WALL)
     text = (tmp_path / "scenario.toml").read_text()
     output = tmp_path / "run"

@@ -1,0 +1,43 @@
+"""``python -m bench study``: many attacks at drawn places, a row each."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class BenchStudy:
+    """Make the attacks of a study, and append a row for each to a table.
+
+    `steps`: parametrisations of colour and learning rates at six places. Takes hours
+    on two cores; stopped, the same command continues from OUTPUT.
+    """
+
+    study: tyro.conf.Positional[Literal["steps"]]
+    """Which."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Table to write, row by row (.jsonl)."""
+
+    def run(self) -> int:
+        """Make the rows that are missing."""
+        import torch
+
+        from bench.study import steps
+        from mi_nerfattack import variant
+        from mi_nerfattack.io import files
+
+        files.check_writable(self.output)
+        torch.set_num_threads(1)
+        variant.ensure()
+
+        def on_row(done: int, count: int, key: str) -> None:
+            print(f"{done}/{count}: {key}", file=sys.stderr, flush=True)
+
+        rows = steps.run(self.output, on_row)
+        print(f"{len(rows)} rows in {self.output}", file=sys.stderr)
+        return 0

@@ -1,0 +1,1 @@
+"""Studies of attacks over drawn places: a row a cell, appended as it ends."""

@@ -1,0 +1,125 @@
+"""What an attack steps in: the colours of an object, whatever its levels.
+
+A grid field's colour is the sigmoid of a sum over levels, so that equal steps on all of
+them add up, and colours far out on the sigmoid hardly move any more. An attack steps in
+the colours c of one level's vertices instead (sRGB), from the original ones c0::
+
+    raw(level) = original raw(level) + logit(c) - logit(c0)
+
+Where nothing was changed, the texture is the original to the bit. A step of `rate` is a
+change of colour by `rate`, and the projection onto what is allowed is exact.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import convolve1d
+
+from mi_nerfattack.backend.colour import linear_to_srgb
+from mi_nerfattack.fields.grid import GridField, GridLevel
+
+#: Colours stay so far from 0 and 1, where no raw value reaches.
+MARGIN = 0.01
+_BINOMIAL = (0.25, 0.5, 0.25)
+
+
+class AbstractColouring(ABC):
+    """Parameters of one object's texture, and what a texture is of them.
+
+    Attributes:
+        start: (n, 3) float32, the parameters of the original texture.
+    """
+
+    start: np.ndarray
+
+    @abstractmethod
+    def texture(self, value: np.ndarray) -> np.ndarray:
+        """Return the texture (n_vertices, 3), raw colours, of parameters (n, 3)."""
+
+    @abstractmethod
+    def gradient(self, value: np.ndarray, by_texture: np.ndarray) -> np.ndarray:
+        """Return the direction (n, 3) in which parameters step down.
+
+        Args:
+            value: (n, 3), the parameters.
+            by_texture: (n_vertices, 3), derivative by the texture.
+        """
+
+    def project(self, value: np.ndarray) -> np.ndarray:
+        """Return the nearest parameters (n, 3) that are allowed."""
+        return value
+
+
+class Colours(AbstractColouring):
+    """Colours of one level's vertices.
+
+    The gradient is smoothed over neighbouring vertices: Adam takes steps of one size
+    everywhere, and neighbours that hardly differ would take opposite ones.
+
+    Args:
+        field: of the object, with its original texture.
+        resolution: the finest level of at most so many vertices an edge is stepped in;
+            the finest of all by default.
+        smoothing: passes of a binomial filter.
+    """
+
+    def __init__(
+        self, field: GridField, resolution: int | None = None, smoothing: int = 1
+    ) -> None:
+        levels = [
+            level
+            for level in field.levels()
+            if resolution is None or level.resolution <= resolution
+        ]
+        self.level = levels[-1] if levels else field.levels()[0]
+        self.smoothing = smoothing
+        self._original = field.texture.numpy().copy()
+        self.start = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
+        self._lower = np.minimum(self.start, np.float32(MARGIN))
+        self._upper = np.maximum(self.start, np.float32(1 - MARGIN))
+
+    def texture(self, value: np.ndarray) -> np.ndarray:
+        """See :meth:`AbstractColouring.texture`."""
+        raw = self._original.copy()
+        raw[self.level.vertices] += _logit(value) - _logit(self.start)
+        return raw
+
+    def gradient(self, value: np.ndarray, by_texture: np.ndarray) -> np.ndarray:
+        """See :meth:`AbstractColouring.gradient`."""
+        slope = by_texture[self.level.vertices] / (value * (1 - value))
+        cube = slope.reshape((self.level.resolution,) * 3 + (3,))
+        for _ in range(self.smoothing):
+            for axis in range(3):
+                cube = convolve1d(cube, _BINOMIAL, axis, mode="constant")
+        return cube.reshape(slope.shape)
+
+    def project(self, value: np.ndarray) -> np.ndarray:
+        """See :meth:`AbstractColouring.project`."""
+        return np.clip(value, self._lower, self._upper)
+
+
+def vertex_colours(
+    field: GridField, level: GridLevel, chosen: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the colours of a level's vertices, (k, 3) float32, sRGB.
+
+    Args:
+        field: with its texture.
+        level: one of `field.levels()`.
+        chosen: (n, n, n) by z, y, x, of bool; all vertices by default.
+    """
+    if chosen is None:
+        chosen = np.ones((level.resolution,) * 3, bool)
+    unit = np.argwhere(chosen)[:, ::-1] / level.scale
+    point = (field.lower + unit * (field.upper - field.lower)).astype(np.float32)
+    points = mi.Point3f(*(mi.Float(point[:, i].tolist()) for i in range(3)))
+    linear: Any = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))[1]
+    return linear_to_srgb(linear).numpy().T
+
+
+def _logit(colour: np.ndarray) -> np.ndarray:
+    return np.log(colour / (1 - colour))

@@ -1,0 +1,106 @@
+"""Steps in colour, their schedule, and what they made of a texture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import toy_loop as toy
+
+from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.fields import GridField, GridLayout
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def field_of(levels: int, rng: np.random.Generator) -> GridField:
+    field = GridField(GridLayout(levels, 4, 12), -np.ones(3), np.ones(3))
+    texture = rng.normal(0, 0.5 / levels, (field.n_vertices, 3)).astype(np.float32)
+    field.set_parameter("texture", texture)
+    return field
+
+
+@pytest.mark.parametrize("levels", [1, 3, 9])
+def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rng):
+    from mi_nerfattack.attack.colours import Colours, vertex_colours
+
+    field = field_of(levels, rng)
+    colours = Colours(field)
+    original = field.texture.numpy()
+    np.testing.assert_array_equal(colours.texture(colours.start), original)
+    field.set_parameter("texture", colours.texture(colours.start + 0.01))
+    changed = vertex_colours(field, field.levels()[-1])
+    np.testing.assert_allclose(changed - colours.start, 0.01, atol=1e-5)
+
+
+def test_projection_allows_colours_and_what_was_there(rng):
+    from mi_nerfattack.attack.colours import MARGIN, Colours
+
+    field = field_of(1, rng)
+    texture = field.texture.numpy().copy()
+    texture[0] = 9.0  # nearly white
+    field.set_parameter("texture", texture)
+    colours = Colours(field)
+    np.testing.assert_array_equal(colours.project(colours.start), colours.start)
+    assert (colours.project(colours.start - 2) == np.float32(MARGIN)).all()
+    highest = colours.project(colours.start + 2)
+    np.testing.assert_allclose(highest[0], colours.start[0])
+    assert (highest[1:] == np.float32(1 - MARGIN)).all()
+
+
+def test_gradient_is_that_of_the_texture(rng):
+    from mi_nerfattack.attack.colours import Colours
+
+    field = field_of(3, rng)
+    colours = Colours(field, smoothing=0)
+    by_texture = rng.normal(size=(field.n_vertices, 3))
+    value = rng.uniform(0.2, 0.8, colours.start.shape)
+    change = 1e-4 * rng.normal(size=value.shape)
+    up, down = (colours.texture(value + s * change) for s in (1, -1))
+    wanted = ((up.astype(np.float64) - down) * by_texture).sum() / 2
+    found = (colours.gradient(value, by_texture) * change).sum()
+    assert found == pytest.approx(wanted, rel=1e-3)
+    level = Colours(field, resolution=8).level
+    assert level.resolution == 7
+    assert Colours(field, resolution=2).level.resolution == 4  # there is none coarser
+
+
+def test_rates_fall_when_nothing_more_is_gained_or_time_is_short():
+    falling = list(np.linspace(1, 0, 20))
+    short, long = Schedule(20, 0.01), Schedule(100, 0.01)
+    assert [short.rate(falling[:k]) for k in range(15)] == [1.0] * 15
+    rates = [short.rate(falling[:k]) for k in range(15, 20)]
+    np.testing.assert_allclose(rates, 0.01 ** (np.arange(1, 6) / 5))
+    assert short.is_over(falling)
+    assert not short.is_over(falling[:19])
+    assert not short.has_converged(falling)
+    settled = [*np.linspace(1, 0.2, 8), 0.199, 0.3]
+    assert long.rate(settled[:9]) == 1.0
+    assert long.rate(settled) == pytest.approx(0.01 ** (1 / 3))  # from 10 on
+    assert long.has_converged(settled)
+    assert not long.is_over([*settled, 0.0, 0.0])
+    assert long.is_over([*settled, 0.0, 0.0, 0.0])
+    assert long.rate([0.5] * 70) == 1.0  # stuck from the first is not converged
+
+
+def test_statistics_of_a_texture_that_is_known():
+    import mitsuba as mi
+
+    from mi_nerfattack.attack.texture_statistics import seen_weights, texture_statistics
+
+    loop, grid = toy.make_loop()
+    original = toy.texture_of(grid)
+    states = [loop.initial(np.zeros((1, 3)))]
+    [weights] = seen_weights(loop.sensor, [grid], states)
+    assert (weights > 0).sum() > 50
+    np.testing.assert_array_equal(toy.texture_of(grid), original)
+    same = texture_statistics(grid, original, weights)
+    assert (same.l2, same.linf, same.saturated_share) == (0, 0, 0)
+    assert same.total_variation > 0.01
+    grey = np.zeros_like(original)
+    white = grey + 9.0  # the sum of three levels: 27
+    grid.set_parameter("texture", mi.TensorXf(white))
+    found = texture_statistics(grid, grey, weights)
+    assert found.l2 == pytest.approx(0.5, abs=1e-5)
+    assert found.linf == pytest.approx(0.5, abs=1e-5)
+    assert found.saturated_share == pytest.approx(1)
+    assert found.total_variation == pytest.approx(0, abs=1e-6)
