@@ -31,7 +31,7 @@ def render(template: str, **values: Any) -> str:
 def _embedded(path: str | Path) -> Markup:
     """Return the address of an image file as PNG that holds its pixels."""
     buffer = io.BytesIO()
-    Image.fromarray(files.read_image(path)).save(buffer, "PNG", optimize=True)
+    Image.fromarray(files.read_image(path)).save(buffer, "PNG")
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
     return Markup(f"data:image/png;base64,{data}")
 
