@@ -230,6 +230,13 @@ class _Baseline(_Model):
 _Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
+class _Texture(_Model):
+    l2: pydantic.NonNegativeFloat
+    linf: pydantic.NonNegativeFloat
+    saturated_share: _Share
+    total_variation: pydantic.NonNegativeFloat
+
+
 class _Document(_Model):
     schema_version: int = pydantic.Field(alias="schema", ge=SCHEMA, le=SCHEMA)
     scenario: dict[str, Any]
@@ -239,8 +246,10 @@ class _Document(_Model):
     cost: _Cost
     flags: list[str]
     converged: bool | None = None
-    saturated_share: _Share | dict[str, _Share] | None = None
-    total_variation: pydantic.NonNegativeFloat | dict[str, float] | None = None
+    saturated_share: _Share | None = None
+    total_variation: pydantic.NonNegativeFloat | None = None
+    textures: dict[str, _Texture] | None = None
+    verdict: list[str] | None = None
     baseline: _Baseline | None = None
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None

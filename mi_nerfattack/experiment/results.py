@@ -10,6 +10,8 @@ from typing import Any
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
+from mi_nerfattack.evaluation.textures import texture_figures
+from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.attribution import attribute, write_attribution
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.pictures import write_pictures
@@ -19,8 +21,9 @@ from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.plots import drives as plots
 from mi_nerfattack.report.table import write_steps
-from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
+from mi_nerfattack.rollout.drive import ATTACK, OWN, Drive, Lane
 from mi_nerfattack.rollout.loop import OnStep
+from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World, object_footprints
 
 
@@ -87,8 +90,13 @@ def write_results(
     images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = output / "strip.png"
     write_pictures(output, world, drives, looks)
+    own = looks[OWN]
+    assert own is not None, "objects are there by themselves"
+    more |= {"converged": attack.has_converged}
+    more |= texture_figures(world, drives, own, attacked)
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(values, scenario.seed, driven, lanes, cost) | more
+    document["verdict"] = verdict(document, SURROGATE)
     validate(document)
     files.write_json(output / "metrics.json", document)
     write_report(output / "report.html", document, images, scenario_text, versions())

@@ -49,6 +49,14 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     assert rows == [(1, 4), (2, 4)]
     # four cases of 2 twice, random looks judged, driven, deployed; 3 there and back
     assert cost["renders"] >= 4 * (16 + 2 * count + few + 6)
+    assert document["converged"] is False  # in 3 iterations
+    [(name, texture)] = document["textures"].items()
+    assert name == "ball" and 0 < texture["l2"] <= texture["linf"] <= 1
+    assert document["total_variation"] == texture["total_variation"] > 0
+    page = (output / "report.html").read_text()
+    for sentence in document["verdict"]:
+        assert sentence in " ".join(result.stdout.split())
+        assert sentence in page
     rows = (output / "steps.csv").read_text().splitlines()
     assert len(rows) == 1 + 4 * (16 + count + few)
     attacked = load_grid(output / "objects" / "ball.safetensors")

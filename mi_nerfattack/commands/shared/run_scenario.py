@@ -44,6 +44,8 @@ def run_scenario(
     from mi_nerfattack.report.table import metrics_table
 
     console = Console()
+    for sentence in [*document["verdict"], *document["flags"]]:
+        console.print(sentence, highlight=False)
     console.print(metrics_table(document))
     _print_files(console, output, document)
     return 0

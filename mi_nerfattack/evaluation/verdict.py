@@ -1,0 +1,112 @@
+"""A run's result in words: what `metrics.json` proves, by stated thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, OWN, RANDOM
+
+#: An attack beats random looks from this multiple of their mean error on.
+BEATS = 2.0
+#: It transfers if it does so in the deployment too.
+TRANSFERS = 2.0
+#: A texture is saturated from this share of its visible colour values on.
+SATURATED = 0.5
+
+Figures = Mapping[str, Any]
+
+
+def verdict(document: Figures, surrogate: str) -> list[str]:
+    """Return sentences: policy, attack against random, transfer, convergence, texture.
+
+    Args:
+        document: as of `metrics.metrics_document`, with `converged` and what follows.
+        surrogate: name of the environment that the attack was optimised in.
+    """
+    found = []
+    for route, environments in document["routes"].items():
+        limit = document["departure_limits_m"][route]
+        found.append(_policy(environments, limit))
+        for name in sorted(environments, key=lambda name: name != surrogate):
+            found += _attack(name, environments[name], name == surrogate, limit)
+    for name, replayed in document.get("replay", {}).items():
+        found += _replayed(name, replayed)
+    found += _search(document)
+    return found
+
+
+def _policy(environments: Figures, limit: float) -> str:
+    """Say whether the policy keeps its lane by itself."""
+    largest, departed = 0.0, []
+    for name, cases in environments.items():
+        for case in (NO_OBJECT, OWN):
+            if case in cases:
+                largest = max(largest, cases[case]["cross_track_max_m"])
+                if cases[case]["drives_departed"]:
+                    what = "without objects" if case == NO_OBJECT else "unattacked"
+                    departed.append(f"{name} ({what})")
+    if departed:
+        return (
+            f"The policy is not sound here: it leaves its lane by itself in "
+            f"{', '.join(departed)}; an attack proves little."
+        )
+    return (
+        "The policy is sound here: without objects and with them as they are it stays "
+        f"within {largest:.2f} m of the lane centre, where {limit:.2f} m are allowed."
+    )
+
+
+def _attack(
+    name: str, cases: Figures, is_surrogate: bool, limit: float
+) -> Iterator[str]:
+    if ATTACK not in cases or RANDOM not in cases:
+        return
+    attack, mean = cases[ATTACK], cases[ATTACK]["cross_track_mean_m"]
+    ratio = _ratio(mean, cases[RANDOM]["cross_track_mean_m"])
+    text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of random looks"
+    if BEST_RANDOM in cases:
+        best = _ratio(mean, cases[BEST_RANDOM]["cross_track_mean_m"])
+        text += f" and {best:.1f} times that of the best of them"
+    left = f"{attack['drives_departed']} of {attack['n']} drives leave the lane"
+    if is_surrogate:
+        lead = "beats" if ratio >= BEATS else "does not beat"
+        yield f"The attack {lead} random looks in the surrogate: {text}; {left}."
+    else:
+        lead = "transfers" if ratio >= TRANSFERS else "does not transfer"
+        yield f"It {lead} to {name}: {text}; {left}."
+
+
+def _replayed(name: str, replayed: Figures) -> Iterator[str]:
+    changes = {
+        case: figures["control_change_mean"]
+        for case, figures in replayed["cases"].items()
+    }
+    if ATTACK in changes and RANDOM in changes:
+        ratio = _ratio(changes[ATTACK], changes[RANDOM])
+        yield (
+            f"In the recording {name} it changes the control by {changes[ATTACK]:.3f} "
+            f"{replayed['control_unit']} on average, {ratio:.1f} times as much as "
+            "random looks; nothing that the policy does has an effect there."
+        )
+
+
+def _search(document: Figures) -> Iterator[str]:
+    """Say whether the search ended by itself, and where the colours are."""
+    if document.get("converged") is not None:
+        yield (
+            "The search has converged."
+            if document["converged"]
+            else "The search has not converged: more iterations would find more."
+        )
+    share = document.get("saturated_share")
+    if share is not None:
+        lead = "is" if share >= SATURATED else "is not"
+        yield (
+            f"The texture {lead} saturated: {share:.0%} of its visible colour values "
+            "are black or full."
+        )
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / max(reference, 1e-9)

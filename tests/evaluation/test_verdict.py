@@ -1,0 +1,60 @@
+"""The verdict of a run, from figures that are known."""
+
+from __future__ import annotations
+
+import pytest
+
+from mi_nerfattack.evaluation.verdict import verdict
+
+
+def case(mean: float, departed: int = 0, largest: float = 0.2) -> dict[str, object]:
+    return {
+        "cross_track_mean_m": mean,
+        "cross_track_max_m": largest,
+        "drives_departed": departed,
+        "n": 4,
+    }
+
+
+@pytest.fixture
+def document():
+    cases = {
+        "no_object": case(0.04),
+        "own": case(0.05, largest=0.11),
+        "random": case(0.05),
+        "best_random": case(0.1),
+        "attack": case(0.3, 3, 1.1),
+    }
+    weak = {**cases, "attack": case(0.06)}
+    return {
+        "routes": {"right": {"mitsuba": weak, "surrogate": cases}},
+        "departure_limits_m": {"right": 0.85},
+        "converged": True,
+        "saturated_share": 0.3,
+    }
+
+
+def test_each_sentence_says_what_the_figures_say(document):
+    policy, attack, transfer, search, texture = verdict(document, "surrogate")
+    assert "is sound" in policy
+    assert "0.20 m of the lane centre, where 0.85 m" in policy
+    assert "beats random looks in the surrogate" in attack
+    assert "0.300 m, 6.0 times that of random looks" in attack
+    assert "3.0 times that of the best of them; 3 of 4 drives leave" in attack
+    assert "does not transfer to mitsuba" in transfer
+    assert "1.2 times" in transfer
+    assert search == "The search has converged."
+    assert "is not saturated: 30%" in texture
+
+
+def test_what_speaks_against_an_attack_is_said(document):
+    cases = document["routes"]["right"]["surrogate"]
+    cases["own"], cases["attack"] = case(0.5, 4, 6.0), case(0.08)
+    document |= {"converged": False, "saturated_share": 0.8}
+    document["routes"]["right"]["mitsuba"]["attack"] = case(0.2)
+    policy, attack, transfer, search, texture = verdict(document, "surrogate")
+    assert "not sound here: it leaves its lane by itself in surrogate (unatt" in policy
+    assert "does not beat random looks" in attack
+    assert "It transfers to mitsuba" in transfer
+    assert "has not converged" in search
+    assert "is saturated: 80%" in texture
