@@ -14,11 +14,13 @@ import tyro
 class BenchStudy:
     """Make the attacks of a study, and append a row for each to a table.
 
-    `steps`: parametrisations of colour and learning rates at six places. Takes hours
-    on two cores; stopped, the same command continues from OUTPUT.
+    `steps`: parametrisations of colour and learning rates at six places. `robust`: what
+    disturbances of the optimisation do for the transfer. `distribution`: 24 places,
+    two sizes. Each takes hours on two cores; stopped, the same command continues from
+    OUTPUT.
     """
 
-    study: tyro.conf.Positional[Literal["steps"]]
+    study: tyro.conf.Positional[Literal["steps", "robust", "distribution"]]
     """Which."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Table to write, row by row (.jsonl)."""
@@ -27,7 +29,7 @@ class BenchStudy:
         """Make the rows that are missing."""
         import torch
 
-        from bench.study import steps
+        from bench.study import distribution, robust, steps
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
@@ -38,6 +40,7 @@ class BenchStudy:
         def on_row(done: int, count: int, key: str) -> None:
             print(f"{done}/{count}: {key}", file=sys.stderr, flush=True)
 
-        rows = steps.run(self.output, on_row)
+        studies = {"steps": steps, "robust": robust, "distribution": distribution}
+        rows = studies[self.study].run(self.output, on_row)
         print(f"{len(rows)} rows in {self.output}", file=sys.stderr)
         return 0

@@ -51,20 +51,27 @@ class Place:
             field, route, self.arc_m, _ground(), np.random.default_rng(seeds)
         )
 
-    def scenario(self, height_m: float, keys: str, folder: Path) -> Scenario:
+    def scenario(
+        self, height_m: float, keys: str, folder: Path, seed: int = 0
+    ) -> Scenario:
         """Write and read the scenario of an attack here.
 
         Args:
             height_m: of the object.
             keys: further tables, as TOML.
             folder: to write to.
+            seed: of the attack.
         """
         pose = self.pose(height_m)
         yaw = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
         path = folder / "scenario.toml"
         position = [round(float(v), 4) for v in pose.translation]
         head = _HEAD.format(
-            route=self.route, position=position, yaw=yaw, scale=pose.scale
+            route=self.route,
+            position=position,
+            yaw=yaw,
+            scale=pose.scale,
+            seed=seed,
         )
         path.write_text(head + keys, encoding="utf-8")
         return load_scenario(path)[0]
@@ -72,6 +79,7 @@ class Place:
 
 _HEAD = """
 name = "study"
+seed = {seed}
 
 [scene]
 field = "bundled:intersection/field.safetensors"

@@ -1,0 +1,79 @@
+"""How much each disturbance of the optimisation helps an attack to transfer.
+
+Settled before the first result: one place on each route (the near ones of
+`bench.study.steps`), two seeds, equal numbers of rendered frames (48 drives: an attack
+from four poses has a quarter of the iterations), four unseen starts. Deployments: the
+path-traced scene as it is, half as bright and twice as bright (objects built in, since
+pasted ones keep their exposure), blurred, noisy. *Transfer* is the mean error there
+over that in the surrogate; the error itself stands beside it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from bench.study import jobs, rows
+from bench.study.places import NATURAL_M, ROUTES, Place
+from bench.study.steps import ARC_M, LATERAL_M
+
+DRIVES, SEEDS = 48, (0, 1)
+POSES = 4
+PARTS: Mapping[str, str] = {
+    "jitter": "jitter = true",
+    "exposure": "exposure_ev_sd = 0.5",
+    "blur": "blur_px_sd = 0.7",
+    "noise": "noise_sd = 0.03",
+}
+#: Parts by row; all but the first optimise from `POSES` poses.
+ROWS: Mapping[str, tuple[str, ...]] = {
+    "one pose": (),
+    "poses": (),
+    **{f"poses, {name}": (name,) for name in PARTS},
+    "all": tuple(PARTS),
+}
+DEPLOYMENTS: Mapping[str, str] = {
+    "clear": "",
+    "dark": 'exposure_ev = -1.0\nobjects = "built-in"',
+    "bright": 'exposure_ev = 1.0\nobjects = "built-in"',
+    "blurred": "blur_px = 1.0",
+    "noisy": "noise_sd = 0.03",
+}
+
+
+def keys() -> list[rows.Row]:
+    """Return what tells one row from another, one place after the other."""
+    cells = itertools.product(SEEDS, ROUTES, ROWS)
+    return [{"seed": s, "route": r, "parts": p} for s, r, p in cells]
+
+
+def run(path: Path, on_row: Callable[[int, int, str], None]) -> list[rows.Row]:
+    """Do the attacks that are missing in a table; see :func:`rows.fill`."""
+    return rows.fill(path, keys(), attack_row, on_row)
+
+
+def attack_row(key: rows.Key) -> rows.Row:
+    """Attack with some parts."""
+    place = Place(key["route"], LATERAL_M["near"], ARC_M, 0)
+    tables = scenario_keys(key["parts"])
+    seed = key["seed"]
+    return jobs.run(lambda f: place.scenario(2 * NATURAL_M, tables, f, seed))
+
+
+def scenario_keys(row: str) -> str:
+    """Return the tables of a row's scenario, as TOML."""
+    poses = 1 if row == "one pose" else POSES
+    attack = [
+        f"poses = {poses}",
+        f"max_iterations = {DRIVES // poses}",
+        'adjoint = "kept_backgrounds"',
+        *(PARTS[name] for name in ROWS[row]),
+    ]
+    deployments = [
+        f'[[deployment]]\nname = "{name}"\nspp = 8\n{more}\n'
+        for name, more in DEPLOYMENTS.items()
+    ]
+    tables = ["[drive]", "horizon = 50", "", "[attack]", *attack, "", "[baseline]"]
+    tables += ["textures = 4", "deployment_textures = 4", ""]
+    return "\n".join(["", *tables, *deployments])
