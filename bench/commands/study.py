@@ -29,7 +29,7 @@ class BenchStudy:
         """Make the rows that are missing."""
         import torch
 
-        from bench.study import distribution, robust, steps
+        from bench.study import distribution, robust, rows, steps
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
@@ -41,6 +41,7 @@ class BenchStudy:
             print(f"{done}/{count}: {key}", file=sys.stderr, flush=True)
 
         studies = {"steps": steps, "robust": robust, "distribution": distribution}
-        rows = studies[self.study].run(self.output, on_row)
-        print(f"{len(rows)} rows in {self.output}", file=sys.stderr)
+        study = studies[self.study]
+        found = rows.fill(self.output, study.keys(), study.attack_row, on_row)
+        print(f"{len(found)} rows in {self.output}", file=sys.stderr)
         return 0

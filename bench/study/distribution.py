@@ -11,8 +11,6 @@ has a wheel out for a second on average over the drives of the case.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from pathlib import Path
 
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
@@ -45,12 +43,7 @@ def keys() -> list[rows.Row]:
     return [{"route": r, "seed": s, "height_m": h} for s, r, h in cells]
 
 
-def run(path: Path, on_row: Callable[[int, int, str], None]) -> list[rows.Row]:
-    """Do the attacks that are missing in a table; see :func:`rows.fill`."""
-    return rows.fill(path, keys(), attack_row, on_row)
-
-
 def attack_row(key: rows.Key) -> rows.Row:
     """Attack at one place."""
     place = Place(key["route"], LATERAL_M, ARC_M, key["seed"])
-    return jobs.run(lambda folder: place.scenario(key["height_m"], KEYS, folder))
+    return jobs.run(lambda folder: place.write(key["height_m"], KEYS, folder))

@@ -11,17 +11,24 @@ from bench.study.rows import Row
 from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.scenario.policy import build_differentiable
-from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.scenario import load_scenario
 
-_CASE = ("n", "cross_track_mean_m", "cross_track_max_m", "wheel_out_s", "centre_out_s")
+_CASE = (
+    "n",
+    "cross_track_mean_m",
+    "cross_track_max_m",
+    "wheel_out_s",
+    "centre_out_s",
+    "drives_departed",
+)
 _KEPT = ("flags", "converged", "saturated_share", "total_variation", "textures")
 
 
-def run(write: Callable[[Path], Scenario]) -> Row:
+def run(write: Callable[[Path], Path]) -> Row:
     """Attack, whatever the checks say, and describe what came of it.
 
     Args:
-        write: writes the scenario ``scenario.toml`` to a folder, and reads it.
+        write: writes the scenario to a folder, and returns its file.
 
     Returns:
         place of the object, figures by environment and case, flags, convergence,
@@ -29,8 +36,7 @@ def run(write: Callable[[Path], Scenario]) -> Row:
     """
     with tempfile.TemporaryDirectory() as name, one_thread():
         folder = Path(name)
-        write(folder)
-        scenario, text = load_scenario(folder / "scenario.toml")
+        scenario, text = load_scenario(write(folder))
         policy = build_differentiable(scenario.policy)
         job = Job(scenario, text, policy, folder / "run")
         document = job.run(anyway=True)
@@ -46,10 +52,7 @@ def _environments(document: dict[str, Any]) -> dict[str, Any]:
     [environments] = document["routes"].values()
     return {
         name: {
-            case: {
-                **{key: figures[key] for key in _CASE},
-                "drives_departed": figures["drives_departed"],
-            }
+            case: {key: figures[key] for key in _CASE}
             for case, figures in cases.items()
         }
         for name, cases in environments.items()

@@ -16,7 +16,6 @@ from mi_nerfattack.deploy.placement import Ground, Roadside, scene_ground
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.pathtrace.load import load_scene
-from mi_nerfattack.scenario.scenario import Scenario, load_scenario
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -51,10 +50,8 @@ class Place:
             field, route, self.arc_m, _ground(), np.random.default_rng(seeds)
         )
 
-    def scenario(
-        self, height_m: float, keys: str, folder: Path, seed: int = 0
-    ) -> Scenario:
-        """Write and read the scenario of an attack here.
+    def write(self, height_m: float, keys: str, folder: Path, seed: int = 0) -> Path:
+        """Write the scenario of an attack here, and return the file.
 
         Args:
             height_m: of the object.
@@ -74,7 +71,7 @@ class Place:
             seed=seed,
         )
         path.write_text(head + keys, encoding="utf-8")
-        return load_scenario(path)[0]
+        return path
 
 
 _HEAD = """

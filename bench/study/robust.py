@@ -11,8 +11,7 @@ over that in the surrogate; the error itself stands beside it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
@@ -48,17 +47,12 @@ def keys() -> list[rows.Row]:
     return [{"seed": s, "route": r, "parts": p} for s, r, p in cells]
 
 
-def run(path: Path, on_row: Callable[[int, int, str], None]) -> list[rows.Row]:
-    """Do the attacks that are missing in a table; see :func:`rows.fill`."""
-    return rows.fill(path, keys(), attack_row, on_row)
-
-
 def attack_row(key: rows.Key) -> rows.Row:
     """Attack with some parts."""
     place = Place(key["route"], LATERAL_M["near"], ARC_M, 0)
     tables = scenario_keys(key["parts"])
     seed = key["seed"]
-    return jobs.run(lambda f: place.scenario(2 * NATURAL_M, tables, f, seed))
+    return jobs.run(lambda f: place.write(2 * NATURAL_M, tables, f, seed))
 
 
 def scenario_keys(row: str) -> str:

@@ -27,6 +27,7 @@ from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture_statistics import seen_weights, texture_statistics
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world
 
 ITERATIONS = 24
@@ -126,21 +127,11 @@ def keys() -> list[dict[str, Any]]:
     ]
 
 
-def run(path: Path, on_row: Callable[[int, int, str], None]) -> list[rows.Row]:
-    """Do the attacks that are missing in a table.
-
-    Args:
-        path: of the table (.jsonl).
-        on_row: as of :func:`rows.fill`.
-    """
-    return rows.fill(path, keys(), attack_row, on_row)
-
-
 def attack_row(key: rows.Key) -> rows.Row:
     """Attack once, and describe it."""
     place = Place(key["route"], LATERAL_M[key["distance"]], ARC_M, 0)
     with tempfile.TemporaryDirectory() as name:
-        scenario = place.scenario(2 * NATURAL_M, KEYS, Path(name))
+        scenario, _ = load_scenario(place.write(2 * NATURAL_M, KEYS, Path(name)))
         world = build_world(scenario, scenario.policy.build())
     variant = VARIANTS[key["variant"]]
     attack = make_attack(

@@ -11,9 +11,8 @@ from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.random_textures import random_texture
-from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.loop import OnStep, simulate
+from mi_nerfattack.rollout.loop import OnStep
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +73,7 @@ def judge(rollout: Rollout, initial: np.ndarray, on_step: OnStep | None) -> floa
     Raises:
         InputError: the objective is not finite.
     """
-    drive = simulate(rollout.loop, initial, rollout.horizon, on_step)
-    value = Cost(rollout.objective, rollout.reduction).of(drive)[0]
+    value = rollout.measure(initial, on_step).value
     if not np.isfinite(value):
         raise InputError(
             f"objective: {value} with a random texture; check policy and costs for NaN"

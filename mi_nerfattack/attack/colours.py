@@ -20,6 +20,7 @@ import numpy as np
 from scipy.ndimage import convolve1d
 
 from mi_nerfattack.backend.colour import linear_to_srgb
+from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.fields.grid import GridField, GridLevel
 
 #: Colours stay so far from 0 and 1, where no raw value reaches.
@@ -116,7 +117,7 @@ def vertex_colours(
         chosen = np.ones((level.resolution,) * 3, bool)
     unit = np.argwhere(chosen)[:, ::-1] / level.scale
     point = (field.lower + unit * (field.upper - field.lower)).astype(np.float32)
-    points = mi.Point3f(*(mi.Float(point[:, i].tolist()) for i in range(3)))
+    points = upload_rows(mi.Point3f, point)
     linear: Any = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))[1]
     return linear_to_srgb(linear).numpy().T
 

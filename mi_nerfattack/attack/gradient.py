@@ -16,9 +16,7 @@ from mi_nerfattack.attack.colours import AbstractColouring
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.function import Evaluation, Rollout
-from mi_nerfattack.rollout.loop import simulate
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -141,7 +139,7 @@ class GradientAttack:
     def measure(self) -> IterationRecord:
         """Drive with the present parameters, so that the last update counts too."""
         self._install()
-        return self._record(self._drive())
+        return self._record(self.rollout.measure(self.initial))
 
     @property
     def best_is_judged(self) -> bool:
@@ -156,20 +154,13 @@ class GradientAttack:
         """
         self.restore_best()
         self.best_objective = np.inf
-        self._record(self._drive(on_step))
+        self._record(self.rollout.measure(self.initial, on_step))
 
     def restore_best(self) -> None:
         """Give the objects the parameters of the iteration with the least objective."""
         self.sensor.set_textures(self.best)
         if self.sensor.offsets() is not None:
             self.sensor.set_offsets(self.best_offsets)
-
-    def _drive(self, on_step: Callable[[int], None] | None = None) -> Evaluation:
-        """Drive without keeping what a derivative needs."""
-        rollout = self.rollout
-        drive = simulate(rollout.loop, self.initial, rollout.horizon, on_step)
-        value, costs = Cost(rollout.objective, rollout.reduction).of(drive)
-        return Evaluation(value, costs, drive)
 
     def _values(self, gradient: Gradient) -> dict[str, Any]:
         """Return the gradient by the optimiser's keys, checked."""

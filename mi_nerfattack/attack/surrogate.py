@@ -50,12 +50,12 @@ def surrogate_sensor(
     """
     integrator = _field_integrator(scene)
     volumes = {volume.id(): volume for volume in integrator.volumes}
+    grids = [name for name, volume in volumes.items() if _is_grid(volume)]
     if attacked is None:
-        grids = [k for k, v in volumes.items() if _is_grid(v)]
         attacked = [name for name in grids if name != "scene"]
     for name in attacked:
-        if name not in volumes or not _is_grid(volumes[name]):
-            allowed = ", ".join(k for k, v in volumes.items() if _is_grid(v))
+        if name not in grids:
+            allowed = ", ".join(grids)
             raise InputError(f"attacked: no grid_field {name!r}; there are: {allowed}")
     for name, volume in volumes.items():
         if volume.relit:

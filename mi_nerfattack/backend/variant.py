@@ -99,7 +99,7 @@ def _on_change(old: str | None, new: str) -> None:
         _register()
     except NerfAttackError as err:
         _log.error("plugins not registered for %s: %s", new, err)
-    except Exception:
+    except Exception:  # whatever it is, other callbacks are to run
         _log.exception("plugins not registered for %s", new)
 
 

@@ -47,8 +47,8 @@ class CameraFrame:
         Returns:
             by layer name: the frame as ``""`` (height, width, 4) and ``Z``, the scene
             alone as ``scene`` and ``scene.Z`` (further fields: ``scene1``, ...), each
-            object (premultiplied) as ``NAME``
-            and ``NAME.Z``; linear, metres along the ray.
+            object (premultiplied) as ``NAME`` and ``NAME.Z``; linear, metres along the
+            ray.
         """
         found = self._layer("")
         if self.beneath is not None:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.stats import truncnorm
 
+from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.ranges import NonNegative, Share, checked
@@ -133,8 +134,7 @@ def scene_ground(scene: Any, highest_m: float = 0.3) -> Ground:
 
 def _first_below(scene: Any, points: np.ndarray, top: float) -> np.ndarray:
     """Return the first surface (n,) below a height at points (n, 2); -inf for none."""
-    # lists: memory from NumPy has an alignment of its own, and so its own kernels
-    x, y = (mi.Float(points[:, i].tolist()) for i in range(2))
+    x, y = upload_rows(mi.Point2f, points[:, :2])
     ray = mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1))
     return top - scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
 

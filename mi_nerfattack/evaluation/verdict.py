@@ -29,7 +29,7 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
         limit = document["departure_limits_m"][route]
         found.append(_policy(environments, limit))
         for name in sorted(environments, key=lambda name: name != surrogate):
-            found += _attack(name, environments[name], name == surrogate, limit)
+            found += _attack(name, environments[name], name == surrogate)
     for name, replayed in document.get("replay", {}).items():
         found += _replayed(name, replayed)
     found += _search(document)
@@ -57,9 +57,7 @@ def _policy(environments: Figures, limit: float) -> str:
     )
 
 
-def _attack(
-    name: str, cases: Figures, is_surrogate: bool, limit: float
-) -> Iterator[str]:
+def _attack(name: str, cases: Figures, is_surrogate: bool) -> Iterator[str]:
     if ATTACK not in cases or RANDOM not in cases:
         return
     attack, mean = cases[ATTACK], cases[ATTACK]["cross_track_mean_m"]

@@ -128,7 +128,7 @@ class CallablePolicy(AbstractBlackBox):
         """Call the function."""
         try:
             return np.asarray(self.function(image, goals, step), np.float64)
-        except Exception as err:
+        except Exception as err:  # a user's function raises whatever it likes
             if is_interrupt(err):
                 raise
             raise InputError(

@@ -43,7 +43,7 @@ def call_module(
             result = module(*(a.clone(memory_format=_PLAIN) for a in arguments))
     except (InputError, torch.OutOfMemoryError, MemoryError):
         raise
-    except Exception as err:
+    except Exception as err:  # a user's module raises whatever it likes
         if is_interrupt(err):
             raise
         shapes = [tuple(part.shape) for part in arguments]

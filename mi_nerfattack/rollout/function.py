@@ -78,6 +78,17 @@ class Rollout:
         value, costs = Cost(self.objective, self.reduction).of(drive)
         return Evaluation(value, costs, drive)
 
+    def measure(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
+        """Drive as :meth:`run` does, without keeping what a derivative needs.
+
+        Args:
+            initial: (m, n) from :meth:`ClosedLoop.initial`.
+            on_step: called after each control period with its index.
+        """
+        drive = simulate(self.loop, initial, self.horizon, on_step)
+        value, costs = Cost(self.objective, self.reduction).of(drive)
+        return Evaluation(value, costs, drive)
+
     def gradient(
         self,
         evaluation: Evaluation,

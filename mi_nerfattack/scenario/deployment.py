@@ -36,27 +36,27 @@ class AbstractDeploymentSection(Section):
         return place
 
 
-class RenderedDeployment(AbstractDeploymentSection):
+class AbstractSimulatedDeployment(AbstractDeploymentSection):
+    """A scene of ours under a sky, seen by a camera."""
+
+    sky: Sky = "day"
+    exposure_ev: Finite = 0.0
+    blur_px: NonNegative = 0.0
+    noise_sd: NonNegative = 0.0
+    objects: Objects = "pasted"
+
+
+class RenderedDeployment(AbstractSimulatedDeployment):
     """Images by Mitsuba; `mujoco` drives a car with wheels."""
 
     environment: Literal["mitsuba", "mujoco"] = "mitsuba"
     spp: Count = 16
-    sky: Sky = "day"
-    exposure_ev: Finite = 0.0
-    blur_px: NonNegative = 0.0
-    noise_sd: NonNegative = 0.0
-    objects: Objects = "pasted"
 
 
-class RasterisedDeployment(AbstractDeploymentSection):
+class RasterisedDeployment(AbstractSimulatedDeployment):
     """Images by MuJoCo, and its car with wheels."""
 
     environment: Literal["mujoco_gl"]
-    sky: Sky = "day"
-    exposure_ev: Finite = 0.0
-    blur_px: NonNegative = 0.0
-    noise_sd: NonNegative = 0.0
-    objects: Objects = "pasted"
 
 
 class CarlaDeployment(AbstractDeploymentSection):

@@ -74,8 +74,8 @@ class NamedFile:
         """Return the name without its folder, and the SHA-256 of the content.
 
         An XML file counts with the files that it and included ones name; a folder with
-        all that lies in it. Of
-        an installed module, its own source counts; the name where it has none.
+        all that lies in it. Of an installed module, its own source counts; the name
+        where it has none.
 
         Raises:
             InputError: the file cannot be read.

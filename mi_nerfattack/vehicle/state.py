@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.upload import upload_rows
+
 
 def state_type(size: int = 3) -> Any:
     """Type of a batch of states of `size` rows, of the active variant, double."""
@@ -27,8 +29,6 @@ def to_state(states: np.ndarray) -> Any:
     if states.ndim != 2 or states.shape[1] < 3 or not np.isfinite(states).all():
         raise ValueError(f"states: shape {states.shape}; expected finite (n, 3)")
     kind = state_type(states.shape[1])
-    # lists: memory from NumPy has an alignment of its own, and so its own kernels
-    row = dr.value_t(kind)
-    result = kind(*[row(column) for column in states.T.tolist()])
+    result = upload_rows(kind, states)
     dr.make_opaque(result)
     return result

@@ -10,6 +10,7 @@ import pytest
 from bench.study import distribution, robust, rows, steps
 from bench.study.places import NATURAL_M, ROUTES, Place
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -43,15 +44,15 @@ def test_places_are_drawn_once_and_for_all_sizes(tmp_path):
         Place(ROUTES[1], steps.LATERAL_M[name], steps.ARC_M, 0)
         for name in ("near", "far")
     )
-    scenario = near.scenario(NATURAL_M, steps.KEYS, tmp_path, seed=5)
-    again = near.scenario(2 * NATURAL_M, steps.KEYS, tmp_path)
+    scenario, _ = load_scenario(near.write(NATURAL_M, steps.KEYS, tmp_path, seed=5))
+    again, _ = load_scenario(near.write(2 * NATURAL_M, steps.KEYS, tmp_path))
     assert (scenario.seed, again.seed) == (5, 0)
     [first], [second] = scenario.objects, again.objects
     assert second.scale == pytest.approx(2 * first.scale, rel=1e-5)
     assert second.yaw_deg == pytest.approx(first.yaw_deg)
     shift = np.subtract(first.position_m, second.position_m)
     assert np.abs(shift).max() < 1.5  # a larger one keeps farther from the lane
-    [other] = far.scenario(NATURAL_M, steps.KEYS, tmp_path).objects
+    [other] = load_scenario(far.write(NATURAL_M, steps.KEYS, tmp_path))[0].objects
     assert other.position_m != first.position_m
 
 
@@ -63,7 +64,8 @@ def test_every_row_of_every_study_is_a_scenario(tmp_path):
     assert len(distribution.keys()) == 48
     place = Place(ROUTES[0], steps.LATERAL_M["near"], steps.ARC_M, 0)
     for row in robust.ROWS:
-        scenario = place.scenario(1.5, robust.scenario_keys(row), tmp_path)
+        path = place.write(1.5, robust.scenario_keys(row), tmp_path)
+        scenario, _ = load_scenario(path)
         frames = scenario.attack.poses * scenario.attack.max_iterations
         assert frames == robust.DRIVES
-    place.scenario(1.5, distribution.KEYS, tmp_path)
+    load_scenario(place.write(1.5, distribution.KEYS, tmp_path))

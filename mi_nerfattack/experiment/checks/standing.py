@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -72,7 +73,7 @@ class Solid:
         pose, field = self.posed.placed, self.posed.field
         local = (points - pose.translation) @ pose.rotation / pose.scale
         within = ((local >= field.lower) & (local <= field.upper)).all(1)
-        return within & _is_solid(self.posed, _array(mi.Point3f, local))
+        return within & _is_solid(self.posed, upload_rows(mi.Point3f, local))
 
     @property
     def sampled(self) -> np.ndarray:
@@ -249,10 +250,10 @@ def _entered(scene: Any, start: np.ndarray, points: np.ndarray) -> np.ndarray:
     line = points - start
     length = np.maximum(np.linalg.norm(line, axis=1), 1e-9)
     unit = line / length[:, None]
-    direction = _array(mi.Vector3f, unit)
+    direction = upload_rows(mi.Vector3f, unit)
     begin, count = np.zeros(len(points)), np.zeros(len(points), int)
     for _ in range(_MOST_SURFACES):
-        at = _array(mi.Point3f, start + begin[:, None] * unit)
+        at = upload_rows(mi.Point3f, start + begin[:, None] * unit)
         found = scene.ray_intersect(mi.Ray3f(at, direction))
         t = begin + found.t.numpy()
         met = t < length
@@ -268,14 +269,11 @@ def _distances(scene: Any, points: np.ndarray) -> np.ndarray:
     """Measure how far the next surface is along six axes, (n, 6), metres."""
     origins = np.repeat(points, 6, axis=0)
     directions = np.tile(_AXES, (len(points), 1))
-    ray = mi.Ray3f(_array(mi.Point3f, origins), _array(mi.Vector3f, directions))
+    ray = mi.Ray3f(
+        upload_rows(mi.Point3f, origins), upload_rows(mi.Vector3f, directions)
+    )
     found = scene.ray_intersect_preliminary(ray, coherent=False)
     return found.t.numpy().reshape(-1, 6)
-
-
-def _array(kind: Any, rows: np.ndarray) -> Any:
-    """Upload (n, 3); from lists, whose kernels do not depend on their alignment."""
-    return kind(*(mi.Float(column) for column in rows.T.tolist()))
 
 
 def _told(point: np.ndarray) -> str:

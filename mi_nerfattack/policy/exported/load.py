@@ -53,7 +53,7 @@ def load_exported(path: Path) -> ExportedNetwork:
     try:
         program = torch.export.load(io.BytesIO(raw))
         network = ExportedNetwork(program)
-    except Exception as err:
+    except Exception as err:  # torch raises whatever a damaged program leads to
         if is_interrupt(err):
             raise
         raise InputError(
