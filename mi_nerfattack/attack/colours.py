@@ -19,12 +19,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import convolve1d
 
+from mi_nerfattack.attack.constraints import Allowed, Constraints
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.fields.grid import GridField, GridLevel
 
-#: Colours stay so far from 0 and 1, where no raw value reaches.
-MARGIN = 0.01
 _BINOMIAL = (0.25, 0.5, 0.25)
 
 
@@ -51,8 +50,13 @@ class AbstractColouring(ABC):
         """
 
     def project(self, value: np.ndarray) -> np.ndarray:
-        """Return the nearest parameters (n, 3) that are allowed."""
+        """Return parameters (n, 3) that are allowed, near to given ones."""
         return value
+
+    def penalty(self, value: np.ndarray) -> float:
+        """Return what is added to the objective."""
+        del value
+        return 0.0
 
 
 class Colours(AbstractColouring):
@@ -66,10 +70,15 @@ class Colours(AbstractColouring):
         resolution: the finest level of at most so many vertices an edge is stepped in;
             the finest of all by default.
         smoothing: passes of a binomial filter.
+        constraints: what colours are allowed.
     """
 
     def __init__(
-        self, field: GridField, resolution: int | None = None, smoothing: int = 1
+        self,
+        field: GridField,
+        resolution: int | None = None,
+        smoothing: int = 1,
+        constraints: Constraints | None = None,
     ) -> None:
         levels = [
             level
@@ -79,19 +88,23 @@ class Colours(AbstractColouring):
         self.level = levels[-1] if levels else field.levels()[0]
         self.smoothing = smoothing
         self._original = field.texture.numpy().copy()
-        self.start = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
-        self._lower = np.minimum(self.start, np.float32(MARGIN))
-        self._upper = np.maximum(self.start, np.float32(1 - MARGIN))
+        colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)
+        self._allowed = Allowed(
+            constraints or Constraints(), field, self.level, colours
+        )
+        self._raw = _logit(colours)
+        self.start = self._allowed.start
 
     def texture(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.texture`."""
         raw = self._original.copy()
-        raw[self.level.vertices] += _logit(value) - _logit(self.start)
+        raw[self.level.vertices] += _logit(value) - self._raw
         return raw
 
     def gradient(self, value: np.ndarray, by_texture: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.gradient`."""
         slope = by_texture[self.level.vertices] / (value * (1 - value))
+        slope = slope + self._allowed.penalty(value)[1]
         cube = slope.reshape((self.level.resolution,) * 3 + (3,))
         for _ in range(self.smoothing):
             for axis in range(3):
@@ -100,7 +113,11 @@ class Colours(AbstractColouring):
 
     def project(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.project`."""
-        return np.clip(value, self._lower, self._upper)
+        return self._allowed.project(value)
+
+    def penalty(self, value: np.ndarray) -> float:
+        """See :meth:`AbstractColouring.penalty`."""
+        return self._allowed.penalty(value)[0]
 
 
 def vertex_colours(

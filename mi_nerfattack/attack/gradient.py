@@ -22,6 +22,9 @@ from mi_nerfattack.vehicle.route.route import Route
 
 OFFSETS = "offsets"
 
+#: Parameters of the objects' textures, (n, 3) each, by the optimiser's key.
+Parameters = dict[str, np.ndarray]
+
 
 @dataclass(frozen=True)
 class IterationRecord:
@@ -60,8 +63,7 @@ class GradientAttack:
 
     Attributes:
         history: a record an iteration.
-        best: textures of the iteration with the least objective.
-        best_offsets: (k, 6) object offsets of the same.
+        best_offsets: (k, 6) object offsets of the iteration with the least objective.
         best_mean_m: mean |e| of the same, metres.
         whole: False while an update is half done, when the state must not be kept.
     """
@@ -83,13 +85,14 @@ class GradientAttack:
         self.history: list[IterationRecord] = []
         self.best_objective = np.inf
         self.best_mean_m = 0.0
-        self.best = self._textures()
         self.optimiser = Adam(lr=1.0)
         self._colourings: dict[str, AbstractColouring] = {}
+        self._best: Parameters = {}  # of the iteration with the least objective
         if self.freedom.texture_rate is not None:
             for i, field in enumerate(self.sensor.fields):
                 colouring = self.freedom.colouring(field)
                 self._colourings[str(i)] = colouring
+                self._best[str(i)] = colouring.start
                 self.optimiser[str(i)] = _tensor(colouring.start)
         self.best_offsets = self._offsets()
         self.whole = True
@@ -142,6 +145,13 @@ class GradientAttack:
         return self._record(self.rollout.measure(self.initial))
 
     @property
+    def best(self) -> list[np.ndarray]:
+        """Textures (n_vertices, 3) of the iteration with the least objective."""
+        if not self._colourings:
+            return [texture.numpy() for texture in self.sensor.textures()]
+        return self._textures(self._best)
+
+    @property
     def best_is_judged(self) -> bool:
         """Whether the best parameters were measured by this attack's objective."""
         return not self.history or np.isfinite(self.best_objective)
@@ -154,7 +164,7 @@ class GradientAttack:
         """
         self.restore_best()
         self.best_objective = np.inf
-        self._record(self.rollout.measure(self.initial, on_step))
+        self._record(self.rollout.measure(self.initial, on_step), self._best)
 
     def restore_best(self) -> None:
         """Give the objects the parameters of the iteration with the least objective."""
@@ -164,11 +174,10 @@ class GradientAttack:
 
     def _values(self, gradient: Gradient) -> dict[str, Any]:
         """Return the gradient by the optimiser's keys, checked."""
+        colours = self._colours()
         values = {
             key: _tensor(
-                colouring.gradient(
-                    self._parameters(key), gradient.textures[int(key)].numpy()
-                )
+                colouring.gradient(colours[key], gradient.textures[int(key)].numpy())
             )
             for key, colouring in self._colourings.items()
         }
@@ -192,35 +201,33 @@ class GradientAttack:
         for key, value in values.items():
             dr.set_grad(self.optimiser[key], value)
         self.optimiser.step()
-        for key, colouring in self._colourings.items():
-            self.optimiser[key] = _tensor(colouring.project(self._parameters(key)))
+        for key, colours in self._colours().items():
+            self.optimiser[key] = _tensor(self._colourings[key].project(colours))
         if OFFSETS in values:
             moved = np.array(dr.detach(self.optimiser[OFFSETS]), np.float64)
             self.optimiser[OFFSETS] = _tensor(self.freedom.project(moved))
 
     def _install(self) -> None:
         """Give the sensor the optimiser's parameters."""
-        if self.freedom.texture_rate is not None:
-            self.sensor.set_textures(
-                [
-                    _tensor(colouring.texture(self._parameters(key)))
-                    for key, colouring in self._colourings.items()
-                ]
-            )
+        if self._colourings:
+            textures = self._textures(self._colours())
+            self.sensor.set_textures([_tensor(texture) for texture in textures])
         if self.freedom.pose_rate is not None:
             offsets = dr.detach(self.optimiser[OFFSETS])
             self.sensor.set_offsets(np.array(offsets, np.float64))
 
-    def _parameters(self, key: str) -> np.ndarray:
-        return dr.detach(self.optimiser[key]).numpy()
+    def _colours(self) -> Parameters:
+        """Return what is stepped in, by the optimiser's key."""
+        return {k: dr.detach(self.optimiser[k]).numpy() for k in self._colourings}
 
-    def _textures(self) -> list[np.ndarray]:
-        return [texture.numpy().copy() for texture in self.sensor.textures()]
+    def _textures(self, colours: Parameters) -> list[np.ndarray]:
+        return [c.texture(colours[key]) for key, c in self._colourings.items()]
 
     def _offsets(self) -> np.ndarray:
         """Return the objects' offsets, (k, 6); zeros where they cannot be moved."""
         offsets = self.sensor.offsets()
-        return np.zeros((len(self.best), 6)) if offsets is None else offsets
+        count = len(self.sensor.fields)
+        return np.zeros((count, 6)) if offsets is None else offsets
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
@@ -235,7 +242,7 @@ class GradientAttack:
             "best_objective": np.array([self.best_objective]),
             "best_offsets": self.best_offsets,
         }
-        result |= {f"best.{i}": best for i, best in enumerate(self.best)}
+        result |= {f"best.{key}": best for key, best in self._best.items()}
         for key in self.optimiser:
             value, _, _, (count, first, second, _) = self.optimiser.state[key]
             result[f"texture.{key}"] = value.numpy().copy()
@@ -255,7 +262,7 @@ class GradientAttack:
         self.best_mean_m = float(tensors["best_mean_m"][0])
         self.best_objective = float(tensors["best_objective"][0])
         self.best_offsets = np.array(tensors["best_offsets"])
-        self.best = [np.array(tensors[f"best.{i}"]) for i in range(len(self.best))]
+        self._best = {key: np.array(tensors[f"best.{key}"]) for key in self._best}
         for key in list(self.optimiser):
             self._load_parameter(key, tensors)
         self.restore_best()
@@ -276,14 +283,13 @@ class GradientAttack:
         self._load_history(tensors)
         self.best_objective = np.inf
         for key in [key for key in self.optimiser if f"texture.{key}" in tensors]:
-            if key == OFFSETS:
-                names = ("best_offsets", f"texture.{OFFSETS}")
-                near = {name: self.freedom.project(tensors[name]) for name in names}
-                self.best_offsets = near["best_offsets"]
-                self._load_parameter(key, {**tensors, **near})
+            name, moved = f"texture.{key}", key == OFFSETS
+            project = (self.freedom if moved else self._colourings[key]).project
+            self._load_parameter(key, {**tensors, name: project(tensors[name])})
+            if moved:
+                self.best_offsets = project(tensors["best_offsets"])
             else:
-                self.best[int(key)] = np.array(tensors[f"best.{key}"])
-                self._load_parameter(key, tensors)
+                self._best[key] = project(tensors[f"best.{key}"])
 
     def _load_history(self, tensors: dict[str, np.ndarray]) -> None:
         counts, rows = tensors["cost_counts"], tensors["history"]
@@ -311,14 +317,23 @@ class GradientAttack:
             extra = (count, first, second, extra[3])
         self.optimiser.state[key] = (value, promoted, rate, extra)
 
-    def _record(self, seen: Evaluation) -> IterationRecord:
-        """Judge a drive; keep the present parameters if they are the best."""
+    def _record(
+        self, seen: Evaluation, colours: Parameters | None = None
+    ) -> IterationRecord:
+        """Judge a drive; keep its parameters if they are the best.
+
+        Args:
+            seen: the drive.
+            colours: that it was driven with; the present ones by default.
+        """
+        colours = self._colours() if colours is None else colours
         states = seen.trajectory.states_numpy()[:, 1:]
         error = self.route.cross_track_numpy(states.reshape(-1, states.shape[2]))
         error = np.abs(error)
         mean, value = float(error.mean()), seen.value
+        value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
         if value < self.best_objective:
-            self.best, self.best_offsets = self._textures(), self._offsets()
+            self._best, self.best_offsets = colours, self._offsets()
             self.best_objective, self.best_mean_m = value, mean
         costs = tuple(map(float, seen.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)

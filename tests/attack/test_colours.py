@@ -33,7 +33,8 @@ def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rn
 
 
 def test_projection_allows_colours_and_what_was_there(rng):
-    from mi_nerfattack.attack.colours import MARGIN, Colours
+    from mi_nerfattack.attack.colours import Colours
+    from mi_nerfattack.attack.constraints import MARGIN
 
     field = field_of(1, rng)
     texture = field.texture.numpy().copy()

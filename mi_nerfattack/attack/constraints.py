@@ -1,0 +1,162 @@
+"""Which colours an attacked object may have: projections, and a penalty.
+
+All are of the colours c of an object's vertices (sRGB), c0 being the original ones:
+
+- boxes: every value within `linf` of the original, within `lowest` and `highest`; none
+  changes in `fixed` regions;
+- a ball: root mean square change of at most `l2`, over the vertices of occupied cells;
+- a penalty: `total_variation` times the mean absolute difference of neighbours there.
+
+Boxes and ball are kept after every step: values are clipped, then drawn towards the
+original, which lies in both (or towards the nearest that does).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField, GridLevel
+from mi_nerfattack.ranges import NonNegative, Positive, Share, checked
+
+#: Colours stay so far from 0 and 1, where no raw value reaches.
+MARGIN = 0.01
+#: Differences below are penalised by their square.
+_SMALL = 0.01
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+@checked("constraints")
+class Constraints:
+    """What colours are allowed.
+
+    Attributes:
+        linf: largest change of a value; None for any.
+        l2: largest root mean square change; None for any.
+        lowest, highest: range of all values, the original's too; by default the
+            original's are allowed wherever they are.
+        fixed: boxes (lower, upper) in the object's frame, metres, whose colours stay.
+        total_variation: weight of the penalty, in units of the objective.
+
+    Raises:
+        InputError: an empty range or box.
+    """
+
+    linf: Positive | None = None
+    l2: Positive | None = None
+    lowest: Share | None = None
+    highest: Share | None = None
+    fixed: tuple[Box, ...] = ()
+    total_variation: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the order of range and boxes."""
+        if (self.lowest or 0.0) >= (1.0 if self.highest is None else self.highest):
+            raise InputError(
+                f"lowest: {self.lowest}, highest: {self.highest}; expected lower first"
+            )
+        for lower, upper in self.fixed:
+            if not np.less(lower, upper).all():
+                raise InputError(f"fixed: {lower} to {upper}; expected lower < upper")
+
+
+class Allowed:
+    """The constraints on the colours of one level of a field.
+
+    Args:
+        constraints: what is allowed.
+        field: of the object.
+        level: whose vertices' colours they are.
+        original: (n, 3) sRGB, by vertex.
+
+    Attributes:
+        start: (n, 3) float32, the allowed colours nearest to the original.
+    """
+
+    def __init__(
+        self,
+        constraints: Constraints,
+        field: GridField,
+        level: GridLevel,
+        original: np.ndarray,
+    ) -> None:
+        self.constraints, n = constraints, level.resolution
+        where = _positions(field, level)
+        self._counts = _occupied(field, where)
+        self._cube = (n, n, n, 3)
+        low, high = constraints.lowest, constraints.highest
+        self._lower = np.minimum(original, np.float32(MARGIN))
+        self._upper = np.maximum(original, np.float32(1 - MARGIN))
+        if low is not None:
+            self._lower = np.full_like(original, max(low, MARGIN))
+        if high is not None:
+            self._upper = np.full_like(original, min(high, 1 - MARGIN))
+        self.start = np.clip(original, self._lower, self._upper)
+        if constraints.linf is not None:
+            self._lower = np.maximum(self._lower, self.start - constraints.linf)
+            self._upper = np.minimum(self._upper, self.start + constraints.linf)
+        for lower, upper in constraints.fixed:
+            inside = ((where >= lower) & (where <= upper)).all(axis=1)
+            self._lower[inside] = self._upper[inside] = self.start[inside]
+
+    def project(self, value: np.ndarray) -> np.ndarray:
+        """Return colours (n, 3) that are allowed, near to given ones."""
+        value = np.clip(value, self._lower, self._upper)
+        if self.constraints.l2 is None:
+            return value
+        change = value - self.start
+        square = np.square(change[self._counts], dtype=np.float64).mean()
+        size = float(np.sqrt(square)) if self._counts.any() else 0.0
+        if size <= self.constraints.l2:
+            return value
+        return self.start + np.float32(self.constraints.l2 / size) * change
+
+    def penalty(self, value: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the weighted total variation, and its gradient (n, 3).
+
+        Args:
+            value: (n, 3) colours.
+        """
+        weight = self.constraints.total_variation
+        gradient = np.zeros(self._cube, np.float32)
+        if weight == 0.0:
+            return 0.0, gradient.reshape(value.shape)
+        cube, seen = value.reshape(self._cube), self._counts.reshape(self._cube[:3])
+        total, pairs = 0.0, 0
+        for axis in range(3):
+            first, second = _neighbours(axis)
+            both = (seen[first] & seen[second])[..., None]
+            change = np.where(both, cube[second] - cube[first], 0)
+            small = np.abs(change) < _SMALL
+            size = np.where(small, change**2 / (2 * _SMALL) + _SMALL / 2, abs(change))
+            total += float(size[np.broadcast_to(both, size.shape)].sum())
+            pairs += 3 * int(both.sum())
+            slope = np.where(small, change / _SMALL, np.sign(change))
+            gradient[second] += slope
+            gradient[first] -= slope
+        share = weight / max(pairs, 1)
+        return share * total, (share * gradient).reshape(value.shape)
+
+
+def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    first, second = [slice(None)] * 3, [slice(None)] * 3
+    first[axis], second[axis] = slice(None, -1), slice(1, None)
+    return tuple(first), tuple(second)
+
+
+def _positions(field: GridField, level: GridLevel) -> np.ndarray:
+    """Return where a level's vertices lie, (n, 3), metres, x the fastest."""
+    index = np.indices((level.resolution,) * 3).reshape(3, -1).T[:, ::-1]
+    return field.lower + index / level.scale * (field.upper - field.lower)
+
+
+def _occupied(field: GridField, where: np.ndarray) -> np.ndarray:
+    """Tell which points (n, 3) lie in occupied cells, (n,)."""
+    cells = field.window.cells  # by x, y, z
+    unit = (where - field.lower) / (field.upper - field.lower)
+    index = np.clip((unit * cells.shape).astype(int), 0, np.array(cells.shape) - 1)
+    return np.asarray(cells[tuple(index.T)], bool)
