@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from mi_nerfattack.attack.colours import Colours
+from mi_nerfattack.attack.constraints import Constraints
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
-from mi_nerfattack.ranges import Count, NonNegative, Positive, SomeShare
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.ranges import (
+    Count,
+    Finite,
+    NonNegative,
+    Positive,
+    Share,
+    SomeShare,
+)
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
     AbstractAdjoint,
@@ -17,8 +31,11 @@ from mi_nerfattack.rollout.adjoint import (
     KeptBackgrounds,
     Replay,
 )
-from mi_nerfattack.scenario.section import Kinds, Section
+from mi_nerfattack.scenario.section import Kinds, Section, refuse
 
+Corner = tuple[Finite, Finite, Finite]
+Box = tuple[Corner, Corner]
+Resolution = Annotated[int, Field(ge=2, le=512)]
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 
 
@@ -43,15 +60,52 @@ class CheckpointedAdjoint(Section):
         return Checkpointed(self.segment)
 
 
-class TextureFreedom(Section):
+class AbstractTextureFreedom(Section):
+    """Colours may change, within what is allowed."""
+
+    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
+    resolution: Resolution | None = None  # vertices an edge that are stepped in
+    linf: Positive | None = None  # largest change of a colour value
+    l2: Positive | None = None  # largest root mean square change
+    lowest: Share | None = None  # of all colour values
+    highest: Share | None = None
+    fixed_m: tuple[Box, ...] = ()  # lower and upper corner, in the object's frame
+    total_variation: NonNegative = 0.0  # weight of the penalty
+
+    @model_validator(mode="after")
+    def _check_constraints(self) -> Any:
+        """Refuse an empty range or box."""
+        try:
+            self._constraints()
+        except InputError as err:
+            key = "fixed_m" if str(err).startswith("fixed") else "lowest"
+            refuse(key, str(err))
+        return self
+
+    def _constraints(self) -> Constraints:
+        return Constraints(
+            self.linf,
+            self.l2,
+            self.lowest,
+            self.highest,
+            self.fixed_m,
+            self.total_variation,
+        )
+
+    def _colouring(self) -> Callable[[GridField], Colours]:
+        return partial(
+            Colours, resolution=self.resolution, constraints=self._constraints()
+        )
+
+
+class TextureFreedom(AbstractTextureFreedom):
     """Textures may change."""
 
     parameters: Literal["texture"] = "texture"
-    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
-        return Freedom(self.learning_rate)
+        return Freedom(self.learning_rate, colouring=self._colouring())
 
 
 class AbstractPoseFreedom(Section):
@@ -78,15 +132,14 @@ class PoseFreedom(AbstractPoseFreedom):
         return self._with(None)
 
 
-class BothFreedom(AbstractPoseFreedom):
+class BothFreedom(AbstractTextureFreedom, AbstractPoseFreedom):
     """Textures may change, too."""
 
     parameters: Literal["both"]
-    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
 
     def build(self) -> Freedom:
         """Say what the attack may change."""
-        return self._with(self.learning_rate)
+        return replace(self._with(self.learning_rate), colouring=self._colouring())
 
 
 class AttackSection(Section):
