@@ -90,6 +90,13 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
         ("[policy]", "[polisy]", 19, ["polisy"]),
         ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
         ("[attack]", "[attack", None, ["scenario.toml"]),
+        ("[attack]", "[attack]\nlowest = 0.9\nhighest = 0.2", 22, ["lowest", "0.2"]),
+        (
+            "[attack]",
+            "[attack]\nfixed_m = [[[0, 0, 0], [0, 1, 1]]]",
+            22,
+            ["fixed_m", "lower < upper"],
+        ),
         ("[attack]", "[attack]\nsegment = 8", 22, ["segment", "checkpointed"]),
         ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
         (
