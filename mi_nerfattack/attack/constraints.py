@@ -4,11 +4,13 @@ All are of the colours c of an object's vertices (sRGB), c0 being the original o
 
 - boxes: every value within `linf` of the original, within `lowest` and `highest`; none
   changes in `fixed` regions;
+- a gamut: what a printer or monitor shows;
 - a ball: root mean square change of at most `l2`, over the vertices of occupied cells;
 - a penalty: `total_variation` times the mean absolute difference of neighbours there.
 
-Boxes and ball are kept after every step: values are clipped, then drawn towards the
-original, which lies in both (or towards the nearest that does).
+All but the penalty are kept after every step: values are clipped, drawn towards the
+gamut's centre, then towards the original, which is allowed (or towards the nearest
+that is).
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.attack.gamut import Gamut
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLevel
 from mi_nerfattack.ranges import NonNegative, Positive, Share, checked
@@ -39,26 +42,36 @@ class Constraints:
         l2: largest root mean square change; None for any.
         lowest, highest: range of all values, the original's too; by default the
             original's are allowed wherever they are.
+        gamut: of a printer or monitor, the original's colours too.
         fixed: boxes (lower, upper) in the object's frame, metres, whose colours stay.
         total_variation: weight of the penalty, in units of the objective.
 
     Raises:
-        InputError: an empty range or box.
+        InputError: an empty range or box, or a gamut whose centre is out of range.
     """
 
     linf: Positive | None = None
     l2: Positive | None = None
     lowest: Share | None = None
     highest: Share | None = None
+    gamut: Gamut | None = None
     fixed: tuple[Box, ...] = ()
     total_variation: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         """Check the order of range and boxes."""
-        if (self.lowest or 0.0) >= (1.0 if self.highest is None else self.highest):
-            raise InputError(
-                f"lowest: {self.lowest}, highest: {self.highest}; expected lower first"
-            )
+        lowest = self.lowest or 0.0
+        highest = 1.0 if self.highest is None else self.highest
+        named = f"lowest: {self.lowest}, highest: {self.highest}"
+        if lowest >= highest:
+            raise InputError(f"{named}; expected lower first")
+        if self.gamut is not None:
+            centre = self.gamut.centre
+            if not lowest < centre.min() <= centre.max() < highest:
+                raise InputError(
+                    f"{named}; the gamut's centre, {centre.round(2).tolist()}, is not "
+                    "within"
+                )
         for lower, upper in self.fixed:
             if not np.less(lower, upper).all():
                 raise InputError(f"fixed: {lower} to {upper}; expected lower < upper")
@@ -96,6 +109,8 @@ class Allowed:
         if high is not None:
             self._upper = np.full_like(original, min(high, 1 - MARGIN))
         self.start = np.clip(original, self._lower, self._upper)
+        if gamut := constraints.gamut:
+            self.start = gamut.draw(self.start, gamut.centre).astype(np.float32)
         if constraints.linf is not None:
             self._lower = np.maximum(self._lower, self.start - constraints.linf)
             self._upper = np.minimum(self._upper, self.start + constraints.linf)
@@ -106,6 +121,10 @@ class Allowed:
     def project(self, value: np.ndarray) -> np.ndarray:
         """Return colours (n, 3) that are allowed, near to given ones."""
         value = np.clip(value, self._lower, self._upper)
+        if gamut := self.constraints.gamut:
+            value = gamut.draw(value, gamut.centre)
+            value = np.clip(value, self._lower, self._upper)
+            value = gamut.draw(value, self.start).astype(np.float32)
         if self.constraints.l2 is None:
             return value
         change = value - self.start

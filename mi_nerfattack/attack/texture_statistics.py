@@ -1,4 +1,4 @@
-"""What an attack made of a texture: distances, saturation, total variation.
+"""What an attack made of a texture: distances, saturation, variation, spectrum.
 
 All are of what the camera sees: a vertex of the finest level counts by how much its
 colour changes the images of given drives.
@@ -34,12 +34,16 @@ class TextureStatistics:
         saturated_share: of the colour values, within `SATURATED` of 0 or 1.
         total_variation: mean distance of neighbouring vertices' colours, sRGB a voxel
             of the finest level.
+        spectrum: shares of `l2` squared by the size of what changed: entry k is of
+            structure of 2^k to 2^(k + 1) voxels, the last of the mean change. Empty
+            where nothing changed.
     """
 
     l2: float
     linf: float
     saturated_share: float
     total_variation: float
+    spectrum: list[float]
 
 
 def seen_weights(
@@ -83,7 +87,7 @@ def texture_statistics(
     texture = field.texture
     seen = weights > _SEEN * weights.max(initial=0.0)
     if not seen.any():
-        return TextureStatistics(0.0, 0.0, 0.0, 0.0)
+        return TextureStatistics(0.0, 0.0, 0.0, 0.0, [])
     colour = vertex_colours(field, field.levels()[-1], seen)
     field.set_parameter("texture", original)
     change = colour - vertex_colours(field, field.levels()[-1], seen)
@@ -95,7 +99,40 @@ def texture_statistics(
         float(np.abs(change).max()),
         float((weight * saturated.mean(axis=1)).sum()),
         _variation(colour, seen, weights),
+        _spectrum(change, seen, weights),
     )
+
+
+def _spectrum(change: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> list[float]:
+    """Take a change apart by Haar's averages over blocks, weighted.
+
+    What an average over eight neighbours leaves of them is structure of their size; the
+    averages are taken apart likewise. The parts' squares add up to that of the whole.
+    """
+    size = 1 << (max(seen.shape) - 1).bit_length()
+    values, weight = np.zeros((size,) * 3 + (3,)), np.zeros((size,) * 3 + (1,))
+    inside = tuple(slice(n) for n in seen.shape)
+    values[inside][seen] = change
+    weight[inside][seen] = weights[seen][:, None]
+    whole = (weight * values**2).sum()
+    if not whole:
+        return []
+    left = [whole]
+    while len(values) > 1:
+        above = _blocks(weight * values)
+        weight = _blocks(weight)
+        values = np.divide(above, weight, out=above, where=weight > 0)
+        left.append((weight * values**2).sum())
+    return (-np.diff([*left, 0.0]) / whole).tolist()
+
+
+def _blocks(cube: np.ndarray) -> np.ndarray:
+    """Add up 2 x 2 x 2 neighbours."""
+    for axis in range(3):
+        cube = cube.take(range(0, cube.shape[axis], 2), axis) + cube.take(
+            range(1, cube.shape[axis], 2), axis
+        )
+    return cube
 
 
 def _variation(colour: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> float:

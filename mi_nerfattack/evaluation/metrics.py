@@ -235,6 +235,7 @@ class _Texture(_Model):
     linf: pydantic.NonNegativeFloat
     saturated_share: _Share
     total_variation: pydantic.NonNegativeFloat
+    spectrum: list[float]
 
 
 class _Document(_Model):

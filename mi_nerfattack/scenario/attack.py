@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from mi_nerfattack.attack.colours import Colours
 from mi_nerfattack.attack.constraints import Constraints
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.gamut import Gamut
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -31,6 +32,7 @@ from mi_nerfattack.rollout.adjoint import (
     KeptBackgrounds,
     Replay,
 )
+from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
 
 Corner = tuple[Finite, Finite, Finite]
@@ -69,17 +71,19 @@ class AbstractTextureFreedom(Section):
     l2: Positive | None = None  # largest root mean square change
     lowest: Share | None = None  # of all colour values
     highest: Share | None = None
+    gamut: File | None = None  # ICC profile or list of sRGB colours
     fixed_m: tuple[Box, ...] = ()  # lower and upper corner, in the object's frame
     total_variation: NonNegative = 0.0  # weight of the penalty
 
     @model_validator(mode="after")
     def _check_constraints(self) -> Any:
-        """Refuse an empty range or box."""
+        """Refuse an empty range or box, and a file that is no gamut."""
         try:
             self._constraints()
         except InputError as err:
-            key = "fixed_m" if str(err).startswith("fixed") else "lowest"
-            refuse(key, str(err))
+            text = str(err)
+            started = {"fixed": "fixed_m", "lowest": "lowest"}.get(text.split(":")[0])
+            refuse(started or "gamut", text)
         return self
 
     def _constraints(self) -> Constraints:
@@ -88,6 +92,7 @@ class AbstractTextureFreedom(Section):
             self.l2,
             self.lowest,
             self.highest,
+            Gamut.load(self.gamut.file) if self.gamut else None,
             self.fixed_m,
             self.total_variation,
         )

@@ -105,3 +105,24 @@ def test_statistics_of_a_texture_that_is_known():
     assert found.linf == pytest.approx(0.5, abs=1e-5)
     assert found.saturated_share == pytest.approx(1)
     assert found.total_variation == pytest.approx(0, abs=1e-6)
+    assert same.spectrum == []
+    assert found.spectrum[-1] == pytest.approx(1)  # all of it is the mean
+
+
+def test_spectrum_tells_fine_structure_from_coarse(variant):
+    from mi_nerfattack.attack.texture_statistics import texture_statistics
+    from mi_nerfattack.fields import GridField, GridLayout
+
+    grid = GridField(GridLayout(1, 8, 8), -np.ones(3), np.ones(3))
+    original = grid.texture.numpy().copy()
+    index = np.indices((8, 8, 8)).reshape(3, -1)
+    everywhere = np.ones((8, 8, 8))
+    for period, wanted in ((1, [1, 0, 0, 0]), (2, [0, 1, 0, 0]), (8, [0, 0, 0, 1])):
+        board = 1 - 2 * (index // period % 2).max(axis=0)
+        raw = original + board[:, None].astype(np.float32)
+        if wanted[-1] == 0:
+            raw -= raw.reshape(-1, 3).mean(axis=0)
+        grid.set_parameter("texture", raw)
+        found = texture_statistics(grid, original, everywhere).spectrum
+        assert sum(found) == pytest.approx(1)
+        assert found == pytest.approx(wanted, abs=0.06)

@@ -265,6 +265,25 @@ def _forked(task: dict[str, Any], stages: Any) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
+def _profile(folder: Path) -> list[tuple[Path, Read]]:
+    from PIL import ImageCms
+
+    from mi_nerfattack.attack.gamut import Gamut
+
+    path = folder / "monitor.icc"
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
+    path.write_bytes(profile.tobytes())
+    return [(path, Gamut.load)]
+
+
+def _patches(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack.attack.gamut import Gamut
+
+    path = folder / "patches.csv"
+    np.savetxt(path, np.random.default_rng(0).uniform(0, 1, (9, 3)), delimiter=",")
+    return [(path, Gamut.load)]
+
+
 def _routes(folder: Path) -> list[tuple[Path, Read]]:
     from mi_nerfattack.vehicle.route.route import load_routes
 
@@ -300,6 +319,8 @@ FORMATS: dict[str, Format] = {
     "transforms": Format(_transforms, _JSON_OR_BYTES),
     "colmap": Format(_colmap, of_bytes),
     "colmap_text": Format(_colmap_text, _TEXT),
+    "profile": Format(_profile, of_bytes),
+    "patches": Format(_patches, _TEXT),
     "routes": Format(_routes, _JSON_OR_BYTES),
     "onnx": Format(programs.onnx_files, one_of(programs.of_onnx, of_bytes)),
     "policy": Format(programs.policies, programs.of_policy),

@@ -97,6 +97,7 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
             22,
             ["fixed_m", "lower < upper"],
         ),
+        ("[attack]", '[attack]\ngamut = "none.icc"', 22, ["gamut", "none.icc"]),
         ("[attack]", "[attack]\nsegment = 8", 22, ["segment", "checkpointed"]),
         ("[attack]", "[attack]\npose_limit_m = 2.0", 22, ["pose_limit_m", "both"]),
         (
