@@ -15,12 +15,13 @@ class BenchStudy:
     """Make the attacks of a study, and append a row for each to a table.
 
     `steps`: parametrisations of colour and learning rates at six places. `robust`: what
-    disturbances of the optimisation do for the transfer. `distribution`: 24 places,
-    two sizes. Each takes hours on two cores; stopped, the same command continues from
+    disturbances of the optimisation do for the transfer. `textures`: the price of
+    smooth and coarse textures, and half the iterations. `distribution`: 24 places, two
+    sizes. Each takes hours on two cores; stopped, the same command continues from
     OUTPUT.
     """
 
-    study: tyro.conf.Positional[Literal["steps", "robust", "distribution"]]
+    study: tyro.conf.Positional[Literal["steps", "robust", "textures", "distribution"]]
     """Which."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Table to write, row by row (.jsonl)."""
@@ -29,7 +30,7 @@ class BenchStudy:
         """Make the rows that are missing."""
         import torch
 
-        from bench.study import distribution, robust, rows, steps
+        from bench.study import distribution, robust, rows, steps, textures
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
@@ -40,7 +41,12 @@ class BenchStudy:
         def on_row(done: int, count: int, key: str) -> None:
             print(f"{done}/{count}: {key}", file=sys.stderr, flush=True)
 
-        studies = {"steps": steps, "robust": robust, "distribution": distribution}
+        studies = {
+            "steps": steps,
+            "robust": robust,
+            "textures": textures,
+            "distribution": distribution,
+        }
         study = studies[self.study]
         found = rows.fill(self.output, study.keys(), study.attack_row, on_row)
         print(f"{len(found)} rows in {self.output}", file=sys.stderr)

@@ -62,14 +62,14 @@ class AbstractColouring(ABC):
 class Colours(AbstractColouring):
     """Colours of one level's vertices.
 
-    The gradient is smoothed over neighbouring vertices: Adam takes steps of one size
-    everywhere, and neighbours that hardly differ would take opposite ones.
+    Adam takes steps of one size everywhere, so that neighbours that hardly differ may
+    take opposite ones. Where the gradient is smoothed, they go together.
 
     Args:
         field: of the object, with its original texture.
         resolution: the finest level of at most so many vertices an edge is stepped in;
             the finest of all by default.
-        smoothing: passes of a binomial filter.
+        smoothing: passes of a binomial filter over neighbouring vertices' gradients.
         constraints: what colours are allowed.
     """
 
@@ -77,7 +77,7 @@ class Colours(AbstractColouring):
         self,
         field: GridField,
         resolution: int | None = None,
-        smoothing: int = 1,
+        smoothing: int = 0,
         constraints: Constraints | None = None,
     ) -> None:
         levels = [

@@ -38,6 +38,7 @@ from mi_nerfattack.scenario.section import Kinds, Section, refuse
 Corner = tuple[Finite, Finite, Finite]
 Box = tuple[Corner, Corner]
 Resolution = Annotated[int, Field(ge=2, le=512)]
+Smoothing = Annotated[int, Field(ge=0, le=8)]
 Axis = Literal["x", "y", "z", "roll", "pitch", "yaw"]
 
 
@@ -65,8 +66,9 @@ class CheckpointedAdjoint(Section):
 class AbstractTextureFreedom(Section):
     """Colours may change, within what is allowed."""
 
-    learning_rate: Positive = 0.1  # of colours (sRGB in 0 to 1) an iteration
+    learning_rate: Positive = 0.3  # of colours (sRGB in 0 to 1) an iteration
     resolution: Resolution | None = None  # vertices an edge that are stepped in
+    smoothing: Smoothing = 0  # passes of a filter over the gradient
     linf: Positive | None = None  # largest change of a colour value
     l2: Positive | None = None  # largest root mean square change
     lowest: Share | None = None  # of all colour values
@@ -99,7 +101,10 @@ class AbstractTextureFreedom(Section):
 
     def _colouring(self) -> Callable[[GridField], Colours]:
         return partial(
-            Colours, resolution=self.resolution, constraints=self._constraints()
+            Colours,
+            resolution=self.resolution,
+            smoothing=self.smoothing,
+            constraints=self._constraints(),
         )
 
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from bench.study import distribution, robust, rows, steps
+from bench.study import distribution, robust, rows, steps, textures
 from bench.study.places import NATURAL_M, ROUTES, Place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -57,7 +57,7 @@ def test_places_are_drawn_once_and_for_all_sizes(tmp_path):
 
 
 def test_every_row_of_every_study_is_a_scenario(tmp_path):
-    for study in (steps, robust, distribution):
+    for study in (steps, robust, textures, distribution):
         keys = [json.dumps(key) for key in study.keys()]
         assert len(set(keys)) == len(keys)
     assert len(steps.keys()) == 72
@@ -68,4 +68,6 @@ def test_every_row_of_every_study_is_a_scenario(tmp_path):
         scenario, _ = load_scenario(path)
         frames = scenario.attack.poses * scenario.attack.max_iterations
         assert frames == robust.DRIVES
+    for row in textures.ROWS:
+        load_scenario(place.write(1.5, textures.scenario_keys(row), tmp_path))
     load_scenario(place.write(1.5, distribution.KEYS, tmp_path))
