@@ -33,6 +33,9 @@ class Attack:
     leaves its lane by itself, an object is not in view, stands on the lane, in a wall,
     in the air or in another, or the route is too short. metrics.json keeps what was
     found as flags."""
+    pictures: bool = True
+    """Write frames, plots, attribution and page beside the numbers, which takes about
+    as long as five drives in each environment."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
@@ -50,4 +53,5 @@ class Attack:
             self.json,
             force=self.force,
             anyway=self.anyway,
+            pictures=self.pictures,
         )

@@ -63,6 +63,7 @@ class Job:
         on_progress: told about every time step.
         on_notice: told what a resumed run ignores, or that there is none.
         started: `time.perf_counter()` from which the wall time counts.
+        pictures: write frames, plots, attribution and page, too.
     """
 
     scenario: Scenario
@@ -72,6 +73,7 @@ class Job:
     on_progress: OnProgress = _quiet
     on_notice: OnNotice = _quiet
     started: float = field(default_factory=time.perf_counter)
+    pictures: bool = True
 
     def run(
         self, resume: bool = False, force: bool = False, anyway: bool = False
@@ -151,20 +153,20 @@ class Job:
                 stages.drive_random(label, baseline.deployed, baseline.look)
                 for case in (BEST_RANDOM, ATTACK):
                     stages.drive_all(label, case)
-        from mi_nerfattack.experiment.results import write_results  # it loads the plots
+        from mi_nerfattack.experiment import results  # it loads the plots
 
-        return write_results(
-            self.output,
+        done = results.Finished(
             world,
             stages.drives,
             attack,
             stages.looks,
-            self.text,
-            effort,
             folder.checkpoint.ignored,
             baseline.figures(),
             flags,
-            self._counter(world, "surrogate: attribution", 3),
+        )
+        on_step = self._counter(world, "surrogate: attribution", 3)
+        return results.write_results(
+            self.output, done, self.text, effort, on_step, self.pictures
         )
 
     def _check(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,79 +27,133 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World, object_footprints
 
 
+@dataclass(frozen=True)
+class Finished:
+    """What a run came to.
+
+    Attributes:
+        world: what was driven in; its textures are changed by what looks at it.
+        drives: all drives.
+        attack: the finished attack.
+        looks: how the objects look and where they stand, per case; None: nowhere.
+        ignored: changes between interruption and resumption that were ignored.
+        baseline: figures of the random looks.
+        flags: findings of the checks before the attack.
+    """
+
+    world: World
+    drives: list[Drive]
+    attack: GradientAttack
+    looks: Mapping[str, Appearance | None]
+    ignored: list[str]
+    baseline: dict[str, Any]
+    flags: list[str]
+
+    def look(self, case: str) -> Appearance:
+        """Return how the objects look in a case that has any."""
+        look = self.looks[case]
+        assert look is not None, "objects are there"
+        return look
+
+    @property
+    def replayed(self) -> list[Drive]:
+        """The drives of recordings."""
+        return [d for d in self.drives if self.world.is_open_loop(d.environment)]
+
+    @property
+    def driven(self) -> list[Drive]:
+        """The drives in closed loops."""
+        replayed = self.replayed
+        return [drive for drive in self.drives if drive not in replayed]
+
+    @property
+    def lane(self) -> Lane:
+        """Of the route."""
+        return Lane.of(self.world.route, self.world.scenario.vehicle.width_m)
+
+
 def write_results(
     output: Path,
-    world: World,
-    drives: list[Drive],
-    attack: GradientAttack,
-    looks: Mapping[str, Appearance | None],
+    done: Finished,
     scenario_text: str,
     effort: Callable[[], Effort],
-    ignored: list[str],
-    baseline: dict[str, Any],
-    flags: list[str],
     on_step: OnStep | None = None,
+    pictures: bool = True,
 ) -> dict[str, Any]:
     """Write everything but scenario and checkpoint, ``metrics.json`` last but one.
 
     Args:
         output: the run folder, present.
-        world: what was driven in; its textures are changed.
-        drives: all drives.
-        attack: the finished attack.
-        looks: how the objects look and where they stand, per case; None: nowhere.
+        done: what the run came to.
         scenario_text: the scenario file.
         effort: tells what the run has cost so far.
-        ignored: changes between interruption and resumption that were ignored.
-        baseline: figures of the random looks.
-        flags: findings of the checks before the attack.
         on_step: called after each of the 3 x horizon control periods of the
             attribution.
+        pictures: write frames, plots, attribution and page, too.
 
     Returns:
         the document that ``metrics.json`` holds.
     """
-    scenario, route = world.scenario, world.route
-    lane = Lane.of(route, scenario.vehicle.width_m)
-    lanes, limit = {route.name: lane}, lane.wheel_m
-    replayed = [d for d in drives if world.is_open_loop(d.environment)]
-    driven = [drive for drive in drives if drive not in replayed]
-    attacked = looks[ATTACK]
-    assert attacked is not None, "an attack has objects"
-    more: dict[str, Any] = {"baseline": baseline, "flags": flags}
-    unit = scenario.vehicle.car().control_unit
-    if replayed:
-        more["replay"] = control_changes(replayed, unit, scenario.seed)
-    if attack.freedom.pose_rate is not None:
-        more["object_poses"] = _poses(world, attacked)
-    if ignored:
-        more["ignored_changes"] = ignored
-    write_steps(output / "steps.csv", driven, lanes)
-    history = [asdict(record) for record in attack.history]
+    history = [asdict(record) for record in done.attack.history]
+    _write_tables(output, done, history)
+    images = _write_images(output, done, history, on_step) if pictures else {}
+    document = _describe(done, effort)
+    files.write_json(output / "metrics.json", document)
+    if pictures:
+        page = output / "report.html"
+        write_report(page, document, images, scenario_text, versions())
+    return document
+
+
+def _write_tables(output: Path, done: Finished, history: list[dict[str, Any]]) -> None:
+    """Write steps, iterations and fields."""
+    world, texture_of = done.world, done.look(ATTACK).textures
+    write_steps(output / "steps.csv", done.driven, {world.route.name: done.lane})
     files.write_json(output / "attack.json", history)
     files.make_folder(output / "objects")
     for grid, item, texture in zip(
-        world.fields, scenario.objects, attacked.textures, strict=True
+        world.fields, world.scenario.objects, texture_of, strict=True
     ):
         grid.set_parameter("texture", texture)
         save_field(output / "objects" / f"{item.id}.safetensors", grid)
-    images = _write_plots(output, world, driven, history, limit)
-    images |= write_control_changes(output, replayed, unit)
-    names = [item.id for item in scenario.objects]
-    found = attribute(attack, names, limit, on_step)
+
+
+def _write_images(
+    output: Path,
+    done: Finished,
+    history: list[dict[str, Any]],
+    on_step: OnStep | None,
+) -> dict[str, Path]:
+    """Write plots and frames, and return the figures of the page by their titles."""
+    world, limit = done.world, done.lane.wheel_m
+    images = _write_plots(output, world, done.driven, history, limit)
+    unit = world.scenario.vehicle.car().control_unit
+    images |= write_control_changes(output, done.replayed, unit)
+    names = [item.id for item in world.scenario.objects]
+    found = attribute(done.attack, names, limit, on_step)
     images |= write_attribution(output, found, world.fields)
-    images["First-person frames"] = output / "strip.png"
-    write_pictures(output, world, drives, looks)
-    own = looks[OWN]
-    assert own is not None, "objects are there by themselves"
-    more |= {"converged": attack.has_converged}
-    more |= texture_figures(world, drives, own, attacked)
+    write_pictures(output, world, done.drives, done.looks)
+    return {**images, "First-person frames": output / "strip.png"}
+
+
+def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
+    """Return the document that ``metrics.json`` holds."""
+    world, scenario = done.world, done.world.scenario
+    lanes = {world.route.name: done.lane}
+    more: dict[str, Any] = {"baseline": done.baseline, "flags": done.flags}
+    if replayed := done.replayed:
+        unit = scenario.vehicle.car().control_unit
+        more["replay"] = control_changes(replayed, unit, scenario.seed)
+    if done.attack.freedom.pose_rate is not None:
+        more["object_poses"] = _poses(world, done.look(ATTACK))
+    if done.ignored:
+        more["ignored_changes"] = done.ignored
+    more["converged"] = done.attack.has_converged
+    more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
-    document = metrics_document(values, scenario.seed, driven, lanes, cost) | more
+    document = metrics_document(values, scenario.seed, done.driven, lanes, cost) | more
     document["verdict"] = verdict(document, SURROGATE)
     validate(document)
-    files.write_json(output / "metrics.json", document)
-    write_report(output / "report.html", document, images, scenario_text, versions())
     return document
 
 

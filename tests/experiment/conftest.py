@@ -39,14 +39,11 @@ def folder(tmp_path_factory):
 def leave_out_results(monkeypatch):
     from mi_nerfattack.experiment import results
 
-    def only_numbers(
-        output, world, drives, attack, looks, text, effort, ignored, *more
-    ):
+    def only_numbers(output, done, text, effort, *more):
         cost = effort().model_dump()
-        document = {"cost": cost, "ignored_changes": ignored, "drives": drives}
-        document["flags"] = more[1]
         files.write_json(output / "metrics.json", {"cost": cost})
-        return document
+        found = {"ignored_changes": done.ignored, "flags": done.flags}
+        return {"cost": cost, "drives": done.drives, **found}
 
     monkeypatch.setattr(results, "write_results", only_numbers)
 

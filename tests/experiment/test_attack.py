@@ -27,12 +27,12 @@ from mi_nerfattack.scenes import bundled
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
+def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     output = tmp_path / "run"
-    result = run(
-        "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=0
-    )
-    assert "attack" in result.stdout and str(output) in result.stdout
+    words = ["attack", str(scenario_folder / "scenario.toml"), "-o", str(output)]
+    assert cli.main(words) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "attack" in told and str(output) in told
     document = json.loads((output / "metrics.json").read_text())
     validate(document)
     route = document["routes"]["line"]
@@ -55,7 +55,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     assert document["total_variation"] == texture["total_variation"] > 0
     page = (output / "report.html").read_text()
     for sentence in document["verdict"]:
-        assert sentence in " ".join(result.stdout.split())
+        assert sentence in told
         assert sentence in page
     rows = (output / "steps.csv").read_text().splitlines()
     assert len(rows) == 1 + 4 * (16 + count + few)
@@ -79,10 +79,8 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path):
     assert "<title>kill</title>" in (output / "report.html").read_text()
     # a second run into the same folder is refused and changes nothing
     before = (output / "metrics.json").read_bytes()
-    again = run(
-        "attack", scenario_folder / "scenario.toml", "-o", output, cwd=tmp_path, check=2
-    )
-    assert "not an empty folder" in again.stderr
+    assert cli.main(words) == 2
+    assert "not an empty folder" in capsys.readouterr().err
     assert (output / "metrics.json").read_bytes() == before
 
 

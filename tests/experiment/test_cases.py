@@ -52,8 +52,8 @@ def test_best_random_is_the_look_of_least_objective(whole):
 def test_random_poses_are_compared_with_attacks_on_poses(folder, tmp_path, monkeypatch):
     seen = {}
 
-    def only_looks(output, world, drives, attack, looks, *more):
-        seen.update(looks)
+    def only_looks(output, done, *more):
+        seen.update(done.looks)
         return {}
 
     monkeypatch.setattr(results, "write_results", only_looks)

@@ -39,6 +39,20 @@ def test_run_killed_early_starts_from_the_beginning(folder, whole, tmp_path, lef
     assert begins == (left in ("nothing", "partial"))
 
 
+def test_numbers_come_without_pictures(folder, whole, tmp_path):
+    output = tmp_path / "run"
+    shutil.copytree(whole[0], output)
+    (output / "metrics.json").unlink()
+    late = job(folder, output)
+    late.pictures = False
+    document = late.run(resume=True)
+    assert document["verdict"] and document["textures"]
+    found = {path.name for path in output.iterdir()} - {
+        path.name for path in whole[0].iterdir()
+    }
+    assert found == {"attack.json", "objects", "steps.csv"}
+
+
 @pytest.mark.usefixtures("no_results")
 def test_folder_of_something_else_is_left_alone(folder, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")

@@ -17,6 +17,7 @@ def run_scenario(
     object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
     anyway: bool = False,
+    pictures: bool = True,
 ) -> int:
     """Run a scenario with a progress bar on stderr, and print its table.
 
@@ -29,13 +30,14 @@ def run_scenario(
             object; None leaves them.
         force: resume although something has changed.
         anyway: attack although it would prove nothing.
+        pictures: write frames, plots, attribution and page, too.
     """
     started = time.perf_counter()
     from mi_nerfattack.experiment.claim import claimed
 
     with claimed(output, resume):
         how = {"resume": resume, "force": force, "anyway": anyway}
-        document = _run(path, output, object_field(), started, **how)
+        document = _run(path, output, object_field(), started, pictures, **how)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
@@ -47,7 +49,7 @@ def run_scenario(
     for sentence in [*document["verdict"], *document["flags"]]:
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
-    _print_files(console, output, document)
+    _print_files(console, output, document, pictures)
     return 0
 
 
@@ -56,6 +58,7 @@ def _run(
     output: Path,
     object_field: Path | None,
     started: float,
+    pictures: bool,
     **how: bool,
 ) -> dict[str, Any]:
     """Run a scenario in a folder that is claimed, as `Job.run_claimed` is told."""
@@ -74,24 +77,29 @@ def _run(
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        job = Job(scenario, text, policy, output, show, bars.say, started)
+        job = Job(scenario, text, policy, output, show, bars.say, started, pictures)
         return job.run_claimed(**how)
 
 
-def _print_files(console: Any, output: Path, document: dict[str, Any]) -> None:
+def _print_files(
+    console: Any, output: Path, document: dict[str, Any], pictures: bool
+) -> None:
     cost = document["cost"]
     console.print(
         f"{cost['wall_s']:.0f} s by the clock, {cost['renders']} frames, "
         f"{cost['peak_memory_mb']:.0f} MB at most"
     )
     console.print(f"Run folder: {output.resolve()}", soft_wrap=True)
-    for name, meaning in (
-        ("report.html", "everything on one page"),
-        ("overhead.png", "all drives from above"),
-        ("strip.png", "what the policy sees"),
-        ("attribution*.png", "when and where the failure is made"),
-        ("metrics.json, *.csv", "the numbers"),
-        ("objects/", "the fields, as the attack leaves them"),
-        ("frames/", "EXR frames with layers"),
-    ):
+    shown = {
+        "report.html": "everything on one page",
+        "overhead.png": "all drives from above",
+        "strip.png": "what the policy sees",
+        "attribution*.png": "when and where the failure is made",
+        "frames/": "EXR frames with layers",
+    }
+    numbers = {
+        "metrics.json, *.csv": "the numbers",
+        "objects/": "the fields, as the attack leaves them",
+    }
+    for name, meaning in ({**shown, **numbers} if pictures else numbers).items():
         console.print(f"  {name:24s} {meaning}")
