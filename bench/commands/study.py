@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from bench.study import rows
 
 
 @dataclass(frozen=True)
@@ -18,19 +22,46 @@ class BenchStudy:
     disturbances of the optimisation do for the transfer. `textures`: the price of
     smooth and coarse textures, and half the iterations. `distribution`: 24 places, two
     sizes. Each takes hours on two cores; stopped, the same command continues from
-    OUTPUT.
+    OUTPUT. Ends with the table in Markdown, of the rows there are with --table.
     """
 
     study: tyro.conf.Positional[Literal["steps", "robust", "textures", "distribution"]]
     """Which."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Table to write, row by row (.jsonl)."""
+    """Table to write, row by row (.jsonl). The picture of `distribution` is written
+    beside it (.png)."""
+    table: bool = False
+    """Add no row."""
 
     def run(self) -> int:
         """Make the rows that are missing."""
-        import torch
+        from rich.console import Console
 
         from bench.study import distribution, robust, rows, steps, textures
+        from mi_nerfattack.errors import InputError
+
+        studies = {
+            "steps": steps,
+            "robust": robust,
+            "textures": textures,
+            "distribution": distribution,
+        }
+        study = studies[self.study]
+        if self.table:
+            found = rows.read(self.output)
+            if not found:
+                raise InputError(f"{self.output}: no rows; leave out --table")
+        else:
+            found = self._fill(study.keys(), study.attack_row)
+        Console(width=400).print(study.table(found))
+        if self.study == "distribution":
+            distribution.draw(self.output.with_suffix(".png"), found)
+        return 0
+
+    def _fill(self, keys: list[rows.Row], work: Callable[[rows.Key], rows.Row]) -> Any:
+        import torch
+
+        from bench.study import rows
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
@@ -41,13 +72,4 @@ class BenchStudy:
         def on_row(done: int, count: int, key: str) -> None:
             print(f"{done}/{count}: {key}", file=sys.stderr, flush=True)
 
-        studies = {
-            "steps": steps,
-            "robust": robust,
-            "textures": textures,
-            "distribution": distribution,
-        }
-        study = studies[self.study]
-        found = rows.fill(self.output, study.keys(), study.attack_row, on_row)
-        print(f"{len(found)} rows in {self.output}", file=sys.stderr)
-        return 0
+        return rows.fill(self.output, keys, work, on_row)

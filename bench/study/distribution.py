@@ -11,15 +11,30 @@ has a wheel out for a second on average over the drives of the case.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import rich.table
 
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
+from bench.study.tables import markdown, mean_m
+from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 SEEDS = tuple(range(1, 9))
 HEIGHTS_M = (NATURAL_M, 2 * NATURAL_M)
 #: Training's distances from the lane centre, and all of a route but its ends, metres.
 LATERAL_M, ARC_M = (2.0, 5.0), (8.0, 36.0)
 SUCCESS_S = 1.0
+ENVIRONMENTS = (SURROGATE, "deployment")
+_STYLES: dict[str, dict[str, Any]] = {
+    "own": {"color": GREY, "marker": ".", "linestyle": ""},
+    "random": {"color": BLUE, "marker": "_", "linestyle": ""},
+    "best_random": {"color": BLUE, "marker": "^", "markersize": 4, "linestyle": ""},
+    "attack": {"color": ORANGE, "marker": "o", "markersize": 4, "linestyle": ""},
+}
 KEYS = """
 [drive]
 runs = 4
@@ -47,3 +62,48 @@ def attack_row(key: rows.Key) -> rows.Row:
     """Attack at one place."""
     place = Place(key["route"], LATERAL_M, ARC_M, key["seed"])
     return jobs.run(lambda folder: place.write(key["height_m"], KEYS, folder))
+
+
+def table(found: Sequence[rows.Row]) -> rich.table.Table:
+    """List all places: mean errors, ratios to random textures, what the checks said."""
+    header = ["route", "seed", "height, m", "own, m", "random, m", "attack, m"]
+    header += ["to random", "wheel out, s", "deployment: attack, m", "to random"]
+    header += ["wheel out, s", "flags"]
+    lines = []
+    for row in sorted(found, key=lambda r: (r["height_m"], r["route"], r["seed"])):
+        line = [row["route"], str(row["seed"]), f"{row['height_m']:.2f}"]
+        line += [mean_m(row, SURROGATE, case) for case in ("own", "random")]
+        for name in ENVIRONMENTS:
+            figures = row["environments"][name]
+            line += [mean_m(row, name), mean_m(row, name) / mean_m(row, name, "random")]
+            line += [figures["attack"]["wheel_out_s"]]
+        lines.append([*line, str(len(row["flags"]))])
+    return markdown(header, lines)
+
+
+def draw(path: Path, found: Sequence[rows.Row]) -> None:
+    """Draw the distribution of the mean error: each place a point, sorted.
+
+    Args:
+        path: PNG file.
+        found: all rows.
+    """
+    with chart(path, 6.0) as figure:
+        grid = figure.subplots(len(ENVIRONMENTS), len(HEIGHTS_M), sharey=True)
+        for (i, name), (j, height) in itertools.product(
+            enumerate(ENVIRONMENTS), enumerate(HEIGHTS_M)
+        ):
+            some = [row for row in found if row["height_m"] == height]
+            some.sort(key=lambda row: mean_m(row, name))
+            for case, style in _STYLES.items():
+                means = [mean_m(row, name, case) for row in some]
+                grid[i, j].plot(range(1, len(some) + 1), means, label=case, **style)
+            grid[i, j].set_title(f"{name}, {height:.2f} m tall", loc="left", fontsize=9)
+            grid[i, j].set_yscale("log")
+            grid[i, j].grid(alpha=0.25)
+        for axis in grid[:, 0]:
+            axis.set_ylabel("mean distance from the lane centre (m)")
+        for axis in grid[-1]:
+            axis.set_xlabel("places, by the error of the attack")
+        handles = grid[0, 0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=len(_STYLES))

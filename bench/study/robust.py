@@ -11,11 +11,15 @@ over that in the surrogate; the error itself stands beside it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+import rich.table
 
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
 from bench.study.steps import ARC_M, LATERAL_M
+from bench.study.tables import geometric_mean, markdown, mean_m
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 DRIVES, SEEDS = 48, (0, 1)
 POSES = 4
@@ -71,3 +75,27 @@ def scenario_keys(row: str) -> str:
     tables = ["[drive]", "horizon = 50", "", "[attack]", *attack, "", "[baseline]"]
     tables += ["textures = 4", "deployment_textures = 4", ""]
     return "\n".join(["", *tables, *deployments])
+
+
+def table(found: Sequence[rows.Row]) -> rich.table.Table:
+    """Compare parts: geometric means over places and seeds, error and transfer."""
+    cells: dict[str, list[rows.Row]] = {name: [] for name in ROWS}
+    for row in found:
+        cells[row["parts"]].append(row)
+    lines = []
+    for parts, some in cells.items():
+        if not some:
+            continue
+        here = [mean_m(row, SURROGATE) for row in some]
+        line = [parts, str(len(some)), geometric_mean(here)]
+        for name in DEPLOYMENTS:
+            there = geometric_mean(mean_m(row, name) for row in some)
+            line += [f"{there:.3f} ({there / geometric_mean(here):.2f})"]
+        lines.append(line)
+    header = [
+        "parts",
+        "attacks",
+        "surrogate, m",
+        *(f"{n}, m (transfer)" for n in DEPLOYMENTS),
+    ]
+    return markdown(header, lines)

@@ -11,16 +11,18 @@ from __future__ import annotations
 import itertools
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rich.table
 
 from bench.study import rows
 from bench.study.places import NATURAL_M, ROUTES, Place
+from bench.study.tables import geometric_mean, markdown
 from mi_nerfattack.attack.colours import AbstractColouring, Colours
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
@@ -176,3 +178,44 @@ def do(attack: GradientAttack) -> rows.Row:
         "texture": asdict(texture_statistics(field, original, weights)),
         "iteration_s": seconds,
     }
+
+
+def table(found: Sequence[rows.Row]) -> rich.table.Table:
+    """Compare variants and rates.
+
+    Columns: mean errors by place, their geometric mean, by how much it is that of raw
+    values at each of two rates, the iterations after which each place had their error
+    (the most of the six), saturated share, total variation.
+    """
+    cells = {(r["variant"], r["rate"]): [] for r in found}
+    for row in found:
+        cells[row["variant"], row["rate"]].append(row)
+    peers = [cells.get(("raw", rate), []) for rate in VARIANTS["raw"].rates[:2]]
+    places = [f"{route}, {distance}" for route in ROUTES for distance in LATERAL_M]
+    header = ["variant", "rate", *places, "geometric mean", "to raw 0.3", "to raw 0.05"]
+    header += ["iterations to raw 0.3", "to raw 0.05", "saturated", "variation"]
+    lines = []
+    for (variant, rate), some in cells.items():
+        if len(some) < len(places):
+            continue
+        means = [row["best_mean_m"] for row in some]
+        mean = geometric_mean(means)
+        ratios = [mean / geometric_mean(r["best_mean_m"] for r in p) for p in peers]
+        most = [_iterations(some, peer) for peer in peers]
+        of_texture = [
+            float(np.mean([row["texture"][key] for row in some]))
+            for key in ("saturated_share", "total_variation")
+        ]
+        lines.append([variant, f"{rate}", *means, mean, *ratios, *most, *of_texture])
+    return markdown(header, lines)
+
+
+def _iterations(some: Sequence[rows.Row], peer: Sequence[rows.Row]) -> str:
+    """Say after how many iterations the last of six attacks had its peer's error."""
+    most = 0
+    for row, other in zip(some, peer, strict=True):
+        reached = np.array(row["mean_m"]) >= other["best_mean_m"]
+        if not reached.any():
+            return "never"
+        most = max(most, int(reached.argmax()))
+    return str(most)

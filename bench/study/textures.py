@@ -14,11 +14,18 @@ the default attack, four unseen starts, the path-traced scene. Rows, by what is 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rich.table
 
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
 from bench.study.steps import ARC_M, ITERATIONS, KEYS, LATERAL_M
+from bench.study.tables import geometric_mean, markdown, mean_m
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+DEPLOYMENT = "deployment"
 
 ROWS: Mapping[str, str] = {
     "default": "",
@@ -48,3 +55,25 @@ def attack_row(key: rows.Key) -> rows.Row:
 def scenario_keys(row: str) -> str:
     """Return the tables of a row's scenario, as TOML."""
     return f"{KEYS}max_iterations = {ITERATIONS}\n{ROWS[row]}\n{_REST}"
+
+
+def table(found: Sequence[rows.Row]) -> rich.table.Table:
+    """Compare what was changed: geometric means of errors, means of textures."""
+    cells: dict[str, list[rows.Row]] = {name: [] for name in ROWS}
+    for row in found:
+        cells[row["kind"]].append(row)
+    header = ["changed", "attacks", "surrogate, m", "deployment, m", "transfer"]
+    header += ["saturated", "variation", "spectrum: 1, 2, 4, ... voxels"]
+    lines = []
+    for kind, some in cells.items():
+        if not some:
+            continue
+        here = geometric_mean(mean_m(row, SURROGATE) for row in some)
+        there = geometric_mean(mean_m(row, DEPLOYMENT) for row in some)
+        saturated = np.mean([row["saturated_share"] for row in some])
+        variation = np.mean([row["total_variation"] for row in some])
+        spectra = [row["textures"]["hydrant"]["spectrum"] for row in some]
+        spectrum = ", ".join(f"{share:.2f}" for share in np.mean(spectra, axis=0))
+        line = [kind, str(len(some)), here, there, there / here]
+        lines.append([*line, float(saturated), float(variation), spectrum])
+    return markdown(header, lines)

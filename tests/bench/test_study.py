@@ -71,3 +71,59 @@ def test_every_row_of_every_study_is_a_scenario(tmp_path):
     for row in textures.ROWS:
         load_scenario(place.write(1.5, textures.scenario_keys(row), tmp_path))
     load_scenario(place.write(1.5, distribution.KEYS, tmp_path))
+
+
+def cells(table):
+    """Return the rows of a table, texts by column."""
+    names = [str(column.header) for column in table.columns]
+    lines = zip(*(column.cells for column in table.columns), strict=True)
+    return [dict(zip(names, line, strict=True)) for line in lines]
+
+
+def made_row(attack, random, **more):
+    case = {"wheel_out_s": 0.5}
+    cases = {
+        "attack": {"cross_track_mean_m": attack, **case},
+        **{name: {"cross_track_mean_m": random} for name in ("own", "random")},
+        "best_random": {"cross_track_mean_m": 2 * random},
+    }
+    names = ("surrogate", "deployment", *robust.DEPLOYMENTS)
+    figures = {"flags": [], "saturated_share": 0.5, "total_variation": 0.1}
+    figures["textures"] = {"hydrant": {"spectrum": [0.75, 0.25]}}
+    return {**more, **figures, "environments": dict.fromkeys(names, cases)}
+
+
+def test_steps_are_compared_at_equal_frames():
+    found = [
+        {
+            **key,
+            "best_mean_m": 0.2 if key["variant"] == "raw" else 0.6,
+            "mean_m": [0.1, 0.2, 0.3],
+            "texture": {"saturated_share": 0.5, "total_variation": 0.1},
+        }
+        for key in steps.keys()
+    ]
+    lines = {
+        (line["variant"], line["rate"]): line for line in cells(steps.table(found))
+    }
+    assert len(lines) == 12
+    other = lines["smoothed", "0.1"]
+    assert (other["geometric mean"], other["to raw 0.3"]) == ("0.600", "3.000")
+    assert other["iterations to raw 0.3"] == "1"
+    cut = cells(steps.table(found[:-1]))
+    assert len(cut) == 11  # no mean of five places beside means of six
+
+
+def test_errors_and_transfer_are_averaged_as_ratios(tmp_path):
+    both = [made_row(0.1, 0.05, kind="default"), made_row(0.4, 0.1, kind="default")]
+    [line] = cells(textures.table(both))
+    assert (line["surrogate, m"], line["transfer"]) == ("0.200", "1.000")
+    assert line["spectrum: 1, 2, 4, ... voxels"] == "0.75, 0.25"
+    [line] = cells(robust.table([{**row, "parts": "all"} for row in both]))
+    assert (line["attacks"], line["noisy, m (transfer)"]) == ("2", "0.200 (1.00)")
+    places = [{**row, **key} for row in both for key in distribution.keys()[:24]]
+    listed = cells(distribution.table(places))
+    assert len(listed) == 48
+    assert {line["to random"] for line in listed} == {"2.000", "4.000"}
+    distribution.draw(tmp_path / "places.png", places)
+    assert (tmp_path / "places.png").stat().st_size > 10000
