@@ -20,30 +20,33 @@ class BenchStudy:
 
     `steps`: parametrisations of colour and learning rates at six places. `robust`: what
     disturbances of the optimisation do for the transfer. `textures`: the price of
-    smooth and coarse textures, and half the iterations. `distribution`: 24 places, two
-    sizes. Each takes hours on two cores; stopped, the same command continues from
-    OUTPUT. Ends with the table in Markdown, of the rows there are with --table.
+    smooth and coarse textures. `distribution`: 24 places, two sizes. Each of these
+    takes hours on two cores, `seeds`, the demo three times, minutes. Stopped, the same
+    command continues from OUTPUT. Ends with the table in Markdown.
     """
 
-    study: tyro.conf.Positional[Literal["steps", "robust", "textures", "distribution"]]
+    study: tyro.conf.Positional[
+        Literal["steps", "robust", "textures", "seeds", "distribution"]
+    ]
     """Which."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Table to write, row by row (.jsonl). The picture of `distribution` is written
     beside it (.png)."""
     table: bool = False
-    """Add no row."""
+    """Add no row; print what there is."""
 
     def run(self) -> int:
         """Make the rows that are missing."""
         from rich.console import Console
 
-        from bench.study import distribution, robust, rows, steps, textures
+        from bench.study import distribution, robust, rows, seeds, steps, textures
         from mi_nerfattack.errors import InputError
 
         studies = {
             "steps": steps,
             "robust": robust,
             "textures": textures,
+            "seeds": seeds,
             "distribution": distribution,
         }
         study = studies[self.study]

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from bench.study import distribution, robust, rows, steps, textures
+from bench.study import distribution, robust, rows, seeds, steps, textures
 from bench.study.places import NATURAL_M, ROUTES, Place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -57,7 +57,7 @@ def test_places_are_drawn_once_and_for_all_sizes(tmp_path):
 
 
 def test_every_row_of_every_study_is_a_scenario(tmp_path):
-    for study in (steps, robust, textures, distribution):
+    for study in (steps, robust, textures, seeds, distribution):
         keys = [json.dumps(key) for key in study.keys()]
         assert len(set(keys)) == len(keys)
     assert len(steps.keys()) == 72
@@ -70,6 +70,7 @@ def test_every_row_of_every_study_is_a_scenario(tmp_path):
         assert frames == robust.DRIVES
     for row in textures.ROWS:
         load_scenario(place.write(1.5, textures.scenario_keys(row), tmp_path))
+    assert load_scenario(seeds.write(tmp_path, 2))[0].seed == 2
     load_scenario(place.write(1.5, distribution.KEYS, tmp_path))
 
 
@@ -81,7 +82,7 @@ def cells(table):
 
 
 def made_row(attack, random, **more):
-    case = {"wheel_out_s": 0.5}
+    case = {"wheel_out_s": 0.5, "drives_departed": 1, "n": 4}
     cases = {
         "attack": {"cross_track_mean_m": attack, **case},
         **{name: {"cross_track_mean_m": random} for name in ("own", "random")},
@@ -121,6 +122,8 @@ def test_errors_and_transfer_are_averaged_as_ratios(tmp_path):
     assert line["spectrum: 1, 2, 4, ... voxels"] == "0.75, 0.25"
     [line] = cells(robust.table([{**row, "parts": "all"} for row in both]))
     assert (line["attacks"], line["noisy, m (transfer)"]) == ("2", "0.200 (1.00)")
+    [line] = cells(seeds.table([{**both[0], "seed": 1}]))
+    assert (line["to random"], line["to best random"]) == ("2.000", "1.000")
     places = [{**row, **key} for row in both for key in distribution.keys()[:24]]
     listed = cells(distribution.table(places))
     assert len(listed) == 48
