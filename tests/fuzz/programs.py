@@ -22,53 +22,54 @@ from fuzz.mutations import (
 def onnx_files(folder: Path) -> list[tuple[Path, Any]]:
     """Two networks, evaluated on an image and a goal."""
     import torch
-    from onnx import helper, numpy_helper
 
     from mi_nerfattack.policy.onnx.network import load_onnx
 
+    made = {"layers": _onnx_layers(), "shapes": _onnx_shapes()}
+    for name, value in made.items():
+        (folder / f"{name}.onnx").write_bytes(value.SerializeToString())
+    torch.set_num_threads(1)
+    image, goal = torch.rand(2, 3, 8, 10), torch.eye(2)
+
+    def read(path: Path) -> None:
+        with torch.no_grad():
+            load_onnx(path)(image, goal)
+
+    return [(folder / f"{name}.onnx", read) for name in made]
+
+
+def _onnx_layers() -> Any:
     rng = np.random.default_rng(0)
-
-    def node(name: str, inputs: str, outputs: str, **attributes: Any) -> Any:
-        return helper.make_node(name, inputs.split(), outputs.split(), **attributes)
-
-    layers = [
-        node("Conv", "image w0 b0", "a", strides=[2, 2], pads=[1, 1, 1, 1]),
-        node("BatchNormalization", "a s s b0 s", "b"),
-        node("MaxPool", "b", "c", kernel_shape=[2, 2]),
-        node("Flatten", "c", "e"),
-        node("Concat", "e goal", "f", axis=1),
-        node("Gemm", "f w1", "control", transB=0),
+    nodes = [
+        _node("Conv", "image w0 b0", "a", strides=[2, 2], pads=[1, 1, 1, 1]),
+        _node("BatchNormalization", "a s s b0 s", "b"),
+        _node("MaxPool", "b", "c", kernel_shape=[2, 2]),
+        _node("Flatten", "c", "e"),
+        _node("Concat", "e goal", "f", axis=1),
+        _node("Gemm", "f w1", "control", transB=0),
     ]
-    shapes = [
-        node("Resize", "image none scales", "a", mode="linear"),
-        node("Shape", "a", "b"),
-        node("Slice", "b start end", "c"),
-        node("Reshape", "a back", "d"),
-        node("ConstantOfShape", "c", "zero"),
-        node("Pad", "d pads", "e"),
-        node("Split", "e", "f g", axis=1),
-        node("ReduceMean", "f", "control", axes=[1], keepdims=1),
-        node("Expand", "control wide", "other"),
-        node("LSTM", "seq wx wh", "y h", hidden_size=2),
-    ]
-
-    def model(nodes: list[Any], constants: dict[str, np.ndarray]) -> Any:
-        sizes = {"image": ["n", 3, 8, 10], "goal": ["n", 2], "control": ["n", 1]}
-        *inputs, output = [
-            helper.make_tensor_value_info(name, 1, shape)
-            for name, shape in sizes.items()
-        ]
-        kept = [numpy_helper.from_array(v, n) for n, v in constants.items()]
-        graph = helper.make_graph(nodes, "test", inputs, [output], kept)
-        opset = helper.make_opsetid("", 17)
-        return helper.make_model(graph, opset_imports=[opset], ir_version=8)
-
     weights = {
         "w0": rng.normal(0, 0.2, (4, 3, 3, 3)).astype("f4"),
         "b0": np.zeros(4, "f4"),
         "s": np.ones(4, "f4"),
         "w1": rng.normal(0, 0.2, (50, 1)).astype("f4"),
     }
+    return _model(nodes, weights)
+
+
+def _onnx_shapes() -> Any:
+    nodes = [
+        _node("Resize", "image none scales", "a", mode="linear"),
+        _node("Shape", "a", "b"),
+        _node("Slice", "b start end", "c"),
+        _node("Reshape", "a back", "d"),
+        _node("ConstantOfShape", "c", "zero"),
+        _node("Pad", "d pads", "e"),
+        _node("Split", "e", "f g", axis=1),
+        _node("ReduceMean", "f", "control", axes=[1], keepdims=1),
+        _node("Expand", "control wide", "other"),
+        _node("LSTM", "seq wx wh", "y h", hidden_size=2),
+    ]
     constants = {
         "none": np.zeros(0, "f4"),
         "scales": np.float32([1, 1, 2, 2]),
@@ -81,20 +82,26 @@ def onnx_files(folder: Path) -> list[tuple[Path, Any]]:
         "wx": np.ones((1, 8, 2), "f4"),
         "wh": np.ones((1, 8, 2), "f4"),
     }
-    made = {
-        "layers": model(layers, weights),
-        "shapes": model(shapes, constants),
-    }
-    for name, value in made.items():
-        (folder / f"{name}.onnx").write_bytes(value.SerializeToString())
-    torch.set_num_threads(1)
-    image, goal = torch.rand(2, 3, 8, 10), torch.eye(2)
+    return _model(nodes, constants)
 
-    def read(path: Path) -> None:
-        with torch.no_grad():
-            load_onnx(path)(image, goal)
 
-    return [(folder / f"{name}.onnx", read) for name in made]
+def _node(name: str, inputs: str, outputs: str, **attributes: Any) -> Any:
+    from onnx import helper
+
+    return helper.make_node(name, inputs.split(), outputs.split(), **attributes)
+
+
+def _model(nodes: list[Any], constants: dict[str, np.ndarray]) -> Any:
+    from onnx import helper, numpy_helper
+
+    sizes = {"image": ["n", 3, 8, 10], "goal": ["n", 2], "control": ["n", 1]}
+    *inputs, output = [
+        helper.make_tensor_value_info(name, 1, shape) for name, shape in sizes.items()
+    ]
+    kept = [numpy_helper.from_array(v, n) for n, v in constants.items()]
+    graph = helper.make_graph(nodes, "test", inputs, [output], kept)
+    opset = helper.make_opsetid("", 17)
+    return helper.make_model(graph, opset_imports=[opset], ir_version=8)
 
 
 def of_onnx(rng: random.Random, raw: bytes) -> bytes:
