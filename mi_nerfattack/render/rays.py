@@ -50,6 +50,21 @@ def pick_rays(value: Any, index: mi.UInt32) -> Any:
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
+def put_rays(march: March, index: mi.UInt32) -> March:
+    """Undo `pick_rays` of what was marched: entry k goes to `index[k]`.
+
+    Args:
+        march: (n,).
+        index: (n,), each number below n once.
+    """
+    result = March.zeros(dr.width(index))
+    for item in fields(March):
+        target = getattr(result, item.name)
+        dr.scatter(target, getattr(march, item.name), index)
+        setattr(result, item.name, target)
+    return result
+
+
 def meet_box(
     o: mi.Point3f, d: mi.Vector3f, lower: mi.Point3f, upper: mi.Point3f
 ) -> tuple[mi.Float, mi.Float]:

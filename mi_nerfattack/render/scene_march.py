@@ -7,25 +7,30 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.fields.cpu.ngp import PackedNGP
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.render.march import integrate, march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import March, Rays, pick_rays, put_rays
 from mi_nerfattack.render.walk import Walk
+
+_TILE = 4
 
 
 class AbstractSceneMarch(ABC):
     """A way to march rays through one field whose parameters are constants."""
 
     @abstractmethod
-    def march(self, rays: Rays) -> March:
+    def march(self, rays: Rays, width: int = 1) -> March:
         """Integrate radiance, opacity and moment; as `render.march.march`.
 
         Args:
             rays: n rays, with gains for one field or none.
+            width: pixels in a row, where rays come row by row; their order changes
+                nothing but the time.
 
         Returns:
             the march, (n,), evaluated.
@@ -58,8 +63,9 @@ class FieldMarch(AbstractSceneMarch):
         self.posed, self.stop = posed, stop
         self._frozen = freeze_method(self._record, self._state)
 
-    def march(self, rays: Rays) -> March:
+    def march(self, rays: Rays, width: int = 1) -> March:
         """See :meth:`AbstractSceneMarch.march`."""
+        del width
         return self._frozen(_opaque(rays))
 
     def _record(self, rays: Rays) -> March:
@@ -74,7 +80,7 @@ class PackedMarch(AbstractSceneMarch):
     """An NGP on a CPU, from a copy of its parameters that is faster to read.
 
     Same positions, occupancy and termination as `render.march.march`, and the same
-    result but for rounding, in about 0.7 of the time. Where the transmittance equals
+    result but for rounding, in about half of the time. Where the transmittance equals
     `stop` to the last digits, a ray may take one sample more or fewer: one in 300,000
     did, and `stop` bounds the difference. Costs a copy of the table.
 
@@ -88,23 +94,28 @@ class PackedMarch(AbstractSceneMarch):
         self.posed, self.stop = posed, stop
         self._field = posed.field
         self._packed = PackedNGP(posed.field)
+        self._orders: dict[tuple[int, int], mi.UInt32] = {}
         self._frozen = freeze_method(self._record, self._state)
 
-    def march(self, rays: Rays) -> March:
+    def march(self, rays: Rays, width: int = 1) -> March:
         """See :meth:`AbstractSceneMarch.march`."""
         if not self._packed.is_current():
             self._packed = PackedNGP(self._field)
-        return self._frozen(_opaque(rays))
+        key = dr.width(rays), width
+        if key not in self._orders:
+            self._orders[key] = tile_order(*key)
+        return self._frozen(_opaque(rays), self._orders[key])
 
-    def _record(self, rays: Rays) -> March:
+    def _record(self, rays: Rays, order: mi.UInt32) -> March:
         with dr.suspend_grad():
+            rays = pick_rays(rays, order)
             view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
             walk, active = Walk.start(self.posed, rays)
             posed, looks = [self.posed], ([self._evaluate], [view])
             result = integrate(posed, walk, active, *looks, self.stop).march()
             for (gain,) in [rays.gains] if rays.gains else []:
                 result.radiance *= gain
-        return result
+        return put_rays(result, order)
 
     def _evaluate(
         self, point: mi.Point3f, view: Any, active: mi.Bool
@@ -112,9 +123,26 @@ class PackedMarch(AbstractSceneMarch):
         density, colour = self._packed.eval(point, view, active)
         return self.posed.in_world(density), colour
 
-    def _state(self, rays: Rays) -> list[Any]:
+    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
+        del order
         sizes = [dr.width(rays.direction), self._field.layout]
         return [self, self.stop, sizes, self._packed.arrays(), self.posed.state()]
+
+
+def tile_order(count: int, width: int) -> mi.UInt32:
+    """Return the indices of pixels tile by tile, (n,): 4 x 4 are a vector's lanes.
+
+    Rays side by side end together, and no lane waits for others.
+
+    Args:
+        count: of pixels, n.
+        width: pixels in a row.
+    """
+    row, column = np.divmod(np.arange(count), width)
+    order = np.lexsort((column, row, column // _TILE, row // _TILE))
+    result = mi.UInt32(order.astype(np.uint32).tolist())
+    dr.make_opaque(result)
+    return result
 
 
 def _opaque(rays: Rays) -> Rays:

@@ -118,7 +118,7 @@ class FieldSensor(AbstractDifferentiableSensor):
             found = self._frozen_render(_pose(state), key, ends, count)
             return self._observation(count, ends, *found)
         rays = self._frozen_make_rays(_pose(state), key, ends, count)
-        scene = self._ahead.march(rays)
+        scene = self._ahead.march(rays, self.camera.width)
         return self.restore(state, step, scene if ends is None else (scene, ends))
 
     def keep(self, observation: Observation) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,7 +24,12 @@ from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import STOP, march
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
-from mi_nerfattack.render.scene_march import FieldMarch, PackedMarch, scene_march
+from mi_nerfattack.render.scene_march import (
+    FieldMarch,
+    PackedMarch,
+    scene_march,
+    tile_order,
+)
 from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -152,6 +159,39 @@ def test_parameters_may_lose_half_precision(rng):
         np.testing.assert_allclose(*pair, atol=2e-5)
 
 
+def test_weights_are_followed(rng):
+    field = small_ngp()
+    posed, rays = PosedField(field), random_rays(rng)
+    scene = PackedMarch(posed, STOP)
+    weights = field.parameters()["colour_weights"].numpy().astype(np.float32).copy()
+    seen = []
+    for factor in (1.0, -2.0, 1.0):
+        value = mi.Float(np.float32(factor) * weights)
+        field.set_parameter("colour_weights", value)
+        seen.append(np.array(scene.march(rays).radiance))
+        expected = np.array(march(posed, rays).radiance)
+        np.testing.assert_allclose(seen[-1], expected, atol=2e-5)
+    np.testing.assert_array_equal(seen[0], seen[2])
+    assert np.abs(seen[0] - seen[1]).max() > 0.01
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 4), (10, 7), (3, 5), (1, 6)])
+def test_tiles_hold_neighbours(width, height):
+    order = tile_order(width * height, width).numpy()
+    assert sorted(order) == list(range(width * height))
+    row, column = np.divmod(order[:16], width)
+    if min(width, height) >= 4:
+        assert row.max() == column.max() == 3
+
+
+def test_the_order_of_rays_changes_nothing(rng):
+    scene, rays = PackedMarch(PosedField(small_ngp()), STOP), random_rays(rng)
+    one, other = scene.march(rays), scene.march(rays, width=30)
+    for name in ("radiance", "opacity", "moment"):
+        first, second = (np.array(getattr(found, name)) for found in (one, other))
+        np.testing.assert_array_equal(first, second)
+
+
 def test_nothing_is_compiled_for_other_rays():
     posed = PosedField(load_field(bundled("intersection/field.safetensors")))
     scene = PackedMarch(posed, STOP)
@@ -173,6 +213,7 @@ def test_memory_does_not_grow_with_the_samples(rng):
         field.density_scale = 1e-3
         scene = PackedMarch(PosedField(field), STOP)
         scene.march(rays)
+        gc.collect()  # the scene before is in a cycle
         dr.sync_thread()
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()

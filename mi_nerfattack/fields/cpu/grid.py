@@ -48,7 +48,8 @@ class PackedGrid:
         """
         result: list[mi.Float] = []
         for level in self._levels:
-            result += _interpolate(level, self.table, self._words, unit, active)
+            index, weights = level.corners(unit, self.table.scale)
+            result += _mix(self.table, self._words, index, weights, active)
         return result
 
 
@@ -84,24 +85,6 @@ class _Level:
             return [x[i] + (y[j] + z[k]) + self.offset for i, j, k in _CORNERS]
         mask = self.size - 1
         return [((x[i] ^ (y[j] ^ z[k])) & mask) + self.offset for i, j, k in _CORNERS]
-
-
-@dr.syntax
-def _interpolate(
-    level: _Level,
-    table: AbstractWords,
-    words: int,
-    unit: mi.Point3f,
-    active: mi.Bool,
-) -> list[mi.Float]:
-    """Interpolate one level; the loop of one turn keeps its code together."""
-    result = [mi.Float(0) for _ in range(2 * words)]
-    active = mi.Bool(active)
-    while active:
-        index, weights = level.corners(unit, table.scale)
-        result = _mix(table, words, index, weights, active)
-        active = mi.Bool(False)
-    return result
 
 
 def _mix(
