@@ -51,7 +51,7 @@ class BenchStudy:
         }
         study = studies[self.study]
         if self.table:
-            found = rows.read(self.output)
+            found = rows.pick(rows.read(self.output), study.keys())
             if not found:
                 raise InputError(f"{self.output}: no rows; leave out --table")
         else:

@@ -78,7 +78,18 @@ def table(found: Sequence[rows.Row]) -> rich.table.Table:
             line += [mean_m(row, name), mean_m(row, name) / mean_m(row, name, "random")]
             line += [figures["attack"]["wheel_out_s"]]
         lines.append([*line, str(len(row["flags"]))])
-    return markdown(header, lines)
+    table = markdown(header, lines)
+    parts = []
+    for height, name in itertools.product(HEIGHTS_M, ENVIRONMENTS):
+        out = [
+            row["environments"][name]["attack"]["wheel_out_s"]
+            for row in found
+            if row["height_m"] == height
+        ]
+        count = sum(seconds >= SUCCESS_S for seconds in out)
+        parts.append(f"{height:.2f} m, {name}: {count} of {len(out)}")
+    table.caption = f"places where the attack succeeds: {'; '.join(parts)}"
+    return table
 
 
 def draw(path: Path, found: Sequence[rows.Row]) -> None:

@@ -58,8 +58,13 @@ def fill(
             with path.open("a", encoding="utf-8") as table:
                 table.write(json.dumps(row, allow_nan=False) + "\n")
             found.append(row)
-    rows = [_find(found, key) for key in wanted]
-    return [row for row in rows if row is not None]
+    return pick(found, wanted)
+
+
+def pick(rows: list[Row], keys: Iterable[Key]) -> list[Row]:
+    """Return the rows of keys, in their order; not those that there are none of."""
+    found = [_find(rows, key) for key in keys]
+    return [row for row in found if row is not None]
 
 
 def _find(rows: list[Row], key: Key) -> Row | None:

@@ -191,6 +191,7 @@ def table(found: Sequence[rows.Row]) -> rich.table.Table:
     for row in found:
         cells[row["variant"], row["rate"]].append(row)
     peers = [cells.get(("raw", rate), []) for rate in VARIANTS["raw"].rates[:2]]
+    is_whole = [len(peer) == len(ROUTES) * len(LATERAL_M) for peer in peers]
     places = [f"{route}, {distance}" for route in ROUTES for distance in LATERAL_M]
     header = ["variant", "rate", *places, "geometric mean", "to raw 0.3", "to raw 0.05"]
     header += ["iterations to raw 0.3", "to raw 0.05", "saturated", "variation"]
@@ -200,8 +201,14 @@ def table(found: Sequence[rows.Row]) -> rich.table.Table:
             continue
         means = [row["best_mean_m"] for row in some]
         mean = geometric_mean(means)
-        ratios = [mean / geometric_mean(r["best_mean_m"] for r in p) for p in peers]
-        most = [_iterations(some, peer) for peer in peers]
+        ratios = [
+            mean / geometric_mean(r["best_mean_m"] for r in p) if whole else ""
+            for p, whole in zip(peers, is_whole, strict=True)
+        ]
+        most = [
+            _iterations(some, peer) if whole else ""
+            for peer, whole in zip(peers, is_whole, strict=True)
+        ]
         of_texture = [
             float(np.mean([row["texture"][key] for row in some]))
             for key in ("saturated_share", "total_variation")

@@ -73,7 +73,9 @@ def table(found: Sequence[rows.Row]) -> rich.table.Table:
         saturated = np.mean([row["saturated_share"] for row in some])
         variation = np.mean([row["total_variation"] for row in some])
         spectra = [row["textures"]["hydrant"]["spectrum"] for row in some]
-        spectrum = ", ".join(f"{share:.2f}" for share in np.mean(spectra, axis=0))
+        changed = [spectrum for spectrum in spectra if spectrum]
+        shares = np.mean(changed, axis=0).tolist() if changed else []
+        spectrum = ", ".join(f"{share:.2f}" for share in shares)
         line = [kind, str(len(some)), here, there, there / here]
         lines.append([*line, float(saturated), float(variation), spectrum])
     return markdown(header, lines)

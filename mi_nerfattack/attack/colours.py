@@ -22,6 +22,7 @@ from scipy.ndimage import convolve1d
 from mi_nerfattack.attack.constraints import Allowed, Constraints
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLevel
 
 _BINOMIAL = (0.25, 0.5, 0.25)
@@ -71,6 +72,9 @@ class Colours(AbstractColouring):
             the finest of all by default.
         smoothing: passes of a binomial filter over neighbouring vertices' gradients.
         constraints: what colours are allowed.
+
+    Raises:
+        InputError: no level is so coarse, or a fixed region lies beside the object.
     """
 
     def __init__(
@@ -85,7 +89,12 @@ class Colours(AbstractColouring):
             for level in field.levels()
             if resolution is None or level.resolution <= resolution
         ]
-        self.level = levels[-1] if levels else field.levels()[0]
+        if not levels:
+            raise InputError(
+                f"resolution: {resolution}; the coarsest level of the object has "
+                f"{field.levels()[0].resolution} vertices an edge"
+            )
+        self.level = levels[-1]
         self.smoothing = smoothing
         self._original = field.texture.numpy().copy()
         colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)

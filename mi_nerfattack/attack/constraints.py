@@ -1,16 +1,16 @@
 """Which colours an attacked object may have: projections, and a penalty.
 
-All are of the colours c of an object's vertices (sRGB), c0 being the original ones:
+All are of the colours c (sRGB) of the vertices that an attack steps in:
 
-- boxes: every value within `linf` of the original, within `lowest` and `highest`; none
-  changes in `fixed` regions;
-- a gamut: what a printer or monitor shows;
-- a ball: root mean square change of at most `l2`, over the vertices of occupied cells;
+- a range: every value within `lowest` and `highest`, in a gamut (what a printer or
+  monitor shows); c0 being the original colours, or the nearest to them that are so,
+- boxes: every value within `linf` of c0, none changing in `fixed` regions;
+- a ball: root mean square distance from c0 of at most `l2`, over the vertices that
+  colour occupied cells;
 - a penalty: `total_variation` times the mean absolute difference of neighbours there.
 
 All but the penalty are kept after every step: values are clipped, drawn towards the
-gamut's centre, then towards the original, which is allowed (or towards the nearest
-that is).
+gamut's centre, then towards c0.
 """
 
 from __future__ import annotations
@@ -60,11 +60,13 @@ class Constraints:
 
     def __post_init__(self) -> None:
         """Check the order of range and boxes."""
-        lowest = self.lowest or 0.0
-        highest = 1.0 if self.highest is None else self.highest
+        lowest = max(self.lowest or 0.0, MARGIN)
+        highest = min(1.0 if self.highest is None else self.highest, 1 - MARGIN)
         named = f"lowest: {self.lowest}, highest: {self.highest}"
         if lowest >= highest:
-            raise InputError(f"{named}; expected lower first")
+            raise InputError(
+                f"{named}; expected lowest < highest, {MARGIN} from 0 and 1"
+            )
         if self.gamut is not None:
             centre = self.gamut.centre
             if not lowest < centre.min() <= centre.max() < highest:
@@ -86,6 +88,9 @@ class Allowed:
         level: whose vertices' colours they are.
         original: (n, 3) sRGB, by vertex.
 
+    Raises:
+        InputError: a fixed region beside the object.
+
     Attributes:
         start: (n, 3) float32, the allowed colours nearest to the original.
     """
@@ -99,7 +104,7 @@ class Allowed:
     ) -> None:
         self.constraints, n = constraints, level.resolution
         where = _positions(field, level)
-        self._counts = _occupied(field, where)
+        self._counts = _colouring(field, level)
         self._cube = (n, n, n, 3)
         low, high = constraints.lowest, constraints.highest
         self._lower = np.minimum(original, np.float32(MARGIN))
@@ -114,8 +119,16 @@ class Allowed:
         if constraints.linf is not None:
             self._lower = np.maximum(self._lower, self.start - constraints.linf)
             self._upper = np.minimum(self._upper, self.start + constraints.linf)
+        voxel = (field.upper - field.lower) / level.scale
         for lower, upper in constraints.fixed:
-            inside = ((where >= lower) & (where <= upper)).all(axis=1)
+            # whatever is interpolated inside
+            inside = (where > lower - voxel) & (where < upper + voxel)
+            inside = inside.all(axis=1)
+            if not inside.any():
+                raise InputError(
+                    f"fixed: {lower} to {upper}; the object lies in "
+                    f"{field.lower.tolist()} to {field.upper.tolist()}"
+                )
             self._lower[inside] = self._upper[inside] = self.start[inside]
 
     def project(self, value: np.ndarray) -> np.ndarray:
@@ -129,7 +142,7 @@ class Allowed:
             return value
         change = value - self.start
         square = np.square(change[self._counts], dtype=np.float64).mean()
-        size = float(np.sqrt(square)) if self._counts.any() else 0.0
+        size = float(np.sqrt(square))
         if size <= self.constraints.l2:
             return value
         return self.start + np.float32(self.constraints.l2 / size) * change
@@ -173,9 +186,14 @@ def _positions(field: GridField, level: GridLevel) -> np.ndarray:
     return field.lower + index / level.scale * (field.upper - field.lower)
 
 
-def _occupied(field: GridField, where: np.ndarray) -> np.ndarray:
-    """Tell which points (n, 3) lie in occupied cells, (n,)."""
-    cells = field.window.cells  # by x, y, z
-    unit = (where - field.lower) / (field.upper - field.lower)
-    index = np.clip((unit * cells.shape).astype(int), 0, np.array(cells.shape) - 1)
-    return np.asarray(cells[tuple(index.T)], bool)
+def _colouring(field: GridField, level: GridLevel) -> np.ndarray:
+    """Tell which vertices have a part in the colour of an occupied cell, (n,)."""
+    found = field.window.cells.transpose()  # by z, y, x
+    index = np.arange(level.resolution)
+    for axis, count in enumerate(found.shape):
+        first = np.floor((index - 1) / level.scale * count).clip(0, count - 1)
+        last = np.ceil((index + 1) / level.scale * count).clip(1, count)
+        ranges = zip(first.astype(int), last.astype(int), strict=True)
+        parts = [found.take(range(a, b), axis).any(axis) for a, b in ranges]
+        found = np.stack(parts, axis)
+    return np.asarray(found.ravel(), bool)

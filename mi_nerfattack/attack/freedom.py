@@ -31,7 +31,7 @@ class Freedom:
         InputError: nothing is left to change, or an axis is unknown.
     """
 
-    texture_rate: float | None = 0.1
+    texture_rate: float | None = 0.3
     pose_rate: float | None = None
     axes: tuple[str, ...] = ("x", "y", "yaw")
     limit_m: float = 1.0

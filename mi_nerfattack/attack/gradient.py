@@ -148,7 +148,7 @@ class GradientAttack:
     def best(self) -> list[np.ndarray]:
         """Textures (n_vertices, 3) of the iteration with the least objective."""
         if not self._colourings:
-            return [texture.numpy() for texture in self.sensor.textures()]
+            return [texture.numpy().copy() for texture in self.sensor.textures()]
         return self._textures(self._best)
 
     @property

@@ -53,10 +53,11 @@ def surrogate_sensor(
     grids = [name for name, volume in volumes.items() if _is_grid(volume)]
     if attacked is None:
         attacked = [name for name in grids if name != "scene"]
-    for name in attacked:
-        if name not in grids:
-            allowed = ", ".join(grids)
-            raise InputError(f"attacked: no grid_field {name!r}; there are: {allowed}")
+    if unknown := [name for name in attacked if name not in grids]:
+        allowed = ", ".join(grids)
+        raise InputError(
+            f"attacked: no grid_field {unknown[0]!r}; there are: {allowed}"
+        )
     for name, volume in volumes.items():
         if volume.relit:
             raise InputError(

@@ -59,9 +59,7 @@ def put_rays(march: March, index: mi.UInt32) -> March:
     """
     result = March.zeros(dr.width(index))
     for item in fields(March):
-        target = getattr(result, item.name)
-        dr.scatter(target, getattr(march, item.name), index)
-        setattr(result, item.name, target)
+        dr.scatter(getattr(result, item.name), getattr(march, item.name), index)
     return result
 
 

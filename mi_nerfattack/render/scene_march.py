@@ -46,7 +46,7 @@ def scene_march(posed: PosedField, stop: float) -> AbstractSceneMarch:
     """
     on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
     field = posed.field
-    if on_cpu and isinstance(field, NGPField) and field.layout.features % 2 == 0:
+    if on_cpu and isinstance(field, NGPField) and PackedNGP.suits(field):
         return PackedMarch(posed, stop)
     return FieldMarch(posed, stop)
 
@@ -85,7 +85,7 @@ class PackedMarch(AbstractSceneMarch):
     did, and `stop` bounds the difference. Costs a copy of the table.
 
     Args:
-        posed: an NGP whose vertices have an even number of features.
+        posed: an NGP that `PackedNGP` suits.
         stop: transmittance below which a ray ends.
     """
 
@@ -126,7 +126,7 @@ class PackedMarch(AbstractSceneMarch):
     def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
         del order
         sizes = [dr.width(rays.direction), self._field.layout]
-        return [self, self.stop, sizes, self._packed.arrays(), self.posed.state()]
+        return [self, self.stop, sizes, self._packed.state(), self.posed.state()]
 
 
 def tile_order(count: int, width: int) -> mi.UInt32:

@@ -84,8 +84,9 @@ class AbstractTextureFreedom(Section):
             self._constraints()
         except InputError as err:
             text = str(err)
-            started = {"fixed": "fixed_m", "lowest": "lowest"}.get(text.split(":")[0])
-            refuse(started or "gamut", text)
+            of_range = "highest" if self.lowest is None else "lowest"
+            keys = {"fixed": "fixed_m", "lowest": of_range}
+            refuse(keys.get(text.split(":")[0], "gamut"), text)
         return self
 
     def _constraints(self) -> Constraints:

@@ -7,6 +7,7 @@ import pytest
 from helpers import toy_loop as toy
 
 from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -52,7 +53,7 @@ def test_gradient_is_that_of_the_texture(rng):
     from mi_nerfattack.attack.colours import Colours
 
     field = field_of(3, rng)
-    colours = Colours(field, smoothing=0)
+    colours = Colours(field)
     by_texture = rng.normal(size=(field.n_vertices, 3))
     value = rng.uniform(0.2, 0.8, colours.start.shape)
     change = 1e-4 * rng.normal(size=value.shape)
@@ -62,7 +63,8 @@ def test_gradient_is_that_of_the_texture(rng):
     assert found == pytest.approx(wanted, rel=1e-3)
     level = Colours(field, resolution=8).level
     assert level.resolution == 7
-    assert Colours(field, resolution=2).level.resolution == 4  # there is none coarser
+    with pytest.raises(InputError, match="resolution: 3; the coarsest level .* has 4"):
+        Colours(field, resolution=3)
 
 
 def test_rates_fall_when_nothing_more_is_gained_or_time_is_short():

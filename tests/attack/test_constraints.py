@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -50,25 +51,34 @@ def test_ball_bounds_the_mean_square_over_occupied_cells(field, rng):
     mine = colours(field, l2=0.05)
     found = mine.project(far_off(mine, rng))
     n = mine.level.resolution
-    change = (found - mine.start).reshape(n, n, n, 3)[:, :, 2:6]  # z, y, x
+    change = (found - mine.start).reshape(n, n, n, 3)[:, :, 2:7]  # z, y, x
     assert np.sqrt((change.astype(float) ** 2).mean()) == pytest.approx(0.05, rel=1e-4)
     near = mine.start + np.float32(0.001) * (mine.start < 0.5)
     np.testing.assert_array_equal(mine.project(near), near)
 
 
 def test_fixed_regions_stay(field, rng):
-    mine = colours(field, fixed=(((-1, -1, -1), (1, 1, 0)),))
-    found = mine.project(far_off(mine, rng))
+    mine = colours(field, fixed=(((-1, -1, -1), (1, 1, 0.1)),))
+    found = mine.project(far_off(mine, rng)).clip(0.01, 0.99)
     n = mine.level.resolution
     changed = (found != mine.start).reshape(n, n, n, 3).any(axis=(1, 2, 3))
-    assert changed.tolist() == [False] * 5 + [True] * 4  # by z
+    assert changed.tolist() == [False] * 6 + [True] * 3  # by z
+    points = mi.Point3f(rng.uniform(-1, 0.1, (3, 200)).tolist())
+    seen = []
+    for value in (mine.start, found):
+        field.set_parameter("texture", mine.texture(value))
+        looked = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))
+        seen.append(np.array(looked[1]))
+    np.testing.assert_array_equal(*seen)
+    with pytest.raises(InputError, match=r"fixed: \(3, 3, 3\) to .*the object lies in"):
+        colours(field, fixed=(((3, 3, 3), (4, 4, 4)),))
 
 
 def test_penalty_is_the_variation_and_its_gradient_that_of_it(field, rng):
     mine = colours(field, total_variation=3.0)
     value = rng.uniform(0.2, 0.8, mine.start.shape)
     n = mine.level.resolution
-    cube = value.reshape(n, n, n, 3)[:, :, 2:6]
+    cube = value.reshape(n, n, n, 3)[:, :, 2:7]
     pairs = [np.abs(np.diff(cube, axis=axis)).ravel() for axis in range(3)]
     assert mine.penalty(value) == pytest.approx(3 * np.concatenate(pairs).mean(), 0.01)
     change = 1e-4 * rng.normal(size=value.shape)
@@ -81,7 +91,10 @@ def test_penalty_is_the_variation_and_its_gradient_that_of_it(field, rng):
 def test_what_allows_nothing_is_refused():
     with pytest.raises(InputError, match="lowest: 0.6, highest: 0.5"):
         Constraints(lowest=0.6, highest=0.5)
+    for bounds in ({"lowest": 0.995}, {"highest": 0.005}):
+        with pytest.raises(InputError, match=r"0\.01 from 0 and 1"):
+            Constraints(**bounds)
     with pytest.raises(InputError, match="fixed: "):
         Constraints(fixed=(((0, 0, 0), (1, 0, 1)),))
-    with pytest.raises(InputError, match="constraints.linf|linf"):
+    with pytest.raises(InputError, match=r"constraints\.linf: -0\.1; must be"):
         Constraints(linf=-0.1)

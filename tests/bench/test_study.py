@@ -113,9 +113,15 @@ def test_steps_are_compared_at_equal_frames():
     assert other["iterations to raw 0.3"] == "1"
     cut = cells(steps.table(found[:-1]))
     assert len(cut) == 11  # no mean of five places beside means of six
+    begun = {line["to raw 0.3"] for line in cells(steps.table(found[:25]))}
+    assert begun == {""}
 
 
 def test_errors_and_transfer_are_averaged_as_ratios(tmp_path):
+    same = made_row(0.1, 0.05, kind="level 16")
+    same["textures"] = {"hydrant": {"spectrum": []}}
+    [line] = cells(textures.table([same]))
+    assert line["spectrum: 1, 2, 4, ... voxels"] == ""
     both = [made_row(0.1, 0.05, kind="default"), made_row(0.4, 0.1, kind="default")]
     [line] = cells(textures.table(both))
     assert (line["surrogate, m"], line["transfer"]) == ("0.200", "1.000")
@@ -125,7 +131,9 @@ def test_errors_and_transfer_are_averaged_as_ratios(tmp_path):
     [line] = cells(seeds.table([{**both[0], "seed": 1}]))
     assert (line["to random"], line["to best random"]) == ("2.000", "1.000")
     places = [{**row, **key} for row in both for key in distribution.keys()[:24]]
-    listed = cells(distribution.table(places))
+    table = distribution.table(places)
+    assert "1.50 m, deployment: 0 of 24" in table.caption
+    listed = cells(table)
     assert len(listed) == 48
     assert {line["to random"] for line in listed} == {"2.000", "4.000"}
     distribution.draw(tmp_path / "places.png", places)

@@ -225,6 +225,10 @@ def test_memory_does_not_grow_with_the_samples(rng):
 
 def test_the_choice_is_by_field(rng):
     assert isinstance(scene_march(PosedField(small_ngp()), STOP), PackedMarch)
+    wide = NGPField(
+        NGPLayout(levels=2, log2_table=8, width=128), -np.ones(3), np.ones(3)
+    )
+    assert isinstance(scene_march(PosedField(wide), STOP), FieldMarch)
     posed, rays = PosedField(homogeneous()), random_rays(rng)
     chosen = scene_march(posed, STOP)
     assert isinstance(chosen, FieldMarch)

@@ -24,8 +24,10 @@ HEADING = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture
 def world(variant: str) -> World:
-    """The bundled scenario."""
+    """The bundled scenario, with samples in the middle of their intervals."""
     scenario, _ = load_scenario(bundled("demo.toml"))
+    attack = scenario.attack.model_copy(update={"jitter": False})
+    scenario = scenario.model_copy(update={"attack": attack})
     return build_world(scenario, scenario.policy.build())
 
 
