@@ -256,6 +256,7 @@ class GradientAttack:
         """Take over a state written by :meth:`tensors`, and install its best.
 
         Raises:
+            InputError: the entries do not fit each other, or what is allowed.
             KeyError: an entry is missing.
         """
         self._load_history(tensors)
@@ -263,6 +264,10 @@ class GradientAttack:
         self.best_objective = float(tensors["best_objective"][0])
         self.best_offsets = np.array(tensors["best_offsets"])
         self._best = {key: np.array(tensors[f"best.{key}"]) for key in self._best}
+        for key, best in self._best.items():
+            change = np.abs(self._colourings[key].project(best) - best)
+            if not change.max(initial=0) < 1e-3:  # nor NaN
+                raise InputError(f"best.{key}: colours that the attack may not have")
         for key in list(self.optimiser):
             self._load_parameter(key, tensors)
         self.restore_best()

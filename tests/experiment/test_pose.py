@@ -58,6 +58,13 @@ def test_both_at_once_go_on_from_their_tensors(single_thread):
     for name, value in whole.tensors().items():
         np.testing.assert_array_equal(resumed.tensors()[name], value, name)
     assert whole.best_offsets.any()
+    for wrong in (1.5, np.nan):
+        damaged = {key: value.copy() for key, value in half.tensors().items()}
+        damaged["best.0"][0, 0] = wrong
+        with pytest.raises(
+            InputError, match=r"best\.0: colours that the attack may not"
+        ):
+            make_attack(freedom).load_tensors(damaged)
 
 
 @pytest.mark.slow
