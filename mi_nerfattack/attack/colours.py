@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from mi_nerfattack.attack.constraints import Allowed, Constraints
+from mi_nerfattack.attack.constraints import Allowed, Constraints, vertex_points
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError
@@ -139,11 +139,7 @@ def vertex_colours(
         level: one of `field.levels()`.
         chosen: (n, n, n) by z, y, x, of bool; all vertices by default.
     """
-    if chosen is None:
-        chosen = np.ones((level.resolution,) * 3, bool)
-    unit = np.argwhere(chosen)[:, ::-1] / level.scale
-    point = (field.lower + unit * (field.upper - field.lower)).astype(np.float32)
-    points = upload_rows(mi.Point3f, point)
+    points = upload_rows(mi.Point3f, vertex_points(field, level, chosen))
     linear: Any = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))[1]
     return linear_to_srgb(linear).numpy().T
 

@@ -103,7 +103,6 @@ class Allowed:
         original: np.ndarray,
     ) -> None:
         self.constraints, n = constraints, level.resolution
-        where = _positions(field, level)
         self._counts = _colouring(field, level)
         self._cube = (n, n, n, 3)
         low, high = constraints.lowest, constraints.highest
@@ -121,6 +120,7 @@ class Allowed:
             self._upper = np.minimum(self._upper, self.start + constraints.linf)
         voxel = (field.upper - field.lower) / level.scale
         for lower, upper in constraints.fixed:
+            where = vertex_points(field, level)
             # whatever is interpolated inside
             inside = (where > lower - voxel) & (where < upper + voxel)
             inside = inside.all(axis=1)
@@ -160,7 +160,7 @@ class Allowed:
         cube, seen = value.reshape(self._cube), self._counts.reshape(self._cube[:3])
         total, pairs = 0.0, 0
         for axis in range(3):
-            first, second = _neighbours(axis)
+            first, second = neighbours(axis)
             both = (seen[first] & seen[second])[..., None]
             change = np.where(both, cube[second] - cube[first], 0)
             small = np.abs(change) < _SMALL
@@ -174,16 +174,27 @@ class Allowed:
         return share * total, (share * gradient).reshape(value.shape)
 
 
-def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+def neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Return which entries of a cube have one behind them along an axis, and those."""
     first, second = [slice(None)] * 3, [slice(None)] * 3
     first[axis], second[axis] = slice(None, -1), slice(1, None)
     return tuple(first), tuple(second)
 
 
-def _positions(field: GridField, level: GridLevel) -> np.ndarray:
-    """Return where a level's vertices lie, (n, 3), metres, x the fastest."""
-    index = np.indices((level.resolution,) * 3).reshape(3, -1).T[:, ::-1]
-    return field.lower + index / level.scale * (field.upper - field.lower)
+def vertex_points(
+    field: GridField, level: GridLevel, chosen: np.ndarray | None = None
+) -> np.ndarray:
+    """Return where a level's vertices lie, (k, 3), metres, x the fastest.
+
+    Args:
+        field: of the level.
+        level: one of `field.levels()`.
+        chosen: (n, n, n) by z, y, x, of bool; all vertices by default.
+    """
+    if chosen is None:
+        chosen = np.ones((level.resolution,) * 3, bool)
+    unit = np.argwhere(chosen)[:, ::-1] / level.scale
+    return field.lower + unit * (field.upper - field.lower)
 
 
 def _colouring(field: GridField, level: GridLevel) -> np.ndarray:

@@ -218,7 +218,8 @@ class GradientAttack:
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""
-        return {k: dr.detach(self.optimiser[k]).numpy() for k in self._colourings}
+        values = {k: dr.detach(self.optimiser[k]) for k in self._colourings}
+        return {key: value.numpy().copy() for key, value in values.items()}
 
     def _textures(self, colours: Parameters) -> list[np.ndarray]:
         return [c.texture(colours[key]) for key, c in self._colourings.items()]

@@ -65,10 +65,8 @@ def surrogate_sensor(
             )
     others = [v.posed for k, v in volumes.items() if k not in attacked]
     camera, clip, sampler = _lens(scene)
-    surroundings = None
-    if scene.shapes() or integrator.behind is not None:
-        parts = scene, integrator.behind, sampler, camera, clip, seed
-        surroundings = Surroundings(*parts)
+    surrounded = scene.shapes() or integrator.behind is not None
+    parts = scene, integrator.behind, sampler, camera, clip, seed
     return FieldSensor(
         sorted(others, key=_has_no_sky),
         [volumes[name].posed for name in attacked],
@@ -77,7 +75,7 @@ def surrogate_sensor(
         seed if integrator.jitter else None,
         integrator.stop,
         integrator.composite,
-        surroundings,
+        Surroundings(*parts) if surrounded else None,
         clip,
     )
 

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.attack.colours import vertex_colours
+from mi_nerfattack.attack.constraints import neighbours
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 
@@ -141,11 +142,7 @@ def _variation(colour: np.ndarray, seen: np.ndarray, weights: np.ndarray) -> flo
     grid[seen] = colour
     above = below = 0.0
     for axis in range(3):
-        low = [slice(None)] * 3
-        low[axis] = slice(None, -1)
-        high = [slice(None)] * 3
-        high[axis] = slice(1, None)
-        first, second = tuple(low), tuple(high)
+        first, second = neighbours(axis)
         both = np.where(
             seen[first] & seen[second],
             np.sqrt(np.maximum(weights[first] * weights[second], 0)),

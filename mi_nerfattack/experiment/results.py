@@ -63,8 +63,7 @@ class Finished:
     @property
     def driven(self) -> list[Drive]:
         """The drives in closed loops."""
-        replayed = self.replayed
-        return [drive for drive in self.drives if drive not in replayed]
+        return [d for d in self.drives if not self.world.is_open_loop(d.environment)]
 
     @property
     def lane(self) -> Lane:
