@@ -34,6 +34,7 @@ class NGPData:
         lower, upper: (3,) corners of the box, metres.
         tensors: ``table``, ``density_net.I``, ``colour_net.I`` and ``sky``, float32.
         cells: boolean (rx, ry, rz), the occupancy.
+        octants: bytes (rx, ry, rz), its octants that are worth a sample.
         step_m, cone: the lattice of samples.
     """
 
@@ -42,6 +43,7 @@ class NGPData:
     upper: np.ndarray
     tensors: dict[str, np.ndarray]
     cells: np.ndarray
+    octants: np.ndarray
     step_m: float
     cone: float
 
@@ -57,6 +59,7 @@ class NGPData:
             field.upper,
             {"table": table, **tensors},
             field.occupancy.cells,
+            _octants(field.occupancy),
             field.step_m,
             field.cone,
         )
@@ -68,7 +71,7 @@ class NGPData:
             self.lower,
             self.upper,
             tensors=self.tensors,
-            occupancy=Occupancy(self.cells),
+            occupancy=Occupancy(self.cells, self.octants),
             step_m=self.step_m,
             cone=self.cone,
         )
@@ -80,6 +83,7 @@ class NGPData:
             "box": np.array([self.lower, self.upper]),
             "steps": np.array([self.step_m, self.cone]),
             "cells": self.cells.astype(np.uint8),
+            "octants": self.octants,
         }
         files.write_safetensors(path, {**self.tensors, **numbers}, {})
 
@@ -87,17 +91,23 @@ class NGPData:
     def read(path: Path) -> NGPData:
         """Read what :meth:`write` wrote."""
         tensors = files.read_safetensors(path)[0]
-        layout, box, steps, cells = (
-            tensors.pop(name) for name in ("layout", "box", "steps", "cells")
-        )
+        names = ("layout", "box", "steps", "cells", "octants")
+        layout, box, steps, cells, octants = (tensors.pop(name) for name in names)
         return NGPData(
             NGPLayout(*map(int, layout)),
             *box,
             tensors=tensors,
             cells=cells.astype(bool),
+            octants=octants,
             step_m=float(steps[0]),
             cone=float(steps[1]),
         )
+
+
+def _octants(occupancy: Occupancy) -> np.ndarray:
+    if occupancy.octants is not None:
+        return occupancy.octants
+    return np.where(occupancy.cells, np.uint8(255), np.uint8(0))
 
 
 def level_sizes(layout: NGPLayout) -> list[tuple[float, int, int]]:

@@ -91,7 +91,7 @@ class TorchNGP:
         self.lower = _single(data.lower)
         self.extent = _single(data.upper) - self.lower
         self.density_scale = 1 / float(np.max(data.upper - data.lower))
-        self.cells = torch.from_numpy(np.ascontiguousarray(data.cells))
+        self.occupied = torch.from_numpy(_halves(data.octants))
         self.window = TorchWindow(data.cells)
         self.step, self.cone = data.step_m, max(data.cone, 1e-12)
         self.evaluated = 0
@@ -199,10 +199,10 @@ class TorchNGP:
         end = torch.minimum(edges[1:], far[:, None])
         t = torch.lerp(start, end, 0.5 if jitter is None else jitter[:, None])
         cell = torch.zeros(t.shape, dtype=torch.int32)
-        for axis, size in enumerate(self.cells.shape):
+        for axis, size in enumerate(self.occupied.shape):
             place = start_unit[:, axis, None] + t * slope[:, axis, None]
             cell = cell * size + (place * size).to(torch.int32).clamp_(0, size - 1)
-        occupied = self.cells.reshape(-1).index_select(0, cell.reshape(-1))
+        occupied = self.occupied.reshape(-1).index_select(0, cell.reshape(-1))
         kept = (occupied & (end > start).reshape(-1)).nonzero()[:, 0]
         ray = kept // t.shape[1]
         t, width = t.reshape(-1)[kept], (end - start).reshape(-1)[kept]
@@ -301,3 +301,11 @@ def spherical_harmonics(direction: torch.Tensor) -> torch.Tensor:
 
 def _single(value: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.array(value, np.float32))
+
+
+def _halves(octants: np.ndarray) -> np.ndarray:
+    """Return the octants of cells (rx, ry, rz), as bits, as booleans of half cells."""
+    rx, ry, rz = octants.shape
+    bits = np.unpackbits(octants[..., None], axis=-1, bitorder="little")
+    bits = bits.reshape(rx, ry, rz, 2, 2, 2).transpose(0, 3, 1, 4, 2, 5)
+    return bits.reshape(2 * rx, 2 * ry, 2 * rz).astype(bool)

@@ -150,7 +150,7 @@ class AbstractField(ABC):
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""
-        skipping = [self.occupancy.distance, self.window.array]
+        skipping = [*self.occupancy.arrays, self.window.array]
         return [*self.parameters().values(), *skipping]
 
     @property

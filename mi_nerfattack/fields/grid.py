@@ -224,7 +224,7 @@ class GridField(AbstractField):
 
     def arrays(self) -> list[Any]:
         """Return `packed`, occupancy and window."""
-        return [self.packed, self.occupancy.distance, self.window.array]
+        return [self.packed, *self.occupancy.arrays, self.window.array]
 
     @property
     def has_gradients(self) -> bool:

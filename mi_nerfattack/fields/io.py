@@ -89,7 +89,7 @@ def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridFie
         _vector(meta, "upper"),
         density=tensors["density"],
         texture=tensors["texture"],
-        occupancy=_occupancy(tensors["occupancy"], meta),
+        occupancy=_occupancy(tensors, meta),
         density_scale=_number(meta, "density_scale", float),
         step_m=_number(meta, "step_m", float),
         info=_info(meta),
@@ -104,7 +104,7 @@ def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField
         _vector(meta, "lower"),
         _vector(meta, "upper"),
         tensors=dict(tensors),
-        occupancy=_occupancy(tensors["occupancy"], meta),
+        occupancy=_occupancy(tensors, meta),
         step_m=_number(meta, "step_m", float),
         cone=_number(meta, "cone", float),
         info=_info(meta),
@@ -124,7 +124,8 @@ def _number(meta: Mapping[str, str], name: str, kind: type[T]) -> T:
         ) from err
 
 
-def _occupancy(bits: np.ndarray, meta: Mapping[str, str]) -> Occupancy:
+def _occupancy(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Occupancy:
+    bits = tensors["occupancy"]
     name = "occupancy_shape"
     shape = tuple(_number({name: v}, name, int) for v in meta[name].split())
     count = int(np.prod(shape))
@@ -133,7 +134,18 @@ def _occupancy(bits: np.ndarray, meta: Mapping[str, str]) -> Occupancy:
         raise ValueError(
             f"occupancy: {bits.size} bytes for a grid of {shape}; the file is damaged"
         )
-    return Occupancy(np.unpackbits(bits, count=count).reshape(shape).astype(bool))
+    cells = np.unpackbits(bits, count=count).reshape(shape).astype(bool)
+    if "octants" not in tensors:
+        return Occupancy(cells)
+    given = tensors["octants"]
+    if given.shape != (cells.sum(),) or given.dtype != np.uint8:
+        raise ValueError(
+            f"octants: {given.dtype} {given.shape} for {cells.sum()} occupied cells; "
+            "expected a byte each, the file is damaged"
+        )
+    octants = np.zeros(shape, np.uint8)
+    octants[cells] = given
+    return Occupancy(cells, octants)
 
 
 def _info(meta: Mapping[str, str]) -> dict[str, str]:

@@ -292,6 +292,8 @@ class NGPField(AbstractField):
             "sky": self.sky.numpy().copy().reshape(*self.sky_shape, 3),
             "occupancy": np.packbits(self.window.cells.ravel()),
         }
+        if self.occupancy.octants is not None:
+            result["octants"] = self.occupancy.octants[self.window.cells]
         packed = (self.density_net, self.colour_net)
         for prefix, net in zip(NETWORK_NAMES, packed, strict=True):
             linear = [layer for layer in net.layers if isinstance(layer, nn.Linear)]

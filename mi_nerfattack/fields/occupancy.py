@@ -17,26 +17,35 @@ class Occupancy:
     it: a ray may leave the whole block of ``2 n - 1`` cells in one jump. Cells that
     hold 0 are occupied. Costs one byte a cell.
 
+    Of occupied cells, a march may skip single octants.
+
     Args:
         cells: boolean (rx, ry, rz), True where the field may have density.
+        octants: (rx, ry, rz) bytes, bit 4 x + 2 y + z set where the octant at the lower
+            (0) or upper (1) end of each axis is worth a sample; nothing counts outside
+            `cells`. All octants are when left out.
     """
 
-    def __init__(self, cells: np.ndarray) -> None:
+    def __init__(self, cells: np.ndarray, octants: np.ndarray | None = None) -> None:
         self.cells = np.ascontiguousarray(cells, dtype=bool)
         if self.cells.ndim != 3 or min(self.cells.shape) < 1:
             raise ValueError(f"occupancy: shape {cells.shape}; expected (rx, ry, rz)")
         rx, ry, rz = self.cells.shape
         self.shape = (rx, ry, rz)
-        if self.cells.all():
+        self.octants = None if octants is None else octants * self.cells
+        seen = self.cells if self.octants is None else self.octants > 0
+        if seen.all():
             distance = np.zeros(self.shape, np.uint8)
-        elif not self.cells.any():
+        elif not seen.any():
             distance = np.full(self.shape, MAX_DISTANCE, np.uint8)
         else:
-            distance = ndimage.distance_transform_cdt(~self.cells, metric="chessboard")
+            distance = ndimage.distance_transform_cdt(~seen, metric="chessboard")
             distance = np.minimum(distance, MAX_DISTANCE).astype(np.uint8)
+        grids = [distance] if self.octants is None else [distance, self.octants]
         byte = dr.uint8_array_t(mi.Float)
-        self.distance = byte(distance.ravel())
-        dr.make_opaque(self.distance)
+        #: What :meth:`query` reads, (rx ry rz,) each.
+        self.arrays = [byte(grid.ravel()) for grid in grids]
+        dr.make_opaque(self.arrays)
 
     @staticmethod
     def full(resolution: int = 1) -> Occupancy:
@@ -56,7 +65,8 @@ class Occupancy:
             active: (n,) mask.
 
         Returns:
-            distance (n,) in cells, 0 where occupied, and the cell's index (3, n).
+            distance (n,) in cells, 0 where occupied, a half in an octant to be skipped
+            of an occupied cell; and the cell's index (3, n).
         """
         rx, ry, rz = self.shape
         cell = mi.Point3f(
@@ -65,8 +75,16 @@ class Occupancy:
             dr.clip(dr.floor(unit.z * rz), 0, rz - 1),
         )
         index = (mi.UInt32(cell.x) * ry + mi.UInt32(cell.y)) * rz + mi.UInt32(cell.z)
-        value = dr.gather(type(self.distance), self.distance, index, active)
-        return mi.Float(mi.UInt32(value)), cell
+        first, *more = self.arrays
+        distance = mi.Float(mi.UInt32(dr.gather(type(first), first, index, active)))
+        for octants in more:
+            inside = active & (distance == 0)
+            bits = mi.UInt32(dr.gather(type(octants), octants, index, inside))
+            for axis, weight in enumerate((4, 2, 1)):
+                upper = unit[axis] * self.shape[axis] - cell[axis] >= 0.5
+                bits >>= dr.select(upper, mi.UInt32(weight), 0)
+            distance = dr.select(inside & (bits & 1 == 0), 0.5, distance)
+        return distance, cell
 
     def exit(
         self,
@@ -77,11 +95,13 @@ class Occupancy:
     ) -> mi.Float:
         """Return how far a ray goes before it leaves the empty block, (n,).
 
+        Of an octant, it returns no more than that, and 0 on half of the ways.
+
         Args:
             unit: (3, n), position in the unit box.
             direction: (3, n), of any length; the result is in units of it.
             cell: (3, n), from :meth:`query`.
-            distance: (n,), from :meth:`query`, at least 1.
+            distance: (n,), from :meth:`query`, above 0.
         """
         result = mi.Float(dr.inf)
         for axis in range(3):

@@ -13,10 +13,12 @@ from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.ngp import NGPField
+from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fit.batch import BatchSource, Score, mean_samples
 from mi_nerfattack.fit.cameras import EXPOSURE, POSES, CameraCorrections
 from mi_nerfattack.fit.cells import cells_near_surfaces, grid_shape
 from mi_nerfattack.fit.occupancy import RunningOccupancy, seen_cells
+from mi_nerfattack.fit.octants import dense_octants
 from mi_nerfattack.fit.options import FitOptions
 from mi_nerfattack.fit.rays import RayBank
 from mi_nerfattack.fit.scores import MIN_EDGE_PX
@@ -186,11 +188,14 @@ class Training:
         """Detach the field from the optimiser.
 
         It keeps the occupancy of the last steps: density in other cells has had no
-        part in what was compared.
+        part in what was compared. Marches through an NGP also skip thin octants.
         """
         self._install({k: dr.detach(self.optimiser[k]) for k in self._values()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
+        else:
+            cells = self.field.window.cells
+            self.field.occupancy = Occupancy(cells, dense_octants(self.field))
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state."""

@@ -10,7 +10,8 @@ to the distance ``step / cone`` and grows exponentially after it. A sample stand
 has no empty cell, for the part inside the bounding box. Lattice intervals whose sample
 lies in an empty cell of the occupancy are skipped: the density there is 0, and rises
 from it continuously (`fields.window`), so that no sample comes or goes at once when a
-ray moves. Beyond ``2**23`` steps in a box a ray sees nothing.
+ray moves. Where octants of cells are skipped, too, one of a small opacity does
+(`fit.octants`). Beyond ``2**23`` steps in a box a ray sees nothing.
 
 Error bounds, for a ray that runs l metres through the box and leaves it at t_far:
 

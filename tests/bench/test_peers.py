@@ -76,7 +76,8 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 def data(rng) -> NGPData:
     """Make a field with holes, a growing step, and densities up to opaque."""
     field = small_ngp(cone=1 / 64)
-    field.occupy(Occupancy(rng.random((6, 5, 4)) < 0.6))
+    octants = rng.integers(0, 256, (6, 5, 4), np.uint8)
+    field.occupy(Occupancy(rng.random((6, 5, 4)) < 0.6, octants))
     data = NGPData.of(field)
     data.tensors["density_net.1"][0] *= 3
     return data

@@ -265,6 +265,31 @@ def test_occupancy_query_and_exit_against_brute_force(shape, share, seed) -> Non
         assert gap == pytest.approx(expected[k] - 0.5, rel=1e-3, abs=1e-3)
 
 
+def test_empty_octants_of_occupied_cells(rng) -> None:
+    cells = rng.random((3, 4, 5)) < 0.6
+    octants = rng.integers(0, 4, cells.shape, np.uint8) * 51  # some cells have none
+    fine = np.unpackbits(octants[..., None], axis=-1, bitorder="little")
+    fine = fine.reshape(*cells.shape, 2, 2, 2).transpose(0, 3, 1, 4, 2, 5)
+    fine = fine.reshape(6, 8, 10) & np.kron(cells, np.ones((2, 2, 2), np.uint8))
+    occupancy = Occupancy(cells, octants)
+    unit = rng.uniform(0, 1, (500, 3)).astype(np.float32)
+    direction = rng.normal(size=(500, 3)).astype(np.float32)
+    place, heading = mi.Point3f(unit.T.copy()), mi.Vector3f(direction.T.copy())
+    distance, cell = occupancy.query(place, mi.Bool(True))
+    found = distance.numpy()
+    half = tuple((unit * fine.shape).astype(int).T)
+    np.testing.assert_array_equal(found == 0, fine[half] > 0)
+    whole = brute_distance(fine.reshape(3, 2, 4, 2, 5, 2).any((1, 3, 5)))
+    cell = tuple(cell.numpy().astype(int))
+    np.testing.assert_array_equal(found[found >= 1], whole[cell][found >= 1])
+    assert set(found[whole[cell] == 0]) == {0, 0.5}
+    # no way out of an octant leads past its faces
+    reach = occupancy.exit(place, heading, mi.Point3f(*cell), distance).numpy()
+    for k in np.flatnonzero(found == 0.5):
+        end = (unit[k] + reach[k] * direction[k].astype(float)) * fine.shape
+        assert np.abs(end - np.array(half)[:, k] - 0.5).max() <= 0.501
+
+
 def test_occupancy_clamps_positions_outside() -> None:
     cells = np.zeros((2, 2, 2), bool)
     cells[1, 1, 1] = True

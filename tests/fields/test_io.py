@@ -75,6 +75,23 @@ def test_ngp_file_evaluates_the_same(tmp_path: Path, rng: np.random.Generator) -
     assert first == second
 
 
+def test_octants_of_occupied_cells_are_kept(tmp_path, rng) -> None:
+    field, path = small.small_ngp(), tmp_path / "a.safetensors"
+    cells = rng.random((3, 4, 5)) < 0.5
+    octants = rng.integers(0, 256, cells.shape, np.uint8)
+    field.occupy(Occupancy(cells, octants))
+    save_field(path, field)
+    found = load_field(path).occupancy
+    np.testing.assert_array_equal(found.octants, np.where(cells, octants, 0))
+    tensors, header = files.read_safetensors(path)
+    for bad in (tensors["octants"][1:], tensors["octants"].astype(np.float32)):
+        files.write_safetensors(path, {**tensors, "octants": bad}, header)
+        with pytest.raises(
+            InputError, match=r"a\.safetensors: octants: .* a byte each"
+        ):
+            load_field(path)
+
+
 def test_load_grid_refuses_an_ngp(tmp_path: Path) -> None:
     save_field(tmp_path / "n.safetensors", small.small_ngp())
     with pytest.raises(InputError, match=r"n\.safetensors: is a ngp_field"):

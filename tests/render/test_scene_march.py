@@ -11,6 +11,7 @@ import pytest
 from helpers.kernels import nothing_compiled
 from helpers.small_fields import homogeneous, small_ngp
 
+from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.fields import NGPField, NGPLayout, Occupancy, load_field
 from mi_nerfattack.fields.cpu.grid import PackedGrid
 from mi_nerfattack.fields.cpu.words import LongWords, ShortWords
@@ -30,6 +31,7 @@ from mi_nerfattack.render.scene_march import (
     scene_march,
     tile_order,
 )
+from mi_nerfattack.render.walk import sample_count
 from mi_nerfattack.scenes import bundled
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -73,6 +75,21 @@ def test_it_is_the_march_of_the_bundled_scene():
     )
 
 
+def test_octants_skipped_in_the_bundled_scene_are_hardly_seen():
+    field = load_field(bundled("intersection/field.safetensors"))
+    assert field.occupancy.octants is not None
+    colours, counts = [], []
+    for occupancy in (field.occupancy, Occupancy(field.occupancy.cells)):
+        field.occupancy = occupancy
+        posed, views = PosedField(field), [road_rays(x) for x in (-30.0, -10.0, 10.0)]
+        seen = [PackedMarch(posed, STOP).march(rays).radiance for rays in views]
+        colours.append(linear_to_srgb_numpy(np.stack([x.numpy() for x in seen])))
+        counts.append(np.mean([sample_count(posed, rays).numpy() for rays in views]))
+    psnr = -10 * np.log10(np.mean((colours[0] - colours[1]) ** 2))
+    assert 45 < psnr < 70
+    assert counts[0] < 0.8 * counts[1]
+
+
 @pytest.mark.parametrize(
     ("cone", "pose", "spread", "stop"),
     [
@@ -85,7 +102,8 @@ def test_it_is_the_march_of_the_bundled_scene():
 )
 def test_it_is_the_march_of_a_small_field(rng, cone, pose, spread, stop):
     field = small_ngp(cone=cone)
-    field.occupy(Occupancy(rng.random((6, 5, 4)) < 0.4))
+    octants = rng.integers(0, 256, (6, 5, 4), np.uint8) | 2
+    field.occupy(Occupancy(rng.random((6, 5, 4)) < 0.5, octants))
     posed, rays = PosedField(field, pose), random_rays(rng, spread=spread)
     assert 0.05 < float(dr.mean(march(posed, rays).opacity)[0]) < 0.95
     assert_same(posed, rays, stop)
