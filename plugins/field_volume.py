@@ -10,7 +10,13 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import AbstractField, GridField, NGPField, load_field
+from mi_nerfattack.fields import (
+    AbstractField,
+    BrickField,
+    GridField,
+    NGPField,
+    load_field,
+)
 from mi_nerfattack.fields.grid import check_positive
 from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.camera.pose import Pose
@@ -24,6 +30,11 @@ def read_field(props: mi.Properties, kind: str) -> GridField | NGPField:
     """Load the file named by the property `filename` and check its kind."""
     name = read_filename(props)
     field = load_field(name)
+    if isinstance(field, BrickField):
+        raise InputError(
+            f"{name}: holds a {field.kind}, for scenarios; give the field that it was "
+            "baked from"
+        )
     if field.kind != kind:
         raise InputError(
             f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'

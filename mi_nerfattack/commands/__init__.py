@@ -11,6 +11,7 @@ from typing import Protocol
 
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.attack import Attack
+from mi_nerfattack.commands.bake import Bake
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
@@ -37,6 +38,7 @@ COMMANDS: dict[str, type[Command]] = {
     "capture": Capture,
     "poses": Poses,
     "fit": Fit,
+    "bake": Bake,
     "asset": Asset,
     "export": Export,
     "train": Train,

@@ -1,4 +1,5 @@
 from .base import AbstractField as AbstractField
+from .bricks import BrickField as BrickField
 from .grid import GridField as GridField
 from .grid import GridLayout as GridLayout
 from .io import load_field as load_field

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.bricks import BrickField, Codes
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
@@ -16,10 +17,12 @@ from mi_nerfattack.io import files
 
 T = TypeVar("T", int, float)
 
+AnyField: TypeAlias = GridField | NGPField | BrickField
+
 FORMAT = "mi_nerfattack field 1"
 
 
-def save_field(path: str | Path, field: GridField | NGPField) -> None:
+def save_field(path: str | Path, field: AnyField) -> None:
     """Write a field file atomically.
 
     Raises:
@@ -33,7 +36,7 @@ def save_field(path: str | Path, field: GridField | NGPField) -> None:
     files.write_safetensors(path, tensors, metadata)
 
 
-def load_field(path: str | Path) -> GridField | NGPField:
+def load_field(path: str | Path) -> AnyField:
     """Read a field file of any kind.
 
     Raises:
@@ -48,7 +51,7 @@ def load_field(path: str | Path) -> GridField | NGPField:
             f"{FORMAT!r}; make field files with 'mi-nerfattack fit' or 'asset'"
         )
     _check_finite(path, tensors)
-    kinds = {"grid_field": _grid, "ngp_field": _ngp}
+    kinds = {"grid_field": _grid, "ngp_field": _ngp, "brick_field": _bricks}
     kind = metadata.get("kind", "")
     if kind not in kinds:
         raise InputError(
@@ -108,6 +111,21 @@ def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField
         step_m=_number(meta, "step_m", float),
         cone=_number(meta, "cone", float),
         info=_info(meta),
+    )
+
+
+def _bricks(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> BrickField:
+    return BrickField(
+        _vector(meta, "lower"),
+        _vector(meta, "upper"),
+        _occupancy(tensors, meta),
+        tensors["subdivisions"],
+        tensors["vertices"],
+        Codes(*_vector(meta, "log_density").tolist()),
+        tensors["sky"],
+        _number(meta, "step_m", float),
+        _number(meta, "cone", float),
+        _info(meta),
     )
 
 

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
-from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.cpu.points import NGPPoints
@@ -23,6 +22,7 @@ from mi_nerfattack.fields.grid import (
     level_growth,
 )
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.sky import activate, sky_colour
 
 GEOMETRY_FEATURES = 16
 SH_ORDER = 3
@@ -198,7 +198,7 @@ class NGPField(AbstractField):
         self, geometry: mi.Float, raw: list[mi.Float]
     ) -> tuple[mi.Float, mi.Color3f]:
         """Turn the networks' raw density (n,) and colours 3 x (n,) into quantities."""
-        return self.density_scale * dr.exp(dr.minimum(geometry, 15.0)), _activate(raw)
+        return self.density_scale * dr.exp(dr.minimum(geometry, 15.0)), activate(raw)
 
     def density_everywhere(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """See :meth:`AbstractField.density_everywhere`."""
@@ -236,21 +236,7 @@ class NGPField(AbstractField):
 
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Interpolate the sky image bilinearly, (3, n), linear."""
-        height, width = self.sky_shape
-        u = dr.atan2(direction.y, direction.x) * (0.5 / dr.pi) * width
-        v = dr.safe_acos(direction.z) / dr.pi * height - 0.5
-        u0, v0 = dr.floor(u), dr.floor(v)
-        colour = mi.Color3f(0)
-        for du in (0, 1):
-            for dv in (0, 1):
-                weight = (u - u0 if du else 1 - u + u0) * (v - v0 if dv else 1 - v + v0)
-                column = mi.Int32(u0) + du
-                column = dr.select(column < 0, column + width, column)
-                column = dr.select(column >= width, column - width, column)
-                row = dr.clip(mi.Int32(v0) + dv, 0, height - 1)
-                index = mi.UInt32(row * width + column)
-                colour += weight * dr.gather(mi.Color3f, self.sky, index)
-        return _activate([colour.x, colour.y, colour.z])
+        return sky_colour(self.sky, self.sky_shape, direction)
 
     def parameters(self) -> dict[str, Any]:
         """Return ``table``, ``density_weights``, ``colour_weights`` and ``sky``."""
@@ -358,7 +344,3 @@ def _networks(layout: NGPLayout, rng: Any) -> tuple[nn.Module, nn.Module]:
         nn.Linear(-1, 3, bias=False),
     ).alloc(_weight_type(), GEOMETRY_FEATURES + (SH_ORDER + 1) ** 2, rng=rng)
     return density, colour
-
-
-def _activate(raw: list[mi.Float]) -> mi.Color3f:
-    return srgb_to_linear(mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in raw]))

@@ -21,9 +21,18 @@ _TILE = 4
 
 
 class AbstractSceneMarch(ABC):
-    """A way to march rays through one field whose parameters are constants."""
+    """A way to march rays through one field whose parameters are constants.
 
-    @abstractmethod
+    Args:
+        posed: the field.
+        stop: transmittance below which a ray ends.
+    """
+
+    def __init__(self, posed: PosedField, stop: float) -> None:
+        self.posed, self.stop = posed, stop
+        self._orders: dict[tuple[int, int], mi.UInt32] = {}
+        self._frozen = freeze_method(self._record, self._state)
+
     def march(self, rays: Rays, width: int = 1) -> March:
         """Integrate radiance, opacity and moment; as `render.march.march`.
 
@@ -35,6 +44,22 @@ class AbstractSceneMarch(ABC):
         Returns:
             the march, (n,), evaluated.
         """
+        key = dr.width(rays), width
+        if key not in self._orders:
+            self._orders[key] = tile_order(*key)
+        return self._frozen(_opaque(rays), self._orders[key])
+
+    def _record(self, rays: Rays, order: mi.UInt32) -> March:
+        with dr.suspend_grad():
+            return put_rays(self._march(pick_rays(rays, order)), order)
+
+    @abstractmethod
+    def _march(self, rays: Rays) -> March:
+        """March rays in their order."""
+
+    @abstractmethod
+    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
+        """Return what :meth:`_march` reads or was compiled for, for `drjit.freeze`."""
 
 
 def scene_march(posed: PosedField, stop: float) -> AbstractSceneMarch:
@@ -52,27 +77,14 @@ def scene_march(posed: PosedField, stop: float) -> AbstractSceneMarch:
 
 
 class FieldMarch(AbstractSceneMarch):
-    """Any field, any backend: `render.march.march`, recorded once.
+    """Any field, any backend: `render.march.march`, recorded once."""
 
-    Args:
-        posed: the field.
-        stop: transmittance below which a ray ends.
-    """
-
-    def __init__(self, posed: PosedField, stop: float) -> None:
-        self.posed, self.stop = posed, stop
-        self._frozen = freeze_method(self._record, self._state)
-
-    def march(self, rays: Rays, width: int = 1) -> March:
-        """See :meth:`AbstractSceneMarch.march`."""
-        del width
-        return self._frozen(_opaque(rays))
-
-    def _record(self, rays: Rays) -> March:
+    def _march(self, rays: Rays) -> March:
         (posed,) = rays.light([self.posed])
         return march(posed, rays, self.stop)
 
-    def _state(self, rays: Rays) -> list[Any]:
+    def _state(self, rays: Rays, order: mi.UInt32) -> list[Any]:
+        del order
         return [self, self.stop, dr.width(rays.direction), self.posed.state()]
 
 
@@ -90,32 +102,25 @@ class PackedMarch(AbstractSceneMarch):
     """
 
     def __init__(self, posed: PosedField, stop: float) -> None:
+        super().__init__(posed, stop)
         assert isinstance(posed.field, NGPField)
-        self.posed, self.stop = posed, stop
         self._field = posed.field
         self._packed = PackedNGP(posed.field)
-        self._orders: dict[tuple[int, int], mi.UInt32] = {}
-        self._frozen = freeze_method(self._record, self._state)
 
     def march(self, rays: Rays, width: int = 1) -> March:
         """See :meth:`AbstractSceneMarch.march`."""
         if not self._packed.is_current():
             self._packed = PackedNGP(self._field)
-        key = dr.width(rays), width
-        if key not in self._orders:
-            self._orders[key] = tile_order(*key)
-        return self._frozen(_opaque(rays), self._orders[key])
+        return super().march(rays, width)
 
-    def _record(self, rays: Rays, order: mi.UInt32) -> March:
-        with dr.suspend_grad():
-            rays = pick_rays(rays, order)
-            view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
-            walk, active = Walk.start(self.posed, rays)
-            posed, looks = [self.posed], ([self._evaluate], [view])
-            result = integrate(posed, walk, active, *looks, self.stop).march()
-            for (gain,) in [rays.gains] if rays.gains else []:
-                result.radiance *= gain
-        return put_rays(result, order)
+    def _march(self, rays: Rays) -> March:
+        view = self._packed.view(dr.normalize(self.posed.turn(rays.direction)))
+        walk, active = Walk.start(self.posed, rays)
+        posed, looks = [self.posed], ([self._evaluate], [view])
+        result = integrate(posed, walk, active, *looks, self.stop).march()
+        for (gain,) in [rays.gains] if rays.gains else []:
+            result.radiance *= gain
+        return result
 
     def _evaluate(
         self, point: mi.Point3f, view: Any, active: mi.Bool

@@ -1,0 +1,243 @@
+"""A field baked into bricks: fast to look up, without networks and derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.grid import box_metadata, check_box, check_positive
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.sky import sky_colour
+
+#: Subdivisions of a cell along each axis.
+FINEST = 8
+_LEVELS = (8, 4, 2, 1)
+_LEVEL_SHIFT = 30  # of a pointer, whose lower bits say where a brick begins
+_TOP = 255.0
+
+
+def vertex_count(subdivisions: np.ndarray) -> int:
+    """Return how many vertices bricks (n,) have together."""
+    return int(((subdivisions.astype(np.int64) + 1) ** 3).sum())
+
+
+@dataclass(frozen=True)
+class Codes:
+    """How vertices keep density and colour in four bytes.
+
+    The lowest byte is the logarithm of the density, from `low` (0) to `high` (255);
+    then come red, green and blue, sRGB.
+
+    Attributes:
+        low: natural logarithm of the least density, 1/length unit.
+        high: of the largest.
+    """
+
+    low: float
+    high: float
+
+    @staticmethod
+    def of(step_m: float) -> Codes:
+        """Return the range from a thousandth of a step's depth to a hundred."""
+        return Codes(float(np.log(1e-3 / step_m)), float(np.log(1e2 / step_m)))
+
+    def numbers(self, density: mi.Float, radiance: mi.Color3f) -> list[mi.Float]:
+        """Return what vertices interpolate: four times (n,), 0 to 255."""
+        logarithm = dr.log(dr.maximum(density, 1e-30))
+        first = (logarithm - self.low) * (_TOP / (self.high - self.low))
+        colour = linear_to_srgb(mi.Color3f(radiance)) * _TOP
+        numbers = first, colour.x, colour.y, colour.z
+        return [dr.clip(mi.Float(x), 0, _TOP) for x in numbers]
+
+    def quantities(self, numbers: list[mi.Float]) -> tuple[mi.Float, mi.Color3f]:
+        """Return density and linear radiance of interpolated numbers."""
+        first, *colour = numbers
+        density = dr.exp(first * ((self.high - self.low) / _TOP) + self.low)
+        return density, srgb_to_linear(mi.Color3f(*colour) * (1 / _TOP))
+
+
+def pack_word(numbers: list[mi.Float]) -> mi.UInt32:
+    """Round four numbers (n,), 0 to 255, to the bytes of words."""
+    word = mi.UInt32(0)
+    for k, number in enumerate(numbers):
+        word |= mi.UInt32(dr.round(dr.clip(number, 0, _TOP))) << (8 * k)
+    return word
+
+
+class BrickField(AbstractField):
+    """Density and colour at the vertices of bricks, one in each occupied cell.
+
+    A brick divides its cell into n^3 parts, n = 1, 2, 4 or 8, and has (n + 1)^3
+    vertices. What they keep (:class:`Codes`) is interpolated trilinearly, and becomes
+    density and radiance then. The radiance does not depend on the direction. Made by
+    `fit.bake`; there is nothing to optimise, but it is differentiable by the position.
+
+    Costs four bytes a vertex, and four a cell for where its brick begins.
+
+    Args:
+        lower: (3,) of the bounding box, metres.
+        upper: (3,) of the bounding box, metres.
+        occupancy: which cells have bricks.
+        subdivisions: (bricks,), n of each occupied cell, in the order of the cells.
+        vertices: (vertices,) uint32, brick by brick, z fastest.
+        codes: what they mean.
+        sky: (height, width, 3), raw colours of what lies behind, as an NGP's.
+        step_m: marching step near the camera, metres.
+        cone: growth of the step with distance.
+        info: free metadata that is kept in the file.
+
+    Raises:
+        InputError: bricks and vertices do not belong together.
+    """
+
+    kind = "brick_field"
+
+    def __init__(
+        self,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        occupancy: Occupancy,
+        subdivisions: np.ndarray,
+        vertices: np.ndarray,
+        codes: Codes,
+        sky: np.ndarray,
+        step_m: float,
+        cone: float,
+        info: dict[str, str] | None = None,
+    ) -> None:
+        self.lower = np.asarray(lower, np.float64)
+        self.upper = np.asarray(upper, np.float64)
+        check_box(self.lower, self.upper)
+        self.step_m, self.cone = float(step_m), float(cone)
+        check_positive("step_m", self.step_m)
+        if not 0 <= self.cone <= 1:
+            raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
+        _check_bricks(occupancy, subdivisions, vertices, sky)
+        self.codes, self.info = codes, dict(info or {})
+        self.occupy(occupancy)
+        self.subdivisions = subdivisions
+        self.vertices = mi.UInt32(np.ascontiguousarray(vertices, np.uint32))
+        ends = np.cumsum((subdivisions.astype(np.int64) + 1) ** 3)
+        level = np.log2(FINEST // subdivisions).astype(np.uint32)
+        pointers = np.zeros(occupancy.shape, np.uint32)
+        pointers[occupancy.cells] = np.append(0, ends[:-1]) | level << _LEVEL_SHIFT
+        self._pointers = mi.UInt32(pointers.ravel())
+        self._sky_shape = sky.shape[0], sky.shape[1]
+        self._sky = mi.Float(np.ascontiguousarray(sky, np.float32).ravel())
+        dr.make_opaque(self.vertices, self._pointers, self._sky)
+
+    def corners(
+        self, unit: mi.Point3f, active: mi.Bool
+    ) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Return the eight vertices around points, and their weights.
+
+        Args:
+            unit: (3, n), positions in the unit box, in occupied cells.
+            active: (n,) mask.
+        """
+        _, ry, rz = self.occupancy.shape
+        cell, part = [], []
+        for value, count in zip(unit, self.occupancy.shape, strict=True):
+            scaled = dr.clip(value, 0, 1) * count
+            lower = dr.minimum(dr.floor(dr.detach(scaled)), count - 1)
+            cell.append(mi.UInt32(lower))
+            part.append(scaled - lower)
+        index = (cell[0] * ry + cell[1]) * rz + cell[2]
+        pointer = dr.gather(mi.UInt32, self._pointers, index, active)
+        n = mi.UInt32(FINEST) >> (pointer >> _LEVEL_SHIFT)
+        strides = (n + 1) * (n + 1), n + 1, mi.UInt32(1)
+        first = pointer & ((1 << _LEVEL_SHIFT) - 1)
+        weights = []
+        for value, stride in zip(part, strides, strict=True):
+            scaled = value * mi.Float(n)
+            lower = dr.minimum(dr.floor(dr.detach(scaled)), mi.Float(n) - 1)
+            first += mi.UInt32(lower) * stride
+            weights.append((1 - scaled + lower, scaled - lower))
+        result = []
+        for place in product((0, 1), repeat=3):
+            vertex, weight = first, mi.Float(1)
+            for k, stride, pair in zip(place, strides, weights, strict=True):
+                vertex = vertex + stride if k else vertex
+                weight = weight * pair[k]
+            result.append((vertex, weight))
+        return result
+
+    def interpolate(
+        self, corners: list[tuple[mi.UInt32, mi.Float]], active: mi.Bool
+    ) -> list[mi.Float]:
+        """Return the four numbers of `Codes` (n,) at points.
+
+        Args:
+            corners: from :meth:`corners`.
+            active: (n,) mask.
+        """
+        result = [mi.Float(0) for _ in range(4)]
+        for vertex, weight in corners:
+            word = dr.gather(mi.UInt32, self.vertices, vertex, active)
+            for k in range(4):
+                value = mi.Float(mi.Int32((word >> (8 * k)) & 255))
+                result[k] = dr.fma(weight, value, result[k])
+        return result
+
+    def eval_everywhere(
+        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Color3f]:
+        """See :meth:`AbstractField.eval_everywhere`; nothing without a brick."""
+        del direction
+        corners = self.corners(self.unit(point), active)
+        density, radiance = self.codes.quantities(self.interpolate(corners, active))
+        return density & active, radiance & active
+
+    def background(self, direction: mi.Vector3f) -> mi.Color3f:
+        """Interpolate the sky image bilinearly, (3, n), linear."""
+        return sky_colour(self._sky, self._sky_shape, direction)
+
+    def arrays(self) -> list[Any]:
+        """See :meth:`AbstractField.arrays`."""
+        return [*super().arrays(), self.vertices, self._pointers, self._sky]
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return vertices, subdivisions, sky, occupancy bits and octants."""
+        cells, octants = self.window.cells, self.occupancy.octants
+        result = {
+            "occupancy": np.packbits(cells.ravel()),
+            "subdivisions": self.subdivisions,
+            "vertices": self.vertices.numpy(),
+            "sky": self._sky.numpy().reshape(*self._sky_shape, 3).copy(),
+        }
+        return result if octants is None else {**result, "octants": octants[cells]}
+
+    def metadata(self) -> dict[str, str]:
+        """Return bounds, units, codes and provenance."""
+        return {
+            **self.info,
+            **box_metadata(self, self.info),
+            "log_density": f"{self.codes.low!r} {self.codes.high!r}",
+            "colour_space": "radiance = srgb_to_linear(byte / 255), linear Rec. 709",
+        }
+
+
+def _check_bricks(
+    occupancy: Occupancy, subdivisions: np.ndarray, vertices: np.ndarray, sky: Any
+) -> None:
+    bricks = int(occupancy.cells.sum())
+    if subdivisions.shape != (bricks,) or not np.isin(subdivisions, _LEVELS).all():
+        raise InputError(
+            f"subdivisions: shape {subdivisions.shape}; expected ({bricks},) of 1, 2, "
+            "4 and 8"
+        )
+    expected = vertex_count(subdivisions)
+    if vertices.shape != (expected,) or expected >= 1 << _LEVEL_SHIFT:
+        raise InputError(
+            f"vertices: shape {vertices.shape}; expected ({expected},), fewer than 2^30"
+        )
+    if sky.ndim != 3 or sky.shape[2] != 3:
+        raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")

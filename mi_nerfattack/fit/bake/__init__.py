@@ -1,0 +1,1 @@
+"""Scenes as bricks: made from a fitted field, and compared with it."""

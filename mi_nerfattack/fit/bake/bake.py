@@ -1,0 +1,273 @@
+"""Bake a fitted scene into bricks: several times as fast to march."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import KDTree
+
+from mi_nerfattack.capture.scene import drive_poses
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.bricks import (
+    FINEST,
+    BrickField,
+    Codes,
+    pack_word,
+    vertex_count,
+)
+from mi_nerfattack.fields.ngp import NGPField
+from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fit.octants import dense_octants
+from mi_nerfattack.ranges import Count, Positive, Seed, Whole, checked
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    generate_rays,
+    pose_arrays,
+)
+from mi_nerfattack.render.march import STOP
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.walk import Segment, Walk
+from mi_nerfattack.vehicle.route.route import Route
+
+_SPACING_M = 1.0  # between the places on routes that distances are measured from
+_FAINT = 1e-3  # sum of weights below which a vertex is hardly moved
+_WORDS_BAKING = 7  # of a vertex: before, after, and five sums
+
+
+@dataclass(frozen=True)
+@checked()
+class BakeOptions:
+    """How fine bricks are, and how they are refined.
+
+    Attributes:
+        cone: edge of a brick's parts over the distance to the nearest route, at most;
+            as long as 8 parts along the brick's edge are enough.
+        passes: over all rays of `views` new poses.
+        views: poses of a pass, scattered along the routes by `capture.drive_poses`.
+        seed: of poses, and of the samples on their rays.
+    """
+
+    cone: Positive = 1 / 64
+    passes: Whole = 2
+    views: Count = 100
+    seed: Seed = 0
+
+
+@dataclass(frozen=True, eq=False)
+class BakePlan:
+    """Which bricks a field needs.
+
+    Attributes:
+        occupancy: the cells that have one.
+        subdivisions: (bricks,), 1, 2, 4 or 8.
+        nearest: (bricks, 2), the place on a route that is nearest, metres.
+    """
+
+    occupancy: Occupancy
+    subdivisions: np.ndarray
+    nearest: np.ndarray
+
+    @property
+    def file_mb(self) -> float:
+        """Size of the vertices, MB."""
+        return 4 * vertex_count(self.subdivisions) / 1e6
+
+    @property
+    def peak_mb(self) -> float:
+        """Memory that baking takes beside the field, MB."""
+        return _WORDS_BAKING * self.file_mb
+
+
+def plan_bricks(
+    field: NGPField, routes: Sequence[Route], options: BakeOptions | None = None
+) -> BakePlan:
+    """Find the bricks of a field, before any memory is taken for them.
+
+    Args:
+        field: the field, in the routes' frame.
+        routes: at least one.
+        options: None for the defaults.
+
+    Raises:
+        InputError: no cell of the field has density.
+    """
+    options = options or BakeOptions()
+    octants = field.occupancy.octants
+    if octants is None:
+        octants = dense_octants(field)
+    cells = octants > 0
+    if not cells.any():
+        raise InputError("bake: the field is empty; fit it again")
+    size = (field.upper - field.lower) / cells.shape
+    centre = field.lower + (np.argwhere(cells) + 0.5) * size
+    places = np.concatenate([_places(route) for route in routes])
+    distance, index = KDTree(places).query(centre[:, :2])
+    wanted = size.max() / (options.cone * np.maximum(distance, 1e-6))
+    subdivisions = 2 ** np.ceil(np.log2(np.clip(wanted, 1, FINEST))).astype(int)
+    kept = Occupancy(cells, octants)
+    return BakePlan(kept, subdivisions.astype(np.uint8), places[index])
+
+
+def bake(
+    field: NGPField,
+    routes: Sequence[Route],
+    camera: Camera,
+    mount: CameraMount | None = None,
+    options: BakeOptions | None = None,
+    plan: BakePlan | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> BrickField:
+    """Bake a field into bricks, as cameras along routes see it.
+
+    Vertices begin with the field's density and, seen from the nearest place on a route,
+    its colour there. Then rays from poses along the routes are marched through the
+    field; at their samples the difference of bricks and field goes back to the eight
+    vertices around, by the weight that the sample has in its pixel. So colours off the
+    surfaces become what the surfaces need, and views are averaged.
+
+    Args:
+        field: the field, in the routes' frame.
+        routes: at least one.
+        camera: of the poses.
+        mount: of the camera on the vehicle; None for the default mount.
+        options: None for the defaults.
+        plan: from :func:`plan_bricks`, of the same arguments; found when left out.
+        progress: called with (passes done, all) after each.
+
+    Source: Hedman et al. 2021 (baking); the refinement is Richardson's iteration on the
+    samples' least squares, each row divided by its sum.
+    """
+    options, mount = options or BakeOptions(), mount or CameraMount()
+    plan = plan or plan_bricks(field, routes, options)
+    codes = Codes.of(field.step_m)
+    with dr.suspend_grad():
+        baked = BrickField(
+            field.lower,
+            field.upper,
+            plan.occupancy,
+            plan.subdivisions,
+            _first_vertices(field, plan, codes, mount.height_m),
+            codes,
+            field.tensors()["sky"],
+            field.step_m,
+            field.cone,
+            dict(field.info),
+        )
+        for step in range(options.passes):
+            progress(step, options.passes)
+            seed = options.seed * 1000 + step
+            poses = drive_poses(routes, options.views, seed, mount)
+            _refine(baked, PosedField(field), _rays(camera, poses, seed))
+        progress(options.passes, options.passes)
+    return baked
+
+
+def _places(route: Route) -> np.ndarray:
+    """Return places along a route, (n, 2), metres."""
+    arcs = np.linspace(0, route.length, 2 + int(route.length / _SPACING_M))
+    return route.pose_at(arcs)[:, :2]
+
+
+def _first_vertices(
+    field: NGPField, plan: BakePlan, codes: Codes, height_m: float
+) -> np.ndarray:
+    """Return what vertices (m,) begin with, as words."""
+    cells = np.argwhere(plan.occupancy.cells)
+    ends = np.cumsum((plan.subdivisions.astype(np.int64) + 1) ** 3)
+    starts = np.append(0, ends[:-1])
+    size = (field.upper - field.lower) / plan.occupancy.shape
+    eyes = np.hstack([plan.nearest, np.full((len(cells), 1), height_m)])
+    heading = field.lower + (cells + 0.5) * size - eyes
+    heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
+    words = dr.zeros(mi.UInt32, int(ends[-1]))
+    for n in np.unique(plan.subdivisions):
+        some = plan.subdivisions == n
+        corner = mi.Point3f((field.lower + cells[some] * size).T.astype(np.float32))
+        towards = mi.Vector3f(heading[some].T.astype(np.float32))
+        start, edge = mi.UInt32(starts[some].astype(np.uint32)), mi.UInt32(int(n) + 1)
+        scale = mi.Vector3f(*map(float, size / float(n)))
+        dr.make_opaque(corner, towards, start, edge, scale)
+        vertex = dr.arange(mi.UInt32, int(some.sum()) * (int(n) + 1) ** 3)
+        brick, inner = vertex // edge**3, vertex % edge**3
+        place = inner // edge**2, inner // edge % edge, inner % edge
+        point = dr.gather(mi.Point3f, corner, brick)
+        point += mi.Vector3f(*map(mi.Float, place)) * scale
+        seen = dr.gather(mi.Vector3f, towards, brick)
+        density, radiance = field.eval_everywhere(point, seen, mi.Bool(True))
+        word = pack_word(codes.numbers(density, radiance))
+        dr.scatter(words, word, dr.gather(mi.UInt32, start, brick) + inner)
+        dr.eval(words)
+    return words.numpy()
+
+
+def _rays(camera: Camera, poses: np.ndarray, seed: int) -> Rays:
+    """Return the rays of all poses, with samples at random in their intervals."""
+    origin, direction = generate_rays(camera, *pose_arrays(poses), len(poses))
+    jitter = dr.rng(seed=seed).random(mi.Float, dr.width(direction))
+    rays = Rays(origin, direction, jitter=mi.Float(jitter))
+    dr.make_opaque(rays)
+    return rays
+
+
+def _refine(baked: BrickField, posed: PosedField, rays: Rays) -> None:
+    """Move vertices towards what the field has at the samples of rays."""
+    sums = [dr.zeros(mi.Float, dr.width(baked.vertices)) for _ in range(5)]
+    walk, active = Walk.start(posed, rays)
+    heading = dr.normalize(posed.turn(rays.direction))
+    dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)
+    *moves, weight = sums
+    rate = dr.rcp(dr.maximum(weight, _FAINT))
+    bytes_now = [mi.Float(mi.Int32(baked.vertices >> (8 * k) & 255)) for k in range(4)]
+    pairs = zip(bytes_now, moves, strict=True)
+    baked.vertices = pack_word([now + rate * move for now, move in pairs])
+    dr.make_opaque(baked.vertices)
+
+
+@dr.syntax
+def _add_differences(
+    baked: BrickField,
+    posed: PosedField,
+    walk: Walk,
+    active: mi.Bool,
+    heading: mi.Vector3f,
+    sums: list[mi.Float],
+) -> mi.Float:
+    """Add weighted differences of the samples to four sums, weights to the fifth."""
+    depth = mi.Float(0)
+    while active:
+        walk, here = walk.next([posed], active)
+        active = here.active
+        depth = _add_sample(baked, posed, walk, here, heading, depth, sums)
+        active &= dr.exp(-depth) > STOP
+    return depth
+
+
+def _add_sample(
+    baked: BrickField,
+    posed: PosedField,
+    walk: Walk,
+    here: Segment,
+    heading: mi.Vector3f,
+    depth: mi.Float,
+    sums: list[mi.Float],
+) -> mi.Float:
+    field, point = posed.field, walk.paths[0].at(here.t)
+    unit = field.unit(point)
+    density, radiance = field.eval_everywhere(point, heading, here.active)
+    (step,) = here.depths([posed.in_world(density * field.window(unit, here.active))])
+    weight = dr.exp(-depth) * (1 - dr.exp(-step))
+    corners = baked.corners(unit, here.active)
+    wanted = baked.codes.numbers(density, radiance)
+    found = baked.interpolate(corners, here.active)
+    changes = [a - b for a, b in zip(wanted, found, strict=True)]
+    for vertex, share in corners:
+        for total, change in zip(sums, [*changes, mi.Float(1)], strict=True):
+            part = weight * share * change
+            dr.scatter_reduce(dr.ReduceOp.Add, total, part, vertex, here.active)
+    return depth + step

@@ -1,0 +1,95 @@
+"""How well bricks show what the field shows that they were baked from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fit.scores import FieldRenderer, Rendering, compare
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.vehicle.route.route import Route
+
+LATERALS_M = (-1.0, 0.0, 1.0)
+_SURE = 0.9  # opacity from which depths are compared
+
+
+@dataclass(frozen=True, eq=False)
+class BakedView:
+    """One view of both.
+
+    Attributes:
+        route: name.
+        arc_m: arc length along the route.
+        lateral_m: offset to its left.
+        psnr_db: of sRGB values in [0, 1], bricks against field.
+        ssim: as in `scores.ViewScore`.
+        depth_m: median difference of depths where both are nearly opaque, metres; NaN
+            where they nowhere are.
+        pictures: what the field and the bricks show; kept for the worst views alone.
+    """
+
+    route: str
+    arc_m: float
+    lateral_m: float
+    psnr_db: float
+    ssim: float
+    depth_m: float
+    pictures: tuple[Rendering, Rendering] | None = None
+
+
+def score_bake(
+    field: AbstractField,
+    baked: AbstractField,
+    routes: Sequence[Route],
+    camera: Camera,
+    mount: CameraMount | None = None,
+    spacing_m: float = 4.0,
+    keep: int = 4,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[BakedView]:
+    """Compare bricks with their field on the routes and 1 m beside, on either side.
+
+    Args:
+        field: in the routes' frame.
+        baked: likewise.
+        routes: at least one.
+        camera: intrinsics.
+        mount: of the camera on the vehicle; None for the default mount.
+        spacing_m: arc length between two views, about.
+        keep: views of least PSNR whose pictures are kept.
+        progress: called with (views done, all) after each.
+
+    Returns:
+        a score a view, route by route.
+    """
+    eyes = FieldRenderer(field), FieldRenderer(baked)
+    places = [
+        (route, float(arc), lateral)
+        for route in routes
+        for arc in np.linspace(0, route.length, 2 + int(route.length / spacing_m))
+        for lateral in LATERALS_M
+    ]
+    views: list[BakedView] = []
+    for route, arc, lateral in places:
+        pose = mount_matrix(route.pose_at(arc, lateral), mount or CameraMount())[0]
+        wanted, shown = (eye.render(camera, pose) for eye in eyes)
+        scores = compare(shown.image, wanted.image)
+        depth = _depth_difference(wanted, shown)
+        where = route.name, arc, lateral
+        views.append(BakedView(*where, *scores, depth, (wanted, shown)))
+        kept = [view for view in views if view.pictures is not None]
+        if len(kept) > keep:
+            best = max(kept, key=lambda view: view.psnr_db)
+            views[views.index(best)] = replace(best, pictures=None)
+        progress(len(views), len(places))
+    return views
+
+
+def _depth_difference(wanted: Rendering, shown: Rendering) -> float:
+    both = (wanted.opacity >= _SURE) & (shown.opacity >= _SURE)
+    if not both.any():
+        return float("nan")
+    return float(np.median(np.abs(wanted.depth[both] - shown.depth[both])))

@@ -1,0 +1,105 @@
+"""Bricks look like the field that they were baked from."""
+
+from __future__ import annotations
+
+import json
+
+import drjit as dr
+import numpy as np
+import pytest
+from helpers.small_fields import homogeneous, small_ngp
+
+from mi_nerfattack import cli
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import NGPField, Occupancy, load_field, save_field
+from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
+from mi_nerfattack.fit.bake.scores import score_bake
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.vehicle.route.route import Route
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ROUTE = Route("line", 0, np.array([[-1.6, 0.1], [0.2, 0.1]]))
+CAMERA, MOUNT = from_fov(40, 24, 80.0), CameraMount(0.4, 0.0, 10.0)
+
+
+@pytest.fixture
+def field(rng) -> NGPField:
+    """A smooth field in half of its cells, with colours that depend on the view."""
+    field = small_ngp(cone=1 / 64)
+    table = field.parameters()["table"].numpy() * 0.5
+    field.set_parameter("table", type(field.parameters()["table"])(table))
+    field.density_scale = 2.0
+    cells = rng.random((6, 5, 4)) < 0.5
+    field.occupy(Occupancy(cells))
+    return field
+
+
+def test_parts_are_finer_near_the_route(field):
+    plan = plan_bricks(field, [ROUTE], BakeOptions(cone=0.3))
+    centre = -1 + 2 * (np.argwhere(plan.occupancy.cells) + 0.5) / (6, 5, 4)
+    x = np.clip(centre[:, 0], -1.6, 0.2)
+    distance = np.hypot(centre[:, 0] - x, centre[:, 1] - 0.1)
+    parts = 0.5 / plan.subdivisions  # of the longest edge of a cell
+    assert (parts <= np.maximum(0.3 * distance * 1.5, 0.5 / 8)).all()
+    finer = plan.subdivisions < 8
+    assert finer.any() and not finer.all()
+    assert (2 * parts[finer] > 0.3 * distance[finer] * 0.7).all()
+    assert plan.peak_mb > plan.file_mb > 0
+
+
+def test_refinement_brings_bricks_to_the_field(field):
+    least = []
+    for passes in (0, 2):
+        options = BakeOptions(cone=0.05, passes=passes, views=20)
+        baked = bake(field, [ROUTE], CAMERA, MOUNT, options)
+        assert (baked.step_m, baked.cone) == (field.step_m, field.cone)
+        views = score_bake(field, baked, [ROUTE], CAMERA, MOUNT, spacing_m=0.5, keep=2)
+        assert sum(view.pictures is not None for view in views) == 2
+        seen = min(views, key=lambda view: view.psnr_db)
+        assert seen.pictures is not None and seen.pictures[0].image.std() > 0.02
+        least.append(seen.psnr_db)
+    assert least[1] > least[0] + 1
+    assert least[1] > 28
+
+
+def test_sky_behind_is_that_of_the_field(field):
+    baked = bake(field, [ROUTE], CAMERA, MOUNT, BakeOptions(passes=0))
+    towards = dr.normalize(type(field.unit(0))([0.3, -1], [0.2, 0.5], [1.0, 0.1]))
+    pair = [np.array(item.background(towards)) for item in (baked, field)]
+    np.testing.assert_allclose(*pair, atol=1e-6)
+
+
+def test_the_command_writes_field_and_report(field, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    field.lower, field.upper = np.array([-1.0, -1, 0.4]), np.array([1.0, 1, 2.4])
+    save_field("field.safetensors", field)
+    routes = {"line": {"goal": 0, "points_m": [[-1.6, 0.1], [0.2, 0.1]]}}
+    routes["line"] |= {"lane_width_m": 3.5, "speed_ms": 5.0}
+    (tmp_path / "routes.json").write_text(json.dumps(routes))
+    words = "bake field.safetensors --routes routes.json -o b.safetensors --views 4"
+    size = ["--width", "32", "--height", "20", "--cone", "0.1"]
+    assert cli.main([*words.split(), *size, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["psnr_db"] >= facts["psnr_least_db"] > 10
+    baked = load_field("b.safetensors")
+    assert baked.kind == "brick_field" and facts["bricks"] == len(baked.subdivisions)
+    written = json.loads((tmp_path / "b.report" / "metrics.json").read_text())
+    assert written["psnr_db"] == facts["psnr_db"]
+    names = {path.name for path in (tmp_path / "b.report").iterdir()}
+    assert names == {"report.html", "metrics.json", "worst.png", "depth.png"}
+
+
+def test_what_cannot_be_baked(field, tmp_path, capsys):
+    save_field(tmp_path / "grid.safetensors", homogeneous())
+    routes = tmp_path / "routes.json"
+    point = {"goal": 0, "points_m": [[0, 0], [1, 0]], "lane_width_m": 3, "speed_ms": 5}
+    routes.write_text(json.dumps({"line": point}))
+    words = ["--routes", str(routes), "-o", str(tmp_path / "b.safetensors")]
+    assert cli.main(["bake", str(tmp_path / "grid.safetensors"), *words]) == 2
+    assert "is a grid_field; only an ngp_field is baked" in capsys.readouterr().err
+    field.occupy(Occupancy(np.zeros((2, 2, 2), bool)))
+    with pytest.raises(InputError, match="bake: the field is empty"):
+        plan_bricks(field, [ROUTE])
+    with pytest.raises(InputError, match="cone: 0"):
+        BakeOptions(cone=0)
