@@ -89,15 +89,16 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
     """Make a side of a comparison of attack iterations; imports only what it needs.
 
     Args:
-        role: ``ours``, ``plain`` or ``tuned``.
-        rest: width, height, poses and horizon; for a peer, also the files of the
-            background and of the object, and, to try nothing else, the rays of a
-            chunk and the object's lookup.
+        role: ``ours``, ``plain``, ``tuned`` or ``baked``.
+        rest: width, height, poses and horizon; for ours, also the file of the bricks,
+            if they are asked for; for a peer, the files of the background and of the
+            object, and, to try nothing else, the rays of a chunk and the object's
+            lookup.
     """
     from bench.attack.drive import Job
 
     job, others = Job(*map(int, rest[:4])), rest[4:]
-    if role in ("plain", "tuned"):
+    if role != "ours":
         from bench.attack.peer import LOOKUPS, TorchAttack
         from bench.render.peer import CHUNKS
 
@@ -108,7 +109,7 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
     variant.ensure()
     from bench.attack.ours import OurAttack
 
-    return OurAttack(job)
+    return OurAttack(job, *map(Path, others))
 
 
 if __name__ == "__main__":

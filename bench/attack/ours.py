@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -40,7 +41,12 @@ from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.integrators import RK4
 
-ADJOINTS = {"replay": Replay(), "kept_backgrounds": KeptBackgrounds()}
+BAKED = "baked"
+ADJOINTS = {
+    "replay": Replay(),
+    "kept_backgrounds": KeptBackgrounds(),
+    BAKED: KeptBackgrounds(),
+}
 VISIBLE = 0.01  # opacity from which a pixel counts as the object's
 
 
@@ -49,9 +55,10 @@ class OurAttack(AbstractAttack):
 
     Args:
         job: what is driven.
+        baked: field file of the scene's bricks, for the way `BAKED`.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, baked: Path | None = None) -> None:
         torch.set_num_threads(1)  # as the commands do: more would wait spinning
         self.job = job
         item = PosedField(load_grid(bundled("hydrant/field.safetensors")), OBJECT_POSE)
@@ -74,6 +81,11 @@ class OurAttack(AbstractAttack):
         self.rollout = Rollout(self.loop, objective, job.horizon)
         self.route = path
         self.attacks: dict[str, GradientAttack] = {}
+        self.loops = dict.fromkeys(ADJOINTS, self.loop)
+        if baked is not None:
+            view = job.camera, MOUNT, None, STOP
+            bricks = FieldSensor(PosedField(load_field(baked)), [item], *view)
+            self.loops[BAKED] = replace(self.loop, sensor=bricks)
 
     def iterate(self, how: str) -> dict[str, float]:
         """See :meth:`AbstractAttack.iterate`; `how` is a key of `ADJOINTS`."""
@@ -88,9 +100,10 @@ class OurAttack(AbstractAttack):
         """
         self._attack(how, 2).step()
 
-    def drive(self) -> dict[str, float]:
+    def drive(self, how: str = "replay") -> dict[str, float]:
         """Drive without derivatives, and return what :meth:`iterate` does."""
-        return _timed(lambda: simulate(self.loop, self.initial, self.job.horizon))
+        loop = self.loops[how]
+        return _timed(lambda: simulate(loop, self.initial, self.job.horizon))
 
     def facts(self) -> dict[str, Any]:
         """Return the object's share of the pixels, mean and largest, and threads."""
@@ -117,7 +130,7 @@ class OurAttack(AbstractAttack):
             all pixels of all poses (``rollout_over_pixels``; the others are over
             poses or single numbers), and ``iteration``, with its backward pass.
         """
-        rollout, wide, compiled = self._history(self.drive)
+        rollout, wide, compiled = self._history(lambda: self.drive(how))
         iteration, _, late = self._history(lambda: self.iterate(how))
         horizon = self.job.horizon
         return {
@@ -139,7 +152,8 @@ class OurAttack(AbstractAttack):
         return sizes[0]
 
     def _attack(self, how: str, horizon: int) -> GradientAttack:
-        rollout = replace(self.rollout, adjoint=ADJOINTS[how], horizon=horizon)
+        parts = {"loop": self.loops[how], "adjoint": ADJOINTS[how]}
+        rollout = replace(self.rollout, **parts, horizon=horizon)
         freedom = Freedom(texture_rate=RATE)
         return GradientAttack(rollout, self.route, self.initial, freedom)
 

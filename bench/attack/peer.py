@@ -23,6 +23,7 @@ from bench.attack.sides import AbstractAttack
 from bench.full_ngp import NGPData
 from bench.render.peer import CHUNKS, GRIDS
 from bench.render.sides import STOP, Clock
+from bench.torch.bricks import TorchBricks
 from bench.torch.loop import (
     Resized,
     TorchCamera,
@@ -51,8 +52,8 @@ class TorchAttack(AbstractAttack):
     They are tried out on the first frame and on one in the middle of the road.
 
     Args:
-        style: of the background's encoding, a key of `GRIDS`.
-        scene: file of the background, from :class:`NGPData`.
+        style: of the background's encoding, a key of `GRIDS`; or ``baked``.
+        scene: file of the background, from :class:`NGPData`; or of its bricks.
         item: file of the object, from :class:`ObjectData`.
         job: what is driven.
         chunks: of the background's rays, sizes to try.
@@ -70,8 +71,7 @@ class TorchAttack(AbstractAttack):
     ) -> None:
         torch.set_num_threads(cores())
         self.job = job
-        data = NGPData.read(scene)
-        ngp = TorchNGP(data, GRIDS[style](data.layout), STOP)
+        ngp = _scene(style, scene)
         self.item = TorchObject(ObjectData.read(item), LOOKUPS[lookups[0]], STOP)
         self.item.texture.requires_grad_(True)
         camera = TorchCamera(job.camera, MOUNT)
@@ -135,6 +135,13 @@ class TorchAttack(AbstractAttack):
             self.lookup = _best(lookups, see)
             self.item.lookup = LOOKUPS[self.lookup]
             self.optimiser.zero_grad()
+
+
+def _scene(style: str, path: Path) -> TorchNGP:
+    if style == "baked":
+        return TorchBricks(path, STOP)
+    data = NGPData.read(path)
+    return TorchNGP(data, GRIDS[style](data.layout), STOP)
 
 
 class Tape(torch.autograd.graph.saved_tensors_hooks):

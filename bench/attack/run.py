@@ -11,17 +11,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.attack.drive import OBJECT_POSE, Job
+from bench.attack.drive import MOUNT, OBJECT_POSE, Job
 from bench.full_ngp import NGPData
 from bench.render.run import PAUSE_S, Worker
+from bench.render.sides import FOV_DEG
 from bench.torch.object import ObjectData
 from mi_nerfattack import variant
-from mi_nerfattack.fields import NGPField, load_field, load_grid
+from mi_nerfattack.fields import NGPField, load_field, load_grid, save_field
+from mi_nerfattack.fit.bake.bake import bake
+from mi_nerfattack.fit.bake.scores import score_bake
+from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenes import bundled
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 WAYS = ("kept_backgrounds", "replay")
-PEERS = {"plain": "torch_", "tuned": "torch_tuned_"}
+BAKED = "baked"
+PEERS = {"plain": "torch_", "tuned": "torch_tuned_", BAKED: "torch_baked_"}
+#: Keys of milliseconds by whose they are.
+MILLISECONDS = {
+    "rollout": "rollout_ms",
+    WAYS[0]: "iteration_ms",
+    WAYS[1]: "replay_iteration_ms",
+    f"ours, {BAKED}": "baked_iteration_ms",
+    "plain": "torch_iteration_ms",
+    "tuned": "torch_tuned_iteration_ms",
+    BAKED: "torch_baked_iteration_ms",
+}
+_SCORE_EVERY_M = 8.0
 PARTS = ("time", "memory")
 
 Progress = Callable[[str, int, int, str], None]
@@ -102,16 +119,17 @@ class Bench:
 
     def __init__(self, settings: Settings, folder: Path, progress: Progress) -> None:
         self.settings, self.progress = settings, progress
-        self.scene, self.item = (
-            folder / "scene.safetensors",
-            folder / "item.safetensors",
+        names = ("scene", "item", "baked")
+        self.scene, self.item, self.baked = (
+            folder / f"{name}.safetensors" for name in names
         )
 
     def write_files(self) -> None:
-        """Write background and object for the peers."""
-        scene = load_field(bundled("intersection/field.safetensors"))
-        assert isinstance(scene, NGPField)
+        """Write background, bricks and object for all sides."""
+        scene = _scene()
         NGPData.of(scene).write(self.scene)
+        camera = from_fov(*Settings().sizes[0], FOV_DEG)
+        save_field(self.baked, bake(scene, _routes(), camera, MOUNT))
         item = load_grid(bundled("hydrant/field.safetensors"))
         ObjectData.of(PosedField(item, OBJECT_POSE)).write(self.item)
 
@@ -123,11 +141,14 @@ class Bench:
         turns: Turns = {}
         with ExitStack() as stack:
             ours = stack.enter_context(self._ours(job))
-            for way in WAYS:  # traces and compiles
+            for way in (*WAYS, BAKED):  # traces and compiles
                 ours.ask("iterate", way)
             peers = {role: stack.enter_context(self._peer(role, job)) for role in PEERS}
             for repeat in range(repeats):
                 self._turn(ours, turns)
+                turns.setdefault(f"ours, {BAKED}", []).append(
+                    ours.ask("iterate", BAKED)
+                )
                 for role, peer in peers.items():
                     self.progress(stage, repeat, repeats, f"PyTorch, {role}")
                     time.sleep(PAUSE_S)
@@ -135,8 +156,10 @@ class Bench:
                 self.progress(stage, repeat + 1, repeats, "")
             facts = {role: peer.ask("facts") for role, peer in peers.items()}
             facts["ours"] = ours.ask("facts")
-            launches = {way: ours.ask("launches", way) for way in WAYS}
+            launches = {way: ours.ask("launches", way) for way in (*WAYS, BAKED)}
         return _time_row(turns) | {
+            "bake_psnr_db": self._bake_psnr_db(size),
+            "bake_mb": self.baked.stat().st_size / 1e6,
             "horizon": job.horizon,
             "launches_per_step": launches,
             "kernels_compiled_after_warmup": sum(
@@ -198,13 +221,31 @@ class Bench:
         for way in ways:
             turns.setdefault(way, []).append(ours.ask("iterate", way))
 
+    def _bake_psnr_db(self, size: tuple[int, int]) -> float:
+        """Return the mean PSNR of the bricks against the field."""
+        camera = from_fov(*size, FOV_DEG)
+        parts = _scene(), load_field(self.baked), _routes(), camera, MOUNT
+        views = score_bake(*parts, spacing_m=_SCORE_EVERY_M)
+        return statistics.fmean(view.psnr_db for view in views)
+
     def _ours(self, job: Job) -> Worker:
-        return Worker("attack", "ours", *job.arguments())
+        return Worker("attack", "ours", *job.arguments(), str(self.baked))
 
     def _peer(self, role: str, job: Job) -> Worker:
-        files = (str(self.scene), str(self.item))
+        scene = self.baked if role == BAKED else self.scene
+        files = (str(scene), str(self.item))
         arguments = (*job.arguments(), *files, *self.settings.choices)
         return Worker("attack", role, *arguments)
+
+
+def _scene() -> NGPField:
+    field = load_field(bundled("intersection/field.safetensors"))
+    assert isinstance(field, NGPField)
+    return field
+
+
+def _routes() -> list[Route]:
+    return load_routes(bundled("intersection/routes.json"))
 
 
 def memory_row(
@@ -247,10 +288,13 @@ def _time_row(turns: Turns) -> dict[str, Any]:
         "replay_over_rollout": _ratio(turns["replay"], turns["rollout"]),
     }
     for role, prefix in PEERS.items():
-        row[f"{prefix}time_ratio"] = _ratio(turns[role], turns[WAYS[0]])
-        row[f"{prefix}cpu_ratio"] = _ratio(turns[role], turns[WAYS[0]], "cpu_seconds")
+        ours = turns[f"ours, {BAKED}" if role == BAKED else WAYS[0]]
+        row[f"{prefix}time_ratio"] = _ratio(turns[role], ours)
+        row[f"{prefix}cpu_ratio"] = _ratio(turns[role], ours, "cpu_seconds")
     for name, some in turns.items():
-        prefix = PEERS.get(name, f"{name}_")
+        prefix = {**PEERS, f"ours, {BAKED}": f"{BAKED}_"}.get(name, f"{name}_")
+        seconds = statistics.median(turn["seconds"] for turn in some)
+        row[MILLISECONDS[name]] = 1000 * seconds
         for unit in ("seconds", "cpu_seconds"):
             row[f"{prefix}{unit}"] = statistics.median(turn[unit] for turn in some)
     return row

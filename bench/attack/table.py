@@ -12,8 +12,10 @@ WHO = {
     "rollout alone": "rollout_",
     "iteration, backgrounds kept": "kept_backgrounds_",
     "iteration, replay": "replay_",
+    "iteration, bricks": "baked_",
     "PyTorch": "torch_",
     "PyTorch, tuned": "torch_tuned_",
+    "PyTorch, bricks": "torch_baked_",
 }
 
 

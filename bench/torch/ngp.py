@@ -91,7 +91,7 @@ class TorchNGP:
         self.lower = _single(data.lower)
         self.extent = _single(data.upper) - self.lower
         self.density_scale = 1 / float(np.max(data.upper - data.lower))
-        self.occupied = torch.from_numpy(_halves(data.octants))
+        self.occupied = torch.from_numpy(halves(data.octants))
         self.window = TorchWindow(data.cells)
         self.step, self.cone = data.step_m, max(data.cone, 1e-12)
         self.evaluated = 0
@@ -303,7 +303,7 @@ def _single(value: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.array(value, np.float32))
 
 
-def _halves(octants: np.ndarray) -> np.ndarray:
+def halves(octants: np.ndarray) -> np.ndarray:
     """Return the octants of cells (rx, ry, rz), as bits, as booleans of half cells."""
     rx, ry, rz = octants.shape
     bits = np.unpackbits(octants[..., None], axis=-1, bitorder="little")

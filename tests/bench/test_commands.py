@@ -110,6 +110,8 @@ def test_attack_prints_the_promised_keys(capsys, tmp_path):
     for key in (
         *("iteration_over_rollout", "replay_over_rollout", "torch_memory_ratio"),
         *("torch_time_ratio", "torch_tuned_time_ratio", "torch_cpu_ratio"),
+        *("iteration_ms", "replay_iteration_ms", "baked_iteration_ms", "rollout_ms"),
+        *("torch_iteration_ms", "torch_tuned_iteration_ms", "bake_mb", "bake_psnr_db"),
     ):
         assert row[key] > 0
     assert list(row["peak_memory_mb_by_horizon"]) == ["1", "2"]
@@ -120,7 +122,7 @@ def test_attack_prints_the_promised_keys(capsys, tmp_path):
     single = row["launches_per_step"]["kept_backgrounds"]
     batch = row["batch"]["launches_per_step"]
     assert batch["rollout_over_pixels"] == single["rollout_over_pixels"]
-    assert time_table(document).row_count == 5
+    assert time_table(document).row_count == 7
     assert memory_table(document).row_count == 6
     assert len(attack_remarks(document)) == 4
 
