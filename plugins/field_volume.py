@@ -39,6 +39,7 @@ def read_field(props: mi.Properties, kind: str) -> GridField | NGPField:
         raise InputError(
             f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'
         )
+    field.see_all()  # derivatives by rays, and media, do
     return field
 
 

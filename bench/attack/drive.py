@@ -29,6 +29,7 @@ LATERAL_SD_M = 0.1
 ROUNDING_M = 0.05  # of the objective's absolute value
 RATE = 1e-6  # of Adam; small, so that all iterations drive alike
 MOUNT = CameraMount()
+BAKED = "baked"  # the way, and the role, with the scene as bricks
 OBJECT_POSE = Pose.upright((-4.0, -3.4, 0.0), 0.0, 2.0)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from bench.attack.drive import (
+    BAKED,
     MAX_HEADING_RATE,
     MOUNT,
     OBJECT_POSE,
@@ -41,7 +42,6 @@ from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.integrators import RK4
 
-BAKED = "baked"
 ADJOINTS = {
     "replay": Replay(),
     "kept_backgrounds": KeptBackgrounds(),
@@ -81,7 +81,7 @@ class OurAttack(AbstractAttack):
         self.rollout = Rollout(self.loop, objective, job.horizon)
         self.route = path
         self.attacks: dict[str, GradientAttack] = {}
-        self.loops = dict.fromkeys(ADJOINTS, self.loop)
+        self.loops = dict.fromkeys(set(ADJOINTS) - {BAKED}, self.loop)
         if baked is not None:
             view = job.camera, MOUNT, None, STOP
             bricks = FieldSensor(PosedField(load_field(baked)), [item], *view)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from bench.attack.drive import (
+    BAKED,
     MAX_HEADING_RATE,
     MOUNT,
     RATE,
@@ -138,7 +139,7 @@ class TorchAttack(AbstractAttack):
 
 
 def _scene(style: str, path: Path) -> TorchNGP:
-    if style == "baked":
+    if style == BAKED:
         return TorchBricks(path, STOP)
     data = NGPData.read(path)
     return TorchNGP(data, GRIDS[style](data.layout), STOP)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.attack.drive import MOUNT, OBJECT_POSE, Job
+from bench.attack.drive import BAKED, MOUNT, OBJECT_POSE, Job
 from bench.full_ngp import NGPData
 from bench.render.run import PAUSE_S, Worker
 from bench.render.sides import FOV_DEG
@@ -26,7 +26,6 @@ from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 WAYS = ("kept_backgrounds", "replay")
-BAKED = "baked"
 PEERS = {"plain": "torch_", "tuned": "torch_tuned_", BAKED: "torch_baked_"}
 #: Keys of milliseconds by whose they are.
 MILLISECONDS = {
@@ -140,7 +139,7 @@ class Bench:
         self.progress(stage, 0, repeats, "starting")
         turns: Turns = {}
         with ExitStack() as stack:
-            ours = stack.enter_context(self._ours(job))
+            ours = stack.enter_context(self._ours(job, str(self.baked)))
             for way in (*WAYS, BAKED):  # traces and compiles
                 ours.ask("iterate", way)
             peers = {role: stack.enter_context(self._peer(role, job)) for role in PEERS}
@@ -228,8 +227,8 @@ class Bench:
         views = score_bake(*parts, spacing_m=_SCORE_EVERY_M)
         return statistics.fmean(view.psnr_db for view in views)
 
-    def _ours(self, job: Job) -> Worker:
-        return Worker("attack", "ours", *job.arguments(), str(self.baked))
+    def _ours(self, job: Job, *baked: str) -> Worker:
+        return Worker("attack", "ours", *job.arguments(), *baked)
 
     def _peer(self, role: str, job: Job) -> Worker:
         scene = self.baked if role == BAKED else self.scene

@@ -13,8 +13,6 @@ from bench.torch.ngp import BATCHES, TorchNGP, halves
 from bench.torch.window import TorchWindow
 from mi_nerfattack.io import files
 
-FINEST = 8
-
 
 class TorchBricks(TorchNGP):
     """A brick field at the identity pose; see `mi_nerfattack.fields.bricks`.
@@ -42,6 +40,7 @@ class TorchBricks(TorchNGP):
         self.occupied = torch.from_numpy(halves(octants))
         self.window = TorchWindow(cells)
         self.step, self.cone = float(header["step_m"]), float(header["cone"])
+        self.cone = max(self.cone, 1e-12)
         self.sky = torch.from_numpy(tensors["sky"])
         divided = tensors["subdivisions"].astype(np.int64)
         ends = np.cumsum((divided + 1) ** 3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Evaluation, Rollout
+from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -143,6 +144,19 @@ class GradientAttack:
         """Drive with the present parameters, so that the last update counts too."""
         self._install()
         return self._record(self.rollout.measure(self.initial))
+
+    def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
+        """Drive with what the objects look like, seen by another sensor.
+
+        Args:
+            sensor: that shows the same objects.
+
+        Returns:
+            mean distance from the lane centre, metres.
+        """
+        loop = replace(self.rollout.loop, sensor=sensor)
+        seen = replace(self.rollout, loop=loop).measure(self.initial)
+        return float(self._errors(seen).mean())
 
     @property
     def best(self) -> list[np.ndarray]:
@@ -333,9 +347,7 @@ class GradientAttack:
             colours: that it was driven with; the present ones by default.
         """
         colours = self._colours() if colours is None else colours
-        states = seen.trajectory.states_numpy()[:, 1:]
-        error = self.route.cross_track_numpy(states.reshape(-1, states.shape[2]))
-        error = np.abs(error)
+        error = self._errors(seen)
         mean, value = float(error.mean()), seen.value
         value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
         if value < self.best_objective:
@@ -343,6 +355,11 @@ class GradientAttack:
             self.best_objective, self.best_mean_m = value, mean
         costs = tuple(map(float, seen.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)
+
+    def _errors(self, seen: Evaluation) -> np.ndarray:
+        """Return the distances from the lane centre, metres, of all states."""
+        states = seen.trajectory.states_numpy()[:, 1:]
+        return np.abs(self.route.cross_track_numpy(states.reshape(-1, states.shape[2])))
 
 
 def _tensor(value: np.ndarray) -> Any:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import BrickField, GridField, NGPField
+from mi_nerfattack.fields import GridField, NGPField
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.conventions import from_mitsuba
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
@@ -99,8 +99,7 @@ def _is_grid(volume: Any) -> bool:
 
 def _has_no_sky(layer: Layer) -> bool:
     """Sort first the field whose background `field_integrator` shows."""
-    kinds = NGPField, BrickField
-    return not (isinstance(layer, PosedField) and isinstance(layer.field, kinds))
+    return not (isinstance(layer, PosedField) and isinstance(layer.field, NGPField))
 
 
 def _lens(scene: mi.Scene) -> tuple[Camera, Clip, mi.Sampler]:

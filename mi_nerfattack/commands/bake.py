@@ -27,7 +27,7 @@ class Bake:
     """Field file to write (.safetensors)."""
     cone: float = 1 / 64
     """Edge of a brick's parts over the distance to the nearest route; half takes up to
-    four times the memory."""
+    six times the memory."""
     passes: int = 2
     """Passes of the refinement."""
     views: int = 100
@@ -52,15 +52,24 @@ class Bake:
         from mi_nerfattack.fields import NGPField, load_field, save_field
         from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
         from mi_nerfattack.fit.bake.scores import score_bake
+        from mi_nerfattack.fit.scores import MIN_EDGE_PX
         from mi_nerfattack.render.camera.intrinsics import from_fov
         from mi_nerfattack.report.pages.bake import (
             bake_summary,
             bake_verdict,
             write_bake_report,
         )
+        from mi_nerfattack.report.pages.fit import finite
         from mi_nerfattack.vehicle.route.route import load_routes
 
         check_output(self.output)
+        if self.output.resolve() == self.field.resolve():
+            raise InputError(f"--output: {self.output} is the field itself")
+        if min(self.width, self.height) < MIN_EDGE_PX:
+            raise InputError(
+                f"--width, --height: {self.width} x {self.height}; SSIM takes at least "
+                f"{MIN_EDGE_PX} px each way"
+            )
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
         camera, routes = (
             from_fov(self.width, self.height, self.fov_deg),
@@ -99,7 +108,7 @@ class Bake:
         title = f"Bake of {self.field.name}"
         page = write_bake_report(report_folder(self.output), views, facts, title)
         if self.json:
-            print(json.dumps(facts | bake_summary(views)))
+            print(json.dumps(finite(facts | bake_summary(views))))
         else:
             print(f"{bake_verdict(views)}\nWrote {self.output} and {page}.")
         return 0

@@ -230,6 +230,12 @@ class _Baseline(_Model):
 _Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
+class _Bricks(_Model):
+    file: str
+    cross_track_mean_m: pydantic.NonNegativeFloat
+    field_cross_track_mean_m: pydantic.NonNegativeFloat
+
+
 class _Texture(_Model):
     l2: pydantic.NonNegativeFloat
     linf: pydantic.NonNegativeFloat
@@ -252,6 +258,7 @@ class _Document(_Model):
     textures: dict[str, _Texture] | None = None
     verdict: list[str] | None = None
     baseline: _Baseline | None = None
+    bricks: _Bricks | None = None
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None
     replay: dict[str, Any] | None = None

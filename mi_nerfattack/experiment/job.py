@@ -132,7 +132,7 @@ class Job:
         """Do what is not done yet."""
 
         def effort() -> Effort:
-            renders = world.surrogate.renders + stages.renders
+            renders = world.renders + stages.renders
             return account.total(renders, folder.checkpoint.seconds)
 
         stages = Stages(world, folder.drives, self.on_progress, effort)

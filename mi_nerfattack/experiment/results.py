@@ -148,12 +148,26 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     if done.ignored:
         more["ignored_changes"] = done.ignored
     more["converged"] = done.attack.has_converged
+    if scenario.scene.bricks is not None:
+        more["bricks"] = _in_bricks(done)
     more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(values, scenario.seed, done.driven, lanes, cost) | more
     document["verdict"] = verdict(document, SURROGATE)
     validate(document)
     return document
+
+
+def _in_bricks(done: Finished) -> dict[str, Any]:
+    """Say how far the attack's own drives go in bricks, and in the field itself."""
+    world, attack = done.world, done.attack
+    world.show(done.look(ATTACK))
+    exact = attack.measure_through(world.surrogate)
+    return {
+        "file": str(world.scenario.scene.bricks),
+        "cross_track_mean_m": attack.measure_through(world.optimised),
+        "field_cross_track_mean_m": exact,
+    }
 
 
 def _poses(world: World, look: Appearance) -> dict[str, Any]:

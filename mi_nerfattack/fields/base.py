@@ -74,7 +74,8 @@ class AbstractField(ABC):
             frame.
         cone: growth of the step with distance, 1/1; a step at distance t is about
             ``max(step_m, cone * t)``. Zero keeps the step constant.
-        occupancy: grid by which a march skips empty space, and nothing else.
+        occupancy: grid by which a march skips empty space and, where it has octants,
+            what is thin.
         window: factor of the density that is 0 in empty space.
     """
 
@@ -89,6 +90,14 @@ class AbstractField(ABC):
     def occupy(self, occupancy: Occupancy) -> None:
         """Make the field empty outside the occupied cells of a grid over its box."""
         self.occupancy, self.window = occupancy, Window(occupancy.cells)
+
+    def see_all(self) -> None:
+        """Let marches see thin octants, too.
+
+        Where a march skips them, samples come and go at once as a ray moves, and its
+        derivative by the ray misses that.
+        """
+        self.occupancy = Occupancy(self.window.cells)
 
     def refine(self, step_m: float) -> None:
         """Change the marching step; where it grows with distance, in proportion.

@@ -21,7 +21,9 @@ from mi_nerfattack.fields.sky import sky_colour
 FINEST = 8
 _LEVELS = (8, 4, 2, 1)
 _LEVEL_SHIFT = 30  # of a pointer, whose lower bits say where a brick begins
+MOST_VERTICES = (1 << _LEVEL_SHIFT) - 1
 _TOP = 255.0
+_LARGEST_LOG = 80.0  # its exponential is a number of single precision
 
 
 def vertex_count(subdivisions: np.ndarray) -> int:
@@ -43,6 +45,14 @@ class Codes:
 
     low: float
     high: float
+
+    def __post_init__(self) -> None:
+        """Check that the range is one."""
+        if not -_LARGEST_LOG < self.low < self.high < _LARGEST_LOG:
+            raise InputError(
+                f"log_density: {self.low:g} to {self.high:g}; must rise, within "
+                f"{-_LARGEST_LOG:g} to {_LARGEST_LOG:g}"
+            )
 
     @staticmethod
     def of(step_m: float) -> Codes:
@@ -127,7 +137,9 @@ class BrickField(AbstractField):
         self.vertices = mi.UInt32(np.ascontiguousarray(vertices, np.uint32))
         ends = np.cumsum((subdivisions.astype(np.int64) + 1) ** 3)
         level = np.log2(FINEST // subdivisions).astype(np.uint32)
-        pointers = np.zeros(occupancy.shape, np.uint32)
+        # without a brick: one part, at the first vertex, and no density
+        none = len(_LEVELS) - 1 << _LEVEL_SHIFT
+        pointers = np.full(occupancy.shape, none, np.uint32)
         pointers[occupancy.cells] = np.append(0, ends[:-1]) | level << _LEVEL_SHIFT
         self._pointers = mi.UInt32(pointers.ravel())
         self._sky_shape = sky.shape[0], sky.shape[1]
@@ -190,7 +202,7 @@ class BrickField(AbstractField):
     def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
-        """See :meth:`AbstractField.eval_everywhere`; nothing without a brick."""
+        """See :meth:`AbstractField.eval_everywhere`; anything without a brick."""
         del direction
         corners = self.corners(self.unit(point), active)
         density, radiance = self.codes.quantities(self.interpolate(corners, active))
@@ -229,15 +241,20 @@ def _check_bricks(
     occupancy: Occupancy, subdivisions: np.ndarray, vertices: np.ndarray, sky: Any
 ) -> None:
     bricks = int(occupancy.cells.sum())
-    if subdivisions.shape != (bricks,) or not np.isin(subdivisions, _LEVELS).all():
+    if not bricks:
+        raise InputError("occupancy: no cell is occupied; at least one has a brick")
+    good = subdivisions.shape == (bricks,) and subdivisions.dtype == np.uint8
+    if not good or not np.isin(subdivisions, _LEVELS).all():
         raise InputError(
-            f"subdivisions: shape {subdivisions.shape}; expected ({bricks},) of 1, 2, "
-            "4 and 8"
+            f"subdivisions: {subdivisions.dtype} {subdivisions.shape}; expected "
+            f"({bricks},) bytes of 1, 2, 4 and 8"
         )
     expected = vertex_count(subdivisions)
-    if vertices.shape != (expected,) or expected >= 1 << _LEVEL_SHIFT:
+    good = vertices.shape == (expected,) and vertices.dtype == np.uint32
+    if not good or expected > MOST_VERTICES:
         raise InputError(
-            f"vertices: shape {vertices.shape}; expected ({expected},), fewer than 2^30"
+            f"vertices: {vertices.dtype} {vertices.shape}; expected ({expected},) "
+            f"words, at most {MOST_VERTICES}"
         )
-    if sky.ndim != 3 or sky.shape[2] != 3:
+    if sky.ndim != 3 or sky.shape[2] != 3 or not sky.size:
         raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
@@ -115,13 +116,16 @@ def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField
 
 
 def _bricks(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> BrickField:
+    codes = _vector(meta, "log_density").tolist()
+    if len(codes) != len(fields(Codes)):
+        raise ValueError(f"log_density: {len(codes)} numbers; expected low and high")
     return BrickField(
         _vector(meta, "lower"),
         _vector(meta, "upper"),
         _occupancy(tensors, meta),
         tensors["subdivisions"],
         tensors["vertices"],
-        Codes(*_vector(meta, "log_density").tolist()),
+        Codes(*codes),
         tensors["sky"],
         _number(meta, "step_m", float),
         _number(meta, "cone", float),

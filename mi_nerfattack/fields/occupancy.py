@@ -95,7 +95,7 @@ class Occupancy:
     ) -> mi.Float:
         """Return how far a ray goes before it leaves the empty block, (n,).
 
-        Of an octant, it returns no more than that, and 0 on half of the ways.
+        Of an octant it returns less on most ways, as little as 0.
 
         Args:
             unit: (3, n), position in the unit box.

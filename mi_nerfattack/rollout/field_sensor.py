@@ -108,6 +108,11 @@ class FieldSensor(AbstractDifferentiableSensor):
         view = self.camera, self.mount, self.jitter_seed, self.stop, self.composite
         return FieldSensor(self.scene, objects, *view, self.surroundings, self.clip)
 
+    def within(self, scene: Layer) -> FieldSensor:
+        """Return a camera like this one that shows its objects in another scene."""
+        view = self.camera, self.mount, self.jitter_seed, self.stop, self.composite
+        return FieldSensor(scene, self.objects, *view, self.surroundings, self.clip)
+
     def observe(self, state: Any, step: int) -> Observation:
         """Render the composite; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)

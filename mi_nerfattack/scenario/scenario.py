@@ -51,6 +51,7 @@ class SceneSection(Section):
     """Where the drive takes place."""
 
     field: File | None = None  # or .ply of Gaussian splats: the surrogate
+    bricks: File | None = None  # of field, by bake: attacks are optimised in them
     surrogate: File | None = None  # Mitsuba scene XML with a field_integrator, instead
     deployment: File  # Mitsuba scene XML: the deployment environment
     routes: File  # JSON of routes
@@ -67,7 +68,7 @@ class SceneSection(Section):
             if self.field is None:
                 refuse("field", "is missing; give it, or surrogate")
             return self
-        for key in ("field", "composite", "step_m", "stop", "to_world"):
+        for key in ("field", "bricks", "composite", "step_m", "stop", "to_world"):
             if getattr(self, key) != self.defaults()[key]:
                 refuse(key, f"{self.surrogate} says it; leave out this, or surrogate")
         return self

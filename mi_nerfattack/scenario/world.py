@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -57,6 +58,7 @@ class World:
         route: the lane centre.
         fields: grid fields of the objects, in the scenario's order.
         surrogate: sensor in the scene's field.
+        optimised: sensor that attacks are made through; `surrogate`, or in bricks.
         deployments: other environments, by label.
         policy: the policy under test.
         motion: of the vehicle.
@@ -68,6 +70,7 @@ class World:
     route: Route
     fields: list[GridField]
     surrogate: FieldSensor
+    optimised: FieldSensor
     deployments: Mapping[str, Deployment]
     policy: AbstractPolicy
     motion: Motion
@@ -125,12 +128,23 @@ class World:
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
         textures = [grid.texture.numpy().copy() for grid in self.fields]
-        return Appearance(textures, self.surrogate.offsets())
+        return Appearance(textures, self.optimised.offsets())
 
     def show(self, appearance: Appearance) -> None:
         """Give the objects their textures and places."""
         self.set_textures(appearance.textures)
-        self.surrogate.set_offsets(appearance.offsets)
+        for sensor in self._sensors:
+            sensor.set_offsets(appearance.offsets)
+
+    @property
+    def renders(self) -> int:
+        """Frames that its sensors have rendered."""
+        return sum(sensor.renders for sensor in self._sensors)
+
+    @property
+    def _sensors(self) -> list[FieldSensor]:
+        same = self.optimised is self.surrogate
+        return [self.surrogate] if same else [self.surrogate, self.optimised]
 
     def set_textures(self, textures: list[np.ndarray]) -> None:
         """Give each object a texture, (n_vertices, 3) raw colours."""
@@ -149,6 +163,9 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         InputError: a file is missing or wrong.
     """
     place, surrogate = scenario.scene, build_surrogate(scenario)
+    optimised = surrogate
+    if place.bricks is not None:
+        optimised = surrogate.within(_load_layer(scenario, place.bricks.file))
     camera, mount = surrogate.camera, surrogate.mount
     route = Route.from_file(place.routes.file, place.route)
     motion = scenario.vehicle.motion()
@@ -176,6 +193,7 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         route,
         surrogate.fields,
         surrogate,
+        optimised,
         deployments(scenario.deployment, where),
         policy,
         motion,
@@ -207,7 +225,9 @@ def build_surrogate(scenario: Scenario) -> FieldSensor:
         posed.append(PosedField(field, item.pose))
     jitter = scenario.seed if scenario.attack.jitter else None
     look = place.stop, COMPOSITES[place.composite]()
-    return FieldSensor(_load_scene(scenario), posed, camera, mount, jitter, *look)
+    assert place.field is not None  # checked by SceneSection
+    scene = _load_layer(scenario, place.field.file)
+    return FieldSensor(scene, posed, camera, mount, jitter, *look)
 
 
 def build_attack(world: World) -> GradientAttack:
@@ -221,7 +241,7 @@ def build_attack(world: World) -> GradientAttack:
     """
     scenario, section = world.scenario, world.scenario.attack
     disturbance = section.disturbance(scenario.seed)
-    loop = replace(world.loop(world.surrogate), disturbance=disturbance)
+    loop = replace(world.loop(world.optimised), disturbance=disturbance)
     rollout = Rollout(
         loop,
         world.objective,
@@ -237,10 +257,9 @@ def build_attack(world: World) -> GradientAttack:
     return GradientAttack(rollout, world.route, initial, freedom, section.schedule)
 
 
-def _load_scene(scenario: Scenario) -> Layer:
-    """Load the scene: a field, or splats, which are told by the suffix .ply."""
-    assert scenario.scene.field is not None  # checked by SceneSection
-    path, matrix = scenario.scene.field.file, scenario.scene.to_world
+def _load_layer(scenario: Scenario, path: Path) -> Layer:
+    """Load a scene: a field, or splats, which are told by the suffix .ply."""
+    matrix = scenario.scene.to_world
     try:
         pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
     except ValueError as err:
@@ -250,6 +269,8 @@ def _load_scene(scenario: Scenario) -> Layer:
     if path.suffix.lower() != ".ply":
         field = load_field(path)
         field.refine(scenario.scene.step_m or field.step_m)
+        if scenario.attack.attached:
+            field.see_all()
         return PosedField(field, pose)
     if scenario.scene.step_m is not None:
         raise InputError(f"scene.step_m: {path} holds splats, which take no steps")

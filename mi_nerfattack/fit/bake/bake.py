@@ -1,9 +1,9 @@
-"""Bake a fitted scene into bricks: several times as fast to march."""
+"""Bake a fitted scene into bricks, which are faster to march."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +14,7 @@ from mi_nerfattack.capture.scene import drive_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.bricks import (
     FINEST,
+    MOST_VERTICES,
     BrickField,
     Codes,
     pack_word,
@@ -36,6 +37,7 @@ from mi_nerfattack.render.walk import Segment, Walk
 from mi_nerfattack.vehicle.route.route import Route
 
 _SPACING_M = 1.0  # between the places on routes that distances are measured from
+_RAYS_AT_ONCE = 1 << 21  # whose memory is little beside that of the vertices
 _FAINT = 1e-3  # sum of weights below which a vertex is hardly moved
 _WORDS_BAKING = 7  # of a vertex: before, after, and five sums
 
@@ -101,7 +103,7 @@ def plan_bricks(
     octants = field.occupancy.octants
     if octants is None:
         octants = dense_octants(field)
-    cells = octants > 0
+    cells = field.window.cells
     if not cells.any():
         raise InputError("bake: the field is empty; fit it again")
     size = (field.upper - field.lower) / cells.shape
@@ -110,6 +112,12 @@ def plan_bricks(
     distance, index = KDTree(places).query(centre[:, :2])
     wanted = size.max() / (options.cone * np.maximum(distance, 1e-6))
     subdivisions = 2 ** np.ceil(np.log2(np.clip(wanted, 1, FINEST))).astype(int)
+    subdivisions[octants[cells] == 0] = 1  # hardly ever looked at
+    if (count := vertex_count(subdivisions)) > MOST_VERTICES:
+        raise InputError(
+            f"cone: {options.cone:g}; bricks would have {count} vertices, at most "
+            f"{MOST_VERTICES} are possible, give a larger one"
+        )
     kept = Occupancy(cells, octants)
     return BakePlan(kept, subdivisions.astype(np.uint8), places[index])
 
@@ -138,7 +146,7 @@ def bake(
         mount: of the camera on the vehicle; None for the default mount.
         options: None for the defaults.
         plan: from :func:`plan_bricks`, of the same arguments; found when left out.
-        progress: called with (passes done, all) after each.
+        progress: called with (passes done, all) before the first and after each.
 
     Source: Hedman et al. 2021 (baking); the refinement is Richardson's iteration on the
     samples' least squares, each row divided by its sum.
@@ -157,15 +165,19 @@ def bake(
             field.tensors()["sky"],
             field.step_m,
             field.cone,
-            dict(field.info),
+            {**field.info, **_provenance(options)},
         )
+        progress(0, options.passes)
         for step in range(options.passes):
-            progress(step, options.passes)
             seed = options.seed * 1000 + step
             poses = drive_poses(routes, options.views, seed, mount)
-            _refine(baked, PosedField(field), _rays(camera, poses, seed))
-        progress(options.passes, options.passes)
+            _refine(baked, PosedField(field), camera, poses, seed)
+            progress(step + 1, options.passes)
     return baked
+
+
+def _provenance(options: BakeOptions) -> dict[str, str]:
+    return {f"provenance.bake_{key}": repr(v) for key, v in asdict(options).items()}
 
 
 def _places(route: Route) -> np.ndarray:
@@ -215,12 +227,17 @@ def _rays(camera: Camera, poses: np.ndarray, seed: int) -> Rays:
     return rays
 
 
-def _refine(baked: BrickField, posed: PosedField, rays: Rays) -> None:
-    """Move vertices towards what the field has at the samples of rays."""
+def _refine(
+    baked: BrickField, posed: PosedField, camera: Camera, poses: np.ndarray, seed: int
+) -> None:
+    """Move vertices towards what the field has at the samples of views' rays."""
     sums = [dr.zeros(mi.Float, dr.width(baked.vertices)) for _ in range(5)]
-    walk, active = Walk.start(posed, rays)
-    heading = dr.normalize(posed.turn(rays.direction))
-    dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)
+    at_once = max(1, _RAYS_AT_ONCE // (camera.width * camera.height))
+    for start in range(0, len(poses), at_once):
+        rays = _rays(camera, poses[start : start + at_once], seed + start)
+        walk, active = Walk.start(posed, rays)
+        heading = dr.normalize(posed.turn(rays.direction))
+        dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)
     *moves, weight = sums
     rate = dr.rcp(dr.maximum(weight, _FAINT))
     bytes_now = [mi.Float(mi.Int32(baked.vertices >> (8 * k) & 255)) for k in range(4)]

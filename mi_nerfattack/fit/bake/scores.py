@@ -69,7 +69,7 @@ def score_bake(
     places = [
         (route, float(arc), lateral)
         for route in routes
-        for arc in np.linspace(0, route.length, 2 + int(route.length / spacing_m))
+        for arc in _arcs(route, spacing_m)
         for lateral in LATERALS_M
     ]
     views: list[BakedView] = []
@@ -86,6 +86,11 @@ def score_bake(
             views[views.index(best)] = replace(best, pictures=None)
         progress(len(views), len(places))
     return views
+
+
+def _arcs(route: Route, spacing_m: float) -> np.ndarray:
+    count = 2 + int(route.length / spacing_m)
+    return np.linspace(0, route.length, count, endpoint=not route.closed)
 
 
 def _depth_difference(wanted: Rendering, shown: Rendering) -> float:

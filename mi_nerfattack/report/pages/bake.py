@@ -37,8 +37,8 @@ def write_bake_report(
     root = files.make_folder(folder)
     kept = [view for view in views if view.pictures is not None]
     worst = [_pair(view) for view in sorted(kept, key=lambda view: view.psnr_db)]
-    write_colours(root / "worst.png", worst, "exact field")
-    write_depths(root / "depth.png", worst)
+    write_colours(root / "worst.png", worst, "field", "bricks")
+    write_depths(root / "depth.png", worst, titles=("bricks", "field"))
     entries = [
         {
             name: getattr(view, name)

@@ -42,17 +42,20 @@ class ViewPair:
     known_depth: np.ndarray | None = None
 
 
-def write_colours(path: str | Path, views: Sequence[ViewPair], wanted: str) -> None:
+def write_colours(
+    path: str | Path, views: Sequence[ViewPair], wanted: str, shown: str = "field"
+) -> None:
     """Write image, field and error of views below each other.
 
     Args:
         path: PNG file.
         views: at least one, all of one size.
         wanted: title of the column of images.
+        shown: of the field's.
     """
     scale = Normalize(0, _ERROR_MAX)
     with chart(path, _height(views, 3)) as figure:
-        rows = _panels(figure, views, (wanted, "field", "difference"))
+        rows = _panels(figure, views, (wanted, shown, "difference"))
         for view, axes in zip(views, rows, strict=True):
             error = np.abs(view.shown - view.wanted).mean(axis=2)
             axes[0].imshow(np.clip(view.wanted, 0, 1), interpolation="nearest")
@@ -62,7 +65,12 @@ def write_colours(path: str | Path, views: Sequence[ViewPair], wanted: str) -> N
         _bar(figure, rows, _ERRORS, scale, label)
 
 
-def write_depths(path: str | Path, views: Sequence[ViewPair], unit: str = "m") -> None:
+def write_depths(
+    path: str | Path,
+    views: Sequence[ViewPair],
+    unit: str = "m",
+    titles: tuple[str, str] = ("field", "known"),
+) -> None:
     """Write the field's depth of views below each other, beside the known one.
 
     Grey is where the field stops less than half of the light, or nothing is known.
@@ -71,12 +79,13 @@ def write_depths(path: str | Path, views: Sequence[ViewPair], unit: str = "m") -
         path: PNG file.
         views: at least one, all of one size.
         unit: of the depths, for the labels.
+        titles: of the column of the field, and of that of what is known.
     """
     known = all(view.known_depth is not None for view in views)
     shown = [np.where(view.opacity >= SOLID, view.depth, np.inf) for view in views]
     given = [view.known_depth for view in views if view.known_depth is not None]
     scale = Normalize(*_range([*shown, *given]))
-    columns = ("field", "known", "difference") if known else ("field",)
+    columns = (*titles, "difference") if known else titles[:1]
     errors = [abs_difference(*pair) for pair in zip(shown, given, strict=False)]
     error_scale = Normalize(0, _top(errors))
     with chart(path, _height(views, 3 if known else 2)) as figure:
