@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
-from helpers.small_fields import blob, small_ngp
+from helpers.small_fields import blob, small_bricks, small_ngp
 
 from bench.full_ngp import NGPData, enlarge
 from bench.torch.bricks import TorchBricks
@@ -27,8 +27,7 @@ from bench.torch.ngp import TorchNGP
 from bench.torch.object import BagLookup, ObjectData, SelectLookup, TorchObject
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.backend.colour import linear_to_srgb
-from mi_nerfattack.fields import BrickField, NGPLayout, Occupancy, save_field
-from mi_nerfattack.fields.bricks import Codes, vertex_count
+from mi_nerfattack.fields import NGPLayout, Occupancy, save_field
 from mi_nerfattack.fit.loss import huber
 from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -111,13 +110,7 @@ def test_the_peer_sees_the_same_image(rng, data, grid):
 
 
 def test_the_peer_sees_the_same_bricks(rng, tmp_path):
-    octants = rng.integers(0, 256, (6, 5, 4), np.uint8)
-    cells = rng.random((6, 5, 4)) < 0.6
-    divided = rng.choice(np.array([1, 2, 4, 8], np.uint8), cells.sum())
-    words = rng.integers(0, 1 << 32, vertex_count(divided), np.uint32)
-    parts = Occupancy(cells, octants), divided, words, Codes(-2.0, 3.0)
-    box, sky = (-np.ones(3), np.ones(3)), rng.normal(size=(4, 8, 3)).astype(np.float32)
-    bricks = BrickField(*box, *parts, sky, step_m=0.08, cone=1 / 64)
+    bricks = small_bricks(rng)
     save_field(tmp_path / "b.safetensors", bricks)
     origin, direction = fan(rng)
     image = our_image(bricks, origin, direction)

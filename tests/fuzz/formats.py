@@ -78,17 +78,19 @@ def _field(folder: Path) -> list[tuple[Path, Read]]:
     from mi_nerfattack import variant
 
     variant.ensure()
-    from helpers.small_fields import blob, small_ngp
+    from helpers.small_fields import blob, small_bricks, small_ngp
 
     from mi_nerfattack.fields.io import load_field, save_field
 
     save_field(folder / "grid.safetensors", blob(np.random.default_rng(0)))
     save_field(folder / "ngp.safetensors", small_ngp())
+    save_field(folder / "bricks.safetensors", small_bricks(np.random.default_rng(0)))
 
     def read(path: Path) -> None:
         load_field(path).metadata()
 
-    return [(folder / f"{kind}.safetensors", read) for kind in ("grid", "ngp")]
+    kinds = ("grid", "ngp", "bricks")
+    return [(folder / f"{kind}.safetensors", read) for kind in kinds]
 
 
 def _gltf(folder: Path) -> list[tuple[Path, Read]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-TYPES = {"F16": "<f2", "F32": "<f4", "U8": "u1"}
+TYPES = {"F16": "<f2", "F32": "<f4", "U8": "u1", "U32": "<u4"}
 PRIMES = np.array([1, 2654435761, 805459861], np.uint64)
 CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
@@ -39,20 +39,28 @@ class FileReader:
         bits = np.unpackbits(self.tensors["occupancy"], count=shape.prod())
         self.cells = bits.reshape(shape).astype(bool)
         self.is_grid = self.header["kind"] == "grid_field"
+        self.has_bricks = self.header["kind"] == "brick_field"
 
     def density(self, points: np.ndarray) -> np.ndarray:
         """Evaluate (n,), 1/metre, at points (n, 3) in the box."""
+        unit = (points - self.lower) / (self.upper - self.lower)
+        if self.has_bricks:
+            low, high = self._numbers("log_density")
+            raw = low + self._bytes(unit)[:, 0] / 255 * (high - low)
+            return np.exp(raw) * window(self.cells, unit)
         if self.is_grid:
             raw = self._levels(points, self.tensors["density"][:, None]).sum(1)[:, 0]
             scale = float(self.header["density_scale"])
         else:
             raw = self._geometry(points)[:, 0]
             scale = 1 / (self.upper - self.lower).max()
-        unit = (points - self.lower) / (self.upper - self.lower)
         return scale * np.exp(np.minimum(raw, 15)) * window(self.cells, unit)
 
     def radiance(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Evaluate (n, 3), linear, at points (n, 3) along unit directions (n, 3)."""
+        if self.has_bricks:
+            unit = (points - self.lower) / (self.upper - self.lower)
+            return srgb_to_linear(self._bytes(unit)[:, 1:] / 255)
         if self.is_grid:
             return decode(self._levels(points, self.tensors["texture"]).sum(1))
         inputs = np.hstack([self._geometry(points), harmonics(directions)])
@@ -73,6 +81,26 @@ class FileReader:
                 texel = sky[np.clip(v + dv, 0, height - 1), (u + du) % width]
                 total += weight[:, None] * texel
         return decode(total)
+
+    def _bytes(self, unit: np.ndarray) -> np.ndarray:
+        """Interpolate the bytes (n, 4) of bricks; NaN at points without one."""
+        sizes = self.tensors["subdivisions"].astype(int)
+        starts = np.cumsum((sizes + 1) ** 3) - (sizes + 1) ** 3
+        vertices = self.tensors["vertices"].view(np.uint8).reshape(-1, 4).astype(float)
+        number = np.full(self.cells.shape, -1)
+        number[self.cells] = np.arange(len(sizes))
+        scaled = unit * self.cells.shape
+        result = np.full((len(unit), 4), np.nan)
+        for i, (place, cell) in enumerate(zip(scaled, scaled.astype(int), strict=True)):
+            if (brick := number[tuple(cell)]) < 0:
+                continue
+            n, start = sizes[brick], starts[brick]
+            mine = vertices[start : start + (n + 1) ** 3].reshape(*[n + 1] * 3, 4)
+            at = ((place - cell) * n)[:, None]
+            result[i] = [
+                ndimage.map_coordinates(mine[..., k], at, order=1)[0] for k in range(4)
+            ]
+        return result
 
     def _geometry(self, points: np.ndarray) -> np.ndarray:
         table = self.tensors["table"].reshape(-1, int(self.header["features"]))
@@ -138,7 +166,11 @@ def window(cells: np.ndarray, unit: np.ndarray) -> np.ndarray:
 
 def decode(raw: np.ndarray) -> np.ndarray:
     """Turn raw colours into linear ones: the sRGB curve of their sigmoid."""
-    value = 1 / (1 + np.exp(-raw))
+    return srgb_to_linear(1 / (1 + np.exp(-raw)))
+
+
+def srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Apply the sRGB curve."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 

@@ -6,7 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
+from mi_nerfattack.fields import (
+    BrickField,
+    GridField,
+    GridLayout,
+    NGPField,
+    NGPLayout,
+    Occupancy,
+)
+from mi_nerfattack.fields.bricks import Codes, vertex_count
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -77,6 +85,17 @@ def small_ngp(seed: int = 0, cone: float = 0.0) -> NGPField:
         fresh = rng.normal(0, spread, dr.width(value)).astype(np.float32)
         field.set_parameter(name, type(value)(fresh))
     return field
+
+
+def small_bricks(rng: np.random.Generator) -> BrickField:
+    """Make bricks of all sizes in some cells of [-1, 1]^3, with arbitrary vertices."""
+    cells = rng.random((6, 5, 4)) < 0.6
+    octants = rng.integers(0, 256, cells.shape, np.uint8)
+    divided = rng.choice(np.array([1, 2, 4, 8], np.uint8), cells.sum())
+    words = rng.integers(0, 1 << 32, vertex_count(divided), np.uint32)
+    sky = rng.normal(size=(4, 8, 3)).astype(np.float32)
+    parts = Occupancy(cells, octants), divided, words, Codes(-2.0, 3.0), sky
+    return BrickField(-ONES, ONES, *parts, step_m=0.08, cone=1 / 64)
 
 
 def sigmoid_to_linear(raw: np.ndarray) -> np.ndarray:
