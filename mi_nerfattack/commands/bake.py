@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -46,13 +46,12 @@ class Bake:
     def run(self) -> int:
         """Bake, score and write."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.fit_report import check_output, report_folder
+        from mi_nerfattack.commands.shared.fit_report import report_folder
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.fields import NGPField, load_field, save_field
         from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
         from mi_nerfattack.fit.bake.scores import score_bake
-        from mi_nerfattack.fit.scores import MIN_EDGE_PX
         from mi_nerfattack.render.camera.intrinsics import from_fov
         from mi_nerfattack.report.pages.bake import (
             bake_summary,
@@ -62,19 +61,10 @@ class Bake:
         from mi_nerfattack.report.pages.fit import finite
         from mi_nerfattack.vehicle.route.route import load_routes
 
-        check_output(self.output)
-        if self.output.resolve() == self.field.resolve():
-            raise InputError(f"--output: {self.output} is the field itself")
-        if min(self.width, self.height) < MIN_EDGE_PX:
-            raise InputError(
-                f"--width, --height: {self.width} x {self.height}; SSIM takes at least "
-                f"{MIN_EDGE_PX} px each way"
-            )
+        self._check()
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
-        camera, routes = (
-            from_fov(self.width, self.height, self.fov_deg),
-            load_routes(self.routes),
-        )
+        camera = from_fov(self.width, self.height, self.fov_deg)
+        routes = load_routes(self.routes)
         variant.ensure()
         field = load_field(self.field)
         if not isinstance(field, NGPField):
@@ -89,8 +79,7 @@ class Bake:
             )
             started = time.perf_counter()
             counter = bars.counter("baking", "pass ")
-            parts = routes, camera, None, options, plan, counter
-            baked = bake(field, *parts)
+            baked = bake(field, routes, camera, None, options, plan, counter)
             seconds = time.perf_counter() - started
             save_field(self.output, baked)
             score = bars.counter("comparing", "view ")
@@ -99,10 +88,7 @@ class Bake:
             "field": self.field.name,
             "bricks": len(plan.subdivisions),
             "vertices_mb": round(plan.file_mb, 1),
-            "cone": self.cone,
-            "passes": self.passes,
-            "views": self.views,
-            "seed": self.seed,
+            **asdict(options),
             "bake_s": round(seconds, 1),
         }
         title = f"Bake of {self.field.name}"
@@ -112,3 +98,18 @@ class Bake:
         else:
             print(f"{bake_verdict(views)}\nWrote {self.output} and {page}.")
         return 0
+
+    def _check(self) -> None:
+        """Refuse what would fail after the bake."""
+        from mi_nerfattack.commands.shared.fit_report import check_output
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.fit.scores import MIN_EDGE_PX
+
+        check_output(self.output)
+        if self.output.resolve() == self.field.resolve():
+            raise InputError(f"--output: {self.output} is the field itself")
+        if min(self.width, self.height) < MIN_EDGE_PX:
+            raise InputError(
+                f"--width, --height: {self.width} x {self.height}; SSIM takes at least "
+                f"{MIN_EDGE_PX} px each way"
+            )

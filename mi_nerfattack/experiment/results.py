@@ -162,11 +162,10 @@ def _in_bricks(done: Finished) -> dict[str, Any]:
     """Say how far the attack's own drives go in bricks, and in the field itself."""
     world, attack = done.world, done.attack
     world.show(done.look(ATTACK))
-    exact = attack.measure_through(world.surrogate)
     return {
         "file": str(world.scenario.scene.bricks),
-        "cross_track_mean_m": attack.measure_through(world.optimised),
-        "field_cross_track_mean_m": exact,
+        "cross_track_mean_m": attack.best_mean_m,
+        "field_cross_track_mean_m": attack.measure_through(world.surrogate),
     }
 
 

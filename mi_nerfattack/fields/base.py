@@ -99,6 +99,12 @@ class AbstractField(ABC):
         """
         self.occupancy = Occupancy(self.window.cells)
 
+    def occupancy_tensors(self) -> dict[str, np.ndarray]:
+        """Return what field files of all kinds hold of the occupancy."""
+        cells, octants = self.window.cells, self.occupancy.octants
+        bits = {"occupancy": np.packbits(cells.ravel())}
+        return bits if octants is None else {**bits, "octants": octants[cells]}
+
     def refine(self, step_m: float) -> None:
         """Change the marching step; where it grows with distance, in proportion.
 

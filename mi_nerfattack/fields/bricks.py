@@ -15,7 +15,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import box_metadata, check_box, check_positive
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fields.sky import sky_colour
+from mi_nerfattack.fields.sky import check_sky, sky_colour
 
 #: Subdivisions of a cell along each axis.
 FINEST = 8
@@ -26,9 +26,14 @@ _TOP = 255.0
 _LARGEST_LOG = 80.0  # its exponential is a number of single precision
 
 
+def brick_starts(subdivisions: np.ndarray) -> np.ndarray:
+    """Return where the vertices of bricks (n,) begin, (n + 1,): their number last."""
+    return np.append(0, np.cumsum((subdivisions.astype(np.int64) + 1) ** 3))
+
+
 def vertex_count(subdivisions: np.ndarray) -> int:
     """Return how many vertices bricks (n,) have together."""
-    return int(((subdivisions.astype(np.int64) + 1) ** 3).sum())
+    return int(brick_starts(subdivisions)[-1])
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,11 @@ def pack_word(numbers: list[mi.Float]) -> mi.UInt32:
     for k, number in enumerate(numbers):
         word |= mi.UInt32(dr.round(dr.clip(number, 0, _TOP))) << (8 * k)
     return word
+
+
+def unpack_word(word: mi.UInt32) -> list[mi.Float]:
+    """Return the four numbers (n,) of words."""
+    return [mi.Float(mi.Int32((word >> (8 * k)) & 255)) for k in range(4)]
 
 
 class BrickField(AbstractField):
@@ -135,12 +145,12 @@ class BrickField(AbstractField):
         self.occupy(occupancy)
         self.subdivisions = subdivisions
         self.vertices = mi.UInt32(np.ascontiguousarray(vertices, np.uint32))
-        ends = np.cumsum((subdivisions.astype(np.int64) + 1) ** 3)
         level = np.log2(FINEST // subdivisions).astype(np.uint32)
         # without a brick: one part, at the first vertex, and no density
         none = len(_LEVELS) - 1 << _LEVEL_SHIFT
         pointers = np.full(occupancy.shape, none, np.uint32)
-        pointers[occupancy.cells] = np.append(0, ends[:-1]) | level << _LEVEL_SHIFT
+        starts = brick_starts(subdivisions)[:-1]
+        pointers[occupancy.cells] = starts | level << _LEVEL_SHIFT
         self._pointers = mi.UInt32(pointers.ravel())
         self._sky_shape = sky.shape[0], sky.shape[1]
         self._sky = mi.Float(np.ascontiguousarray(sky, np.float32).ravel())
@@ -194,9 +204,8 @@ class BrickField(AbstractField):
         result = [mi.Float(0) for _ in range(4)]
         for vertex, weight in corners:
             word = dr.gather(mi.UInt32, self.vertices, vertex, active)
-            for k in range(4):
-                value = mi.Float(mi.Int32((word >> (8 * k)) & 255))
-                result[k] = dr.fma(weight, value, result[k])
+            pairs = zip(unpack_word(word), result, strict=True)
+            result = [dr.fma(weight, value, total) for value, total in pairs]
         return result
 
     def eval_everywhere(
@@ -218,14 +227,12 @@ class BrickField(AbstractField):
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return vertices, subdivisions, sky, occupancy bits and octants."""
-        cells, octants = self.window.cells, self.occupancy.octants
-        result = {
-            "occupancy": np.packbits(cells.ravel()),
+        return {
             "subdivisions": self.subdivisions,
             "vertices": self.vertices.numpy(),
             "sky": self._sky.numpy().reshape(*self._sky_shape, 3).copy(),
+            **self.occupancy_tensors(),
         }
-        return result if octants is None else {**result, "octants": octants[cells]}
 
     def metadata(self) -> dict[str, str]:
         """Return bounds, units, codes and provenance."""
@@ -256,5 +263,4 @@ def _check_bricks(
             f"vertices: {vertices.dtype} {vertices.shape}; expected ({expected},) "
             f"words, at most {MOST_VERTICES}"
         )
-    if sky.ndim != 3 or sky.shape[2] != 3 or not sky.size:
-        raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")
+    check_sky(sky)

@@ -251,7 +251,7 @@ class GridField(AbstractField):
         return {
             "density": self._density.numpy().astype(np.float16),
             "texture": self.texture.numpy().astype(np.float16),
-            "occupancy": np.packbits(self.window.cells.ravel()),
+            **self.occupancy_tensors(),
         }
 
     def metadata(self) -> dict[str, str]:

@@ -22,7 +22,7 @@ from mi_nerfattack.fields.grid import (
     level_growth,
 )
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fields.sky import activate, sky_colour
+from mi_nerfattack.fields.sky import activate, check_sky, sky_colour
 
 GEOMETRY_FEATURES = 16
 SH_ORDER = 3
@@ -168,8 +168,7 @@ class NGPField(AbstractField):
                 bound = _bound(name, value, bound)
                 module[key] = type(module[key])(value.astype(np.float32))
         sky = np.asarray(tensors["sky"], np.float32)
-        if sky.ndim != 3 or sky.shape[2] != 3:
-            raise InputError(f"sky: shape {sky.shape}; expected (height, width, 3)")
+        check_sky(sky)
         self.sky_shape = (sky.shape[0], sky.shape[1])
         self.sky = mi.Float(sky.ravel())
 
@@ -276,10 +275,8 @@ class NGPField(AbstractField):
         result = {
             "table": self.encoding.data.numpy().astype(np.float16),
             "sky": self.sky.numpy().copy().reshape(*self.sky_shape, 3),
-            "occupancy": np.packbits(self.window.cells.ravel()),
+            **self.occupancy_tensors(),
         }
-        if self.occupancy.octants is not None:
-            result["octants"] = self.occupancy.octants[self.window.cells]
         packed = (self.density_net, self.colour_net)
         for prefix, net in zip(NETWORK_NAMES, packed, strict=True):
             linear = [layer for layer in net.layers if isinstance(layer, nn.Linear)]

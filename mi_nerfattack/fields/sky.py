@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_nerfattack.backend.colour import srgb_to_linear
+from mi_nerfattack.errors import InputError
+
+
+def check_sky(image: np.ndarray) -> None:
+    """Raise InputError unless an image is (height, width, 3), and there is some."""
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"sky: shape {image.shape}; expected (height, width, 3)")
 
 
 def activate(raw: list[mi.Float]) -> mi.Color3f:

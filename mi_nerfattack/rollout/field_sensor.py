@@ -103,15 +103,13 @@ class FieldSensor(AbstractDifferentiableSensor):
         self._frozen_accumulate = freeze_method(self._accumulate, self._state)
         self._frozen_by_rays = freeze_method(self._by_rays, self._state)
 
-    def showing(self, objects: list[PosedField]) -> FieldSensor:
-        """Return a camera like this one that shows other objects."""
+    def showing(
+        self, objects: list[PosedField], scene: Layer | None = None
+    ) -> FieldSensor:
+        """Return a camera like this one that shows other objects, or another scene."""
         view = self.camera, self.mount, self.jitter_seed, self.stop, self.composite
-        return FieldSensor(self.scene, objects, *view, self.surroundings, self.clip)
-
-    def within(self, scene: Layer) -> FieldSensor:
-        """Return a camera like this one that shows its objects in another scene."""
-        view = self.camera, self.mount, self.jitter_seed, self.stop, self.composite
-        return FieldSensor(scene, self.objects, *view, self.surroundings, self.clip)
+        more = self.surroundings, self.clip
+        return FieldSensor(scene or self.scene, objects, *view, *more)
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render the composite; see :meth:`AbstractSensor.observe`."""

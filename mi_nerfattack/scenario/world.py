@@ -165,7 +165,8 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     place, surrogate = scenario.scene, build_surrogate(scenario)
     optimised = surrogate
     if place.bricks is not None:
-        optimised = surrogate.within(_load_layer(scenario, place.bricks.file))
+        bricks = _load_layer(scenario, place.bricks.file)
+        optimised = surrogate.showing(surrogate.objects, bricks)
     camera, mount = surrogate.camera, surrogate.mount
     route = Route.from_file(place.routes.file, place.route)
     motion = scenario.vehicle.motion()

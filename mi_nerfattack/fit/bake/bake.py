@@ -17,7 +17,9 @@ from mi_nerfattack.fields.bricks import (
     MOST_VERTICES,
     BrickField,
     Codes,
+    brick_starts,
     pack_word,
+    unpack_word,
     vertex_count,
 )
 from mi_nerfattack.fields.ngp import NGPField
@@ -191,18 +193,18 @@ def _first_vertices(
 ) -> np.ndarray:
     """Return what vertices (m,) begin with, as words."""
     cells = np.argwhere(plan.occupancy.cells)
-    ends = np.cumsum((plan.subdivisions.astype(np.int64) + 1) ** 3)
-    starts = np.append(0, ends[:-1])
+    starts = brick_starts(plan.subdivisions)
+    count, starts = int(starts[-1]), starts[:-1].astype(np.uint32)
     size = (field.upper - field.lower) / plan.occupancy.shape
     eyes = np.hstack([plan.nearest, np.full((len(cells), 1), height_m)])
     heading = field.lower + (cells + 0.5) * size - eyes
     heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
-    words = dr.zeros(mi.UInt32, int(ends[-1]))
+    words = dr.zeros(mi.UInt32, count)
     for n in np.unique(plan.subdivisions):
         some = plan.subdivisions == n
         corner = mi.Point3f((field.lower + cells[some] * size).T.astype(np.float32))
         towards = mi.Vector3f(heading[some].T.astype(np.float32))
-        start, edge = mi.UInt32(starts[some].astype(np.uint32)), mi.UInt32(int(n) + 1)
+        start, edge = mi.UInt32(starts[some]), mi.UInt32(int(n) + 1)
         scale = mi.Vector3f(*map(float, size / float(n)))
         dr.make_opaque(corner, towards, start, edge, scale)
         vertex = dr.arange(mi.UInt32, int(some.sum()) * (int(n) + 1) ** 3)
@@ -240,8 +242,7 @@ def _refine(
         dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)
     *moves, weight = sums
     rate = dr.rcp(dr.maximum(weight, _FAINT))
-    bytes_now = [mi.Float(mi.Int32(baked.vertices >> (8 * k) & 255)) for k in range(4)]
-    pairs = zip(bytes_now, moves, strict=True)
+    pairs = zip(unpack_word(baked.vertices), moves, strict=True)
     baked.vertices = pack_word([now + rate * move for now, move in pairs])
     dr.make_opaque(baked.vertices)
 
