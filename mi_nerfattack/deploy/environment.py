@@ -119,6 +119,10 @@ class AbstractEnvironment(ABC):
             InputError: the control is not finite, or nothing was reset before.
         """
 
+    def advance(self, control: float) -> None:
+        """Hold a control for one period as `step` does, but look at nothing."""
+        self.step(control)
+
     @property
     @abstractmethod
     def state(self) -> np.ndarray:

@@ -56,11 +56,15 @@ class AbstractSimulation(AbstractEnvironment):
 
     def step(self, control: float) -> CameraFrame:
         """Drive one period and render."""
+        self.advance(control)
+        return self._disturbed(self._observe())
+
+    def advance(self, control: float) -> None:
+        """Drive one period and render nothing."""
         if self._steps < 0:
             raise InputError(f"environment {self.name!r}: step comes after reset")
         self.vehicle.advance(float(control))
         self._steps += 1
-        return self._disturbed(self._observe())
 
     @property
     def state(self) -> np.ndarray:

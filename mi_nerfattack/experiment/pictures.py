@@ -49,10 +49,12 @@ def write_pictures(
         environment = world.open(drive.environment, empty=look is None)
         try:
             row = rows[f"{drive.environment}\n{drive.case.replace('_', ' ')}"] = []
-            for step, frame in _again(environment, world, drive):
+            written = _steps(drive, EXR_FRAMES)
+            wanted = {*columns, *written}
+            for step, frame in _again(environment, world, drive, wanted):
                 if step in columns:
                     row.append(frame.image)
-                if step in _steps(drive, EXR_FRAMES):
+                if step in written:
                     _write_frame(output / "frames", world, drive, step, frame)
         finally:
             environment.close()
@@ -66,14 +68,17 @@ def _steps(drive: Drive, count: int) -> list[int]:
 
 
 def _again(
-    environment: AbstractEnvironment, world: World, drive: Drive
+    environment: AbstractEnvironment, world: World, drive: Drive, wanted: set[int]
 ) -> Iterator[tuple[int, CameraFrame]]:
-    """Yield the frames of a drive, each with the index of the control it led to."""
+    """Yield some frames of a drive, each with the index of the control it led to."""
     frame = environment.reset(world.route, drive.states[0], drive.seed)
-    for step, control in enumerate(drive.controls):
-        yield step, frame
-        if step + 1 < len(drive.controls):
-            frame = environment.step(float(control))
+    if 0 in wanted:
+        yield 0, frame
+    for step, control in enumerate(drive.controls[:-1], start=1):
+        if step in wanted:
+            yield step, environment.step(float(control))
+        else:
+            environment.advance(float(control))
 
 
 def _write_frame(

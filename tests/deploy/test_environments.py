@@ -241,6 +241,22 @@ def test_no_kernel_is_compiled_after_the_first_step(name, tmp_path):
     environment.close()
 
 
+@pytest.mark.parametrize("name", ["surrogate", "mitsuba"])
+def test_a_period_without_a_look_leads_to_the_same_frame(name, tmp_path):
+    conditions = Conditions(spp=2, noise_sd=0.05)
+    environment = make_environment(name, write_place(tmp_path), conditions)
+    environment.reset(a_route(), None, 3)
+    for control in (0.4, -0.2, 0.3):
+        seen = environment.step(control)
+    environment.reset(a_route(), None, 3)
+    environment.advance(0.4)
+    environment.advance(-0.2)
+    frame = environment.step(0.3)
+    assert (frame.image == seen.image).all()
+    assert (frame.camera_to_world == seen.camera_to_world).all()
+    environment.close()
+
+
 @pytest.mark.parametrize("sky", ["noon", "evening", "overcast"])
 def test_shadow_lies_opposite_to_the_sun(sky):
     scene = mi.load_string(SUN)
