@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.backend.concat import concat
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
-from mi_nerfattack.render.batched import march_gradient
+from mi_nerfattack.render.batched import FIRST_RAYS, march_gradient
 from mi_nerfattack.render.march import RayTangent, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays
@@ -49,6 +50,46 @@ class Task:
     primal: March = field(default_factory=March)
     cotangent: March = field(default_factory=March)
     fields: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of rays."""
+        return dr.width(self.rays.direction)
+
+
+class TaskQueue:
+    """Tasks that wait until there are rays enough for a launch.
+
+    A launch goes over the whole buffer of gradients, however few its rays are.
+
+    Args:
+        run: does a task.
+    """
+
+    def __init__(self, run: Callable[[Task], None]) -> None:
+        self._run = run
+        self._waiting: dict[tuple[int, ...], list[Task]] = {}
+
+    def add(self, task: Task) -> None:
+        """Let a task wait, or do it with those that wait for the same fields."""
+        dr.eval(task)  # or it holds all rays of its image
+        waiting = self._waiting.setdefault(task.fields, [])
+        waiting.append(task)
+        if sum(one.size for one in waiting) >= FIRST_RAYS:
+            self._launch(task.fields)
+
+    def finish(self) -> None:
+        """Do all that wait."""
+        for which in list(self._waiting):
+            self._launch(which)
+
+    def clear(self) -> None:
+        """Forget all that wait."""
+        self._waiting.clear()
+
+    def _launch(self, which: tuple[int, ...]) -> None:
+        tasks = self._waiting.pop(which)
+        self._run(concat(tasks, [task.size for task in tasks]))
 
 
 class AbstractComposite(ABC):

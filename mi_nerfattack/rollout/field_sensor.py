@@ -27,6 +27,7 @@ from mi_nerfattack.render.composite import (
     RayTangent,
     Seen,
     Task,
+    TaskQueue,
 )
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.render.posed import PosedField
@@ -100,7 +101,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         self._frozen_render = freeze_method(self._render, self._state)
         self._frozen_restore = freeze_method(self._restore, self._state)
         self._frozen_cotangent = freeze_method(self._cotangent, self._state)
-        self._frozen_accumulate = freeze_method(self._accumulate, self._state)
+        self._tasks = TaskQueue(freeze_method(self._accumulate, self._state))
         self._frozen_by_rays = freeze_method(self._by_rays, self._state)
 
     def showing(
@@ -118,8 +119,8 @@ class FieldSensor(AbstractDifferentiableSensor):
         key = dr.opaque(mi.UInt32, step)
         ends = self._look_around(state, key)
         if self._ahead is None:
-            found = self._frozen_render(_pose(state), key, ends, count)
-            return self._observation(count, ends, *found)
+            pixels, *found = self._frozen_render(_pose(state), key, ends, count)
+            return Observation(self._tensor(pixels, count), *found, ends=ends)
         rays = self._frozen_make_rays(_pose(state), key, ends, count)
         scene = self._ahead.march(rays, self.camera.width)
         return self.restore(state, step, scene if ends is None else (scene, ends))
@@ -138,12 +139,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         count = dr.width(state)
         key = dr.opaque(mi.UInt32, step)
         scene, ends = kept if isinstance(kept, tuple) else (kept, None)
-        found = self._frozen_restore(_pose(state), key, scene, ends, count)
-        return self._observation(count, ends, *found)
-
-    def _observation(
-        self, count: int, ends: Ends | None, pixels: mi.Color3f, *found: Any
-    ) -> Observation:
+        pixels, *found = self._frozen_restore(_pose(state), key, scene, ends, count)
         return Observation(self._tensor(pixels, count), *found, ends=ends)
 
     def behind(self, observation: Observation) -> mi.Color3f:
@@ -189,7 +185,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         else:
             d_rays = wrenches = None
             for task in self.composite.tasks(self._fields, rays, seen, cotangent):
-                self._frozen_accumulate(task)
+                self._tasks.add(task)
         if wrenches is not None and self._wrenches is not None:
             pairs = zip(self._wrenches, wrenches, strict=True)
             self._wrenches = [
@@ -226,16 +222,13 @@ class FieldSensor(AbstractDifferentiableSensor):
         found = self.composite.backward_rays(
             self._fields, rays, seen, cotangent, self.stop, layers
         )
-        wrenches = self._sum_wrenches(rays, found[len(self.scene) - first :])
+        pairs = zip(self.objects, found[len(self.scene) - first :], strict=True)
+        wrenches = [wrench_of(posed, rays, by_rays) for posed, by_rays in pairs]
         if first:
             return None, wrenches
         d_origin = sum((by_origin for by_origin, _ in found), mi.Vector3f(0))
         d_direction = sum((by_direction for _, by_direction in found), mi.Vector3f(0))
         return (d_origin, d_direction), wrenches
-
-    def _sum_wrenches(self, rays: Rays, found: list[RayTangent]) -> list[Any]:
-        pairs = zip(self.objects, found, strict=True)
-        return [wrench_of(posed, rays, by_rays) for posed, by_rays in pairs]
 
     def _state(self, *arguments: Any) -> list[Any]:
         """Return what frozen functions read or depend on beside their arguments."""
@@ -247,6 +240,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def start_gradient(self, poses: bool = False) -> None:
         """Make every object's packed grid a fresh leaf with gradient zero."""
+        self._tasks.clear()
         for field in self.fields:
             leaf = mi.Float(dr.detach(field.packed))
             dr.enable_grad(leaf)
@@ -258,6 +252,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def texture_gradients(self) -> list[Any]:
         """Return the accumulated gradient of each texture, (n_vertices, 3)."""
+        self._tasks.finish()
         return [field.texture_gradient(dr.grad(field.packed)) for field in self.fields]
 
     def textures(self) -> list[Any]:

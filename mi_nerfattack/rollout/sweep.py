@@ -9,10 +9,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.backend.concat import concat, split
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.system.heap import release_heap
 from mi_nerfattack.vehicle.state import to_state
+
+#: Images that go back through the policy at once: what it does with one costs more.
+IMAGES = 8
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,8 @@ class Sweep:
         loop: the closed loop.
         drive: what it did.
         attached: whether images follow the state.
+        together: control periods whose images go through the policy at once; 1 where
+            images follow the state, or the policy has memory.
         pending: derivatives by controls that act in periods already visited.
         d_memory: derivative by the policy's memory after the period.
     """
@@ -121,8 +127,10 @@ class Sweep:
     loop: ClosedLoop
     drive: Trajectory
     attached: bool
+    together: int = 1
     pending: dict[int, Any] = field(default_factory=dict)
     d_memory: tuple[Any, ...] = ()
+    _waiting: list[tuple[Step, Any, Any]] = field(default_factory=list)
 
     def back(self, step: Step, d_after: Any) -> Any:
         """Return the derivative by the state before a period.
@@ -141,18 +149,39 @@ class Sweep:
         none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
         dr.eval(cotangent)
-        d_image, self.d_memory = loop.policy.step_vjp(
-            image, loop.goal, step.memory, cotangent, self.d_memory
-        )
-        d_image = loop.shown_vjp(step.observation, index, d_image)
-        by_pose = differentiable(loop).vjp(
-            step.observation, step.state, d_image, self.attached
-        )
+        self._waiting.append((step, image, cotangent))
+        by_pose = self.finish() if len(self._waiting) == self.together else None
         if by_pose is not None:
             for axis in range(3):
                 d_state[axis] += by_pose[axis]
         dr.eval(d_state, self.pending)
         return d_state
+
+    def finish(self) -> Any:
+        """Go back through policy and sensor, from all periods that wait for that.
+
+        Returns:
+            (3, n), by the pose before the last of them; None when not `attached`.
+        """
+        if not self._waiting:
+            return None
+        steps, images, cotangents = zip(*self._waiting, strict=True)
+        self._waiting.clear()
+        loop, by_pose = self.loop, None
+        d_images, self.d_memory = loop.policy.step_vjp(
+            _batch(images),
+            loop.goal,
+            steps[-1].memory,
+            _batch(cotangents),
+            self.d_memory,
+        )
+        release_heap()
+        for step, d_image in zip(steps, _unbatch(d_images, len(steps)), strict=True):
+            d_seen = loop.shown_vjp(step.observation, step.index, d_image)
+            by_pose = differentiable(loop).vjp(
+                step.observation, step.state, d_seen, self.attached
+            )
+        return by_pose
 
 
 def backward(
@@ -175,18 +204,21 @@ def backward(
         TypeError: sensor or policy have no such derivatives.
     """
     sensor = differentiable(loop)
-    sweep = Sweep(loop, drive, options.attached)
+    remembers = bool(loop.policy.initial_memory(drive.count))
+    alone = options.attached or remembers or options.recorder is not None
+    together = 1 if alone else max(1, IMAGES // drive.count)
+    sweep = Sweep(loop, drive, options.attached, together)
     sensor.start_gradient(options.offsets)
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
     for step in visits:
         d_after = d_before + to_state(d_states[step.index])
         d_before = sweep.back(step, d_after)
-        release_heap()  # of the policy's derivative
         costates.append(-np.array(d_after).T)
         if options.recorder is not None:
             options.recorder.add(step.index, sensor.texture_gradients())
         if options.on_step is not None:
             options.on_step(step.index)
+    sweep.finish()
     textures = sensor.texture_gradients()
     dr.eval(textures)
     return Gradient(
@@ -237,6 +269,27 @@ def forward(
         tangent = loop.transition.jvp((state, *pair), (tangent, *t_pair))
         tangents.append(np.array(tangent).T)
     return np.stack(tangents)
+
+
+def _batch(parts: tuple[Any, ...]) -> Any:
+    """Lay rows, or tensors along their first axis, end to end."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    if not dr.is_tensor_v(first):
+        return concat(parts, [dr.width(first)] * len(parts))
+    size, shape = dr.width(first.array), (len(parts) * first.shape[0], *first.shape[1:])
+    rows = concat([part.array for part in parts], [size] * len(parts))
+    return type(first)(rows, shape)
+
+
+def _unbatch(tensor: Any, count: int) -> list[Any]:
+    """Undo `_batch` of `count` tensors."""
+    if count == 1:
+        return [tensor]
+    shape = (tensor.shape[0] // count, *tensor.shape[1:])
+    parts = split(tensor.array, dr.width(tensor.array) // count)
+    return [type(tensor)(part, shape) for part in parts]
 
 
 def differentiable(loop: ClosedLoop) -> AbstractDifferentiableSensor:

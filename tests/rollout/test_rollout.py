@@ -24,6 +24,7 @@ from helpers.rollouts import (
     unit,
 )
 
+from mi_nerfattack.render import composite
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.interleaved import InterleavedComposite
@@ -171,7 +172,7 @@ def test_a_batch_is_one_sequence_of_launches():
     loop, _ = toy.make_loop()
     rollout = make_rollout(loop, 3, adjoint="kept")
     counts = []
-    for size in (2, 8):
+    for size in (8, 16):  # fewer go through the policy with those of other periods
         poses = np.repeat(INITIAL, size, 0) + 0.01 * np.arange(size)[:, None]
         gradient(rollout, poses)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -203,7 +204,8 @@ def test_adjoints_agree_and_compile_nothing_after_the_first_steps():
         assert error <= 1e-6 * np.linalg.norm(found["replay"])
 
 
-def test_memory_does_not_grow_with_the_horizon():
+def test_memory_does_not_grow_with_the_horizon(monkeypatch):
+    monkeypatch.setattr(composite, "FIRST_RAYS", 64)  # wait for a launch, not more
     loop, _ = toy.make_loop(disturbance=DISTURBANCE)
     backend = dr.backend_v(mi.Float)
 
@@ -220,11 +222,24 @@ def test_memory_does_not_grow_with_the_horizon():
     assert peak(32) <= 1.05 * peak(8)
 
 
-def test_the_heap_is_released_after_each_period(monkeypatch):
+def test_the_heap_is_released_after_each_derivative_of_the_policy(monkeypatch):
     calls = []
     monkeypatch.setattr(sweep, "release_heap", lambda: calls.append(None))
-    gradient(make_rollout(toy.make_loop()[0], 3))
+    gradient(make_rollout(toy.make_loop()[0], 2 * sweep.IMAGES + 1))
     assert len(calls) == 3
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_periods_together_give_the_gradient_of_periods_alone(adjoint, monkeypatch):
+    """Rays that wait for a launch, and images for the policy, lose nothing."""
+    loop, _ = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
+    rollout = make_rollout(loop, 11, adjoint=adjoint)
+    together = texture_gradient(rollout, POSES)
+    monkeypatch.setattr(sweep, "IMAGES", 1)
+    monkeypatch.setattr(composite, "FIRST_RAYS", 1)
+    alone = texture_gradient(rollout, POSES)
+    assert np.linalg.norm(alone) > 0
+    assert np.linalg.norm(together - alone) <= 1e-5 * np.linalg.norm(alone)
 
 
 def test_a_sensor_without_derivatives_is_refused():
