@@ -7,6 +7,7 @@ import sys
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
 from bench.commands.memory import BenchMemory
+from bench.commands.scaling import BenchScaling
 from bench.commands.speed import (
     BenchAttack,
     BenchComposite,
@@ -23,6 +24,7 @@ COMMANDS = {
     "fit": BenchFit,
     "attack": BenchAttack,
     "memory": BenchMemory,
+    "scaling": BenchScaling,
     "composite": BenchComposite,
     "steps": BenchSteps,
     "experts": BenchExperts,

@@ -90,14 +90,14 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
 
     Args:
         role: ``ours``, ``plain``, ``tuned`` or ``baked``.
-        rest: width, height, poses and horizon; for ours, also the file of the bricks,
-            if they are asked for; for a peer, the files of the background and of the
-            object, and, to try nothing else, the rays of a chunk and the object's
-            lookup.
+        rest: width, height, poses, horizon and objects; for ours, also the file of the
+            bricks, if they are asked for; for a peer, the files of the background and
+            of the object, and, to try nothing else, the rays of a chunk and the
+            object's lookup.
     """
     from bench.attack.drive import Job
 
-    job, others = Job(*map(int, rest[:4])), rest[4:]
+    job, others = Job(*map(int, rest[:5])), rest[5:]
     if role != "ours":
         from bench.attack.peer import LOOKUPS, TorchAttack
         from bench.render.peer import CHUNKS

@@ -30,6 +30,7 @@ ROUNDING_M = 0.05  # of the objective's absolute value
 RATE = 1e-6  # of Adam; small, so that all iterations drive alike
 MOUNT = CameraMount()
 BAKED = "baked"  # the way, and the role, with the scene as bricks
+APART_M = 1.5  # of further objects
 OBJECT_POSE = Pose.upright((-4.0, -3.4, 0.0), 0.0, 2.0)
 
 
@@ -41,12 +42,14 @@ class Job:
         width, height: of the camera's image, pixels.
         poses: vehicles in the batch.
         horizon: control periods.
+        objects: the hydrant, and others of its kind around it; one beside a peer.
     """
 
     width: int
     height: int
     poses: int
     horizon: int
+    objects: int = 1
 
     def arguments(self) -> list[str]:
         """Return the job as a worker's arguments."""
@@ -67,6 +70,15 @@ class Job:
         lateral = np.random.default_rng(0).normal(0, LATERAL_SD_M, self.poses)
         lateral[0] = 0.0
         return route().pose_at(np.full(self.poses, START_M), lateral)
+
+    def object_poses(self) -> list[Pose]:
+        """Return where the objects stand: in two rows, away from the road."""
+        x, y, _ = OBJECT_POSE.translation
+        places = [
+            (x + APART_M * (k // 2), y - APART_M * (k % 2), 0.0)
+            for k in range(self.objects)
+        ]
+        return [Pose.upright(place, 0.0, OBJECT_POSE.scale) for place in places]
 
     def transforms(self) -> list[AbstractTransform]:
         """Return the pre-processing: the middle part, resized."""

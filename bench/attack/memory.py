@@ -57,7 +57,7 @@ def run(
     """
     document = results.stamp({"rows": []}, command)
     if path.exists():
-        document["rows"] = _kept(path, document)
+        document["rows"] = kept_rows(path, document)
     done = {(row["poses"], row["horizon"]) for row in document["rows"]}
     left = [job for job in settings.jobs() if (job.poses, job.horizon) not in done]
     work, total = 0, sum(job.poses * job.horizon for job in left)
@@ -72,7 +72,7 @@ def run(
     return document
 
 
-def _kept(path: Path, wanted: dict[str, Any]) -> list[dict[str, Any]]:
+def kept_rows(path: Path, wanted: dict[str, Any]) -> list[dict[str, Any]]:
     """Read the rows of a document that has the same stamp, but for the date."""
     found = files.read_json(path)
     for key in ("command", "machine", "versions"):

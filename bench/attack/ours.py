@@ -15,7 +15,6 @@ from bench.attack.drive import (
     BAKED,
     MAX_HEADING_RATE,
     MOUNT,
-    OBJECT_POSE,
     RATE,
     ROUNDING_M,
     SPEED_MS,
@@ -61,9 +60,10 @@ class OurAttack(AbstractAttack):
     def __init__(self, job: Job, baked: Path | None = None) -> None:
         torch.set_num_threads(1)  # as the commands do: more would wait spinning
         self.job = job
-        item = PosedField(load_grid(bundled("hydrant/field.safetensors")), OBJECT_POSE)
+        hydrant = bundled("hydrant/field.safetensors")
+        items = [PosedField(load_grid(hydrant), pose) for pose in job.object_poses()]
         scene = PosedField(load_field(bundled("intersection/field.safetensors")))
-        sensor = FieldSensor(scene, [item], job.camera, MOUNT, stop=STOP)
+        sensor = FieldSensor(scene, items, job.camera, MOUNT, stop=STOP)
         policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)
@@ -84,7 +84,7 @@ class OurAttack(AbstractAttack):
         self.loops = dict.fromkeys(set(ADJOINTS) - {BAKED}, self.loop)
         if baked is not None:
             view = job.camera, MOUNT, None, STOP
-            bricks = FieldSensor(PosedField(load_field(baked)), [item], *view)
+            bricks = FieldSensor(PosedField(load_field(baked)), items, *view)
             self.loops[BAKED] = replace(self.loop, sensor=bricks)
 
     def iterate(self, how: str) -> dict[str, float]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.__main__ import COMMANDS, main
-from bench.attack import memory
+from bench.attack import memory, scaling
 from bench.attack.table import memory_table, time_table
 from bench.attack.table import remarks as attack_remarks
 from bench.driving import circle, experts
@@ -149,6 +149,31 @@ def test_memory_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path)
     assert "name another file" in capsys.readouterr().err
     assert main([*command, "--poses", "0"]) == cli.EXIT_INPUT
     assert "poses: (0,); must be a whole number of at" in capsys.readouterr().err
+
+
+def test_scaling_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path):
+    path, measured = tmp_path / "scaling.json", []
+
+    def row(job, repeats):
+        measured.append(job)
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        cost = float(job.width * job.poses**0.5)
+        names = ("iteration_ms", "iteration_mb")
+        names += tuple(f"replay_{name}" for name in names)
+        return {"job": job.arguments(), **dict.fromkeys(names, cost)}
+
+    monkeypatch.setattr(scaling, "_measure", row)
+    command = ["scaling", "--sizes", "32x16", "64x16", "--poses", "1", "4"]
+    command += ["--objects", "1", "--horizons", "3", "-o", str(path)]
+    assert main(command) == cli.EXIT_INTERRUPTED
+    assert len(json.loads(path.read_text())["rows"]) == 1
+    assert main(command) == 0
+    assert [job.poses for job in measured] == [1, 1, 1, 4]
+    assert "0.50" in capsys.readouterr().out
+    powers = json.loads(path.read_text())["exponents"]
+    assert powers["pixels"]["iteration_ms"] == pytest.approx(1)
+    assert powers["poses"]["iteration_mb"] == pytest.approx(0.5)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import torch
 from bench.attack.drive import SPEED_MS, Job
 from bench.attack.peer import Tape
 from bench.attack.run import memory_row
+from bench.attack.scaling import Settings, exponents
 from bench.driving import circle, collect, dagger
 from bench.fit.table import remarks
 from mi_nerfattack.errors import InputError
@@ -25,7 +26,24 @@ def test_all_horizons_drive_the_same_road():
     for transform in jobs[0].transforms():
         planes = transform.apply(planes)
     assert planes.shape == (1, 3, 66, 200)
-    assert jobs[0].arguments() == ["366", "188", "3", "25"]
+    assert jobs[0].arguments() == ["366", "188", "3", "25", "1"]
+
+
+def test_exponents_are_those_of_powers():
+    settings = Settings(((8, 8), (16, 8), (32, 8)), (1,), (1, 2), (5, 10, 40), 1)
+    axes = settings.axes()
+    axes = {name: axes[name] for name in ("pixels", "poses", "horizon")}
+    assert list(axes["pixels"]) == [64, 128, 256]
+    rows = {
+        tuple(job.arguments()): {"ms": job.horizon * (job.width * job.height) ** 0.8}
+        for jobs in axes.values()
+        for job in jobs.values()
+    }
+    found = exponents(axes, [{"job": list(k), **row} for k, row in rows.items()])
+    assert found == {
+        "pixels": {"ms": pytest.approx(0.8)},
+        "horizon": {"ms": pytest.approx(1.0)},
+    }  # none of one size
 
 
 def test_memory_is_extrapolated_along_a_line():
