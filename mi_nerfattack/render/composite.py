@@ -232,15 +232,15 @@ class DepthComposite(AbstractComposite):
         return scene_march(scene, stop) if isinstance(scene, PosedField) else None
 
     def keep(self, seen: Seen) -> Any:
-        """See :meth:`AbstractComposite.keep`: the first layer, 20 bytes a ray."""
-        return seen.layers[0]
+        """See :meth:`AbstractComposite.keep`: all layers, 20 bytes a ray and layer."""
+        return seen.layers
 
     def restore(
         self, posed: Sequence[Layer], rays: Rays, kept: Any, stop: float
     ) -> Seen:
-        """See :meth:`AbstractComposite.restore`; marches all layers but the first."""
-        others = [_see(item, rays, stop) for item in rays.light(posed)[1:]]
-        layers = [kept, *others]
+        """See :meth:`AbstractComposite.restore`; marches what comes after `kept`."""
+        others = [_see(item, rays, stop) for item in rays.light(posed)[len(kept) :]]
+        layers = [*kept, *others]
         return Seen(depth_composite(layers), layers)
 
     def forward(

@@ -78,12 +78,12 @@ class Replay(AbstractAdjoint):
 
 @dataclass(frozen=True)
 class KeptBackgrounds(AbstractAdjoint):
-    """Keeps how the scene looked in each frame; renders the objects again.
+    """Keeps how scene and objects looked in each frame; renders nothing again.
 
-    Memory: what :class:`Replay` keeps and 20 bytes a pixel and period (colour, opacity
-    and depth of the scene in single precision): 0.26 MB a vehicle and period at
-    200x66, 1.4 MB at 366x188. Exact composites keep 20 (k + 2) bytes for k objects.
-    Time: as Replay without rendering the scene again, so that forward and backward
+    Memory: what :class:`Replay` keeps and 20 (k + 1) bytes a pixel and period for k
+    objects (colour, opacity and depth of each layer in single precision): with one,
+    0.5 MB a vehicle and period at 200x66, 2.8 MB at 366x188. Exact composites keep
+    20 (k + 2) bytes. Time: as Replay without rendering, so that forward and backward
     together take less than 2 forward passes where the objects fill little of the
     frame. The choice as long as the memory suffices.
     """

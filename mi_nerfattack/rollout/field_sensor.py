@@ -122,11 +122,11 @@ class FieldSensor(AbstractDifferentiableSensor):
             pixels, *found = self._frozen_render(_pose(state), key, ends, count)
             return Observation(self._tensor(pixels, count), *found, ends=ends)
         rays = self._frozen_make_rays(_pose(state), key, ends, count)
-        scene = self._ahead.march(rays, self.camera.width)
-        return self.restore(state, step, scene if ends is None else (scene, ends))
+        first = [self._ahead.march(rays, self.camera.width)]
+        return self.restore(state, step, first if ends is None else (first, ends))
 
     def keep(self, observation: Observation) -> Any:
-        """Keep the scene's march, 20 bytes a pixel (more for other composites).
+        """Keep the layers, 20 bytes a pixel each, and 20 more of exact composites.
 
         With surroundings, 16 more for where rays end, and what is there.
         """
@@ -135,11 +135,11 @@ class FieldSensor(AbstractDifferentiableSensor):
         return kept if ends is None else (kept, ends)
 
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
-        """March the objects again, and lay them over the scene that was kept."""
+        """Lay the layers that were kept over each other; march those that were not."""
         count = dr.width(state)
         key = dr.opaque(mi.UInt32, step)
-        scene, ends = kept if isinstance(kept, tuple) else (kept, None)
-        pixels, *found = self._frozen_restore(_pose(state), key, scene, ends, count)
+        layers, ends = kept if isinstance(kept, tuple) else (kept, None)
+        pixels, *found = self._frozen_restore(_pose(state), key, layers, ends, count)
         return Observation(self._tensor(pixels, count), *found, ends=ends)
 
     def behind(self, observation: Observation) -> mi.Color3f:
