@@ -58,6 +58,7 @@ def run(
     document = results.stamp({"rows": []}, command)
     if path.exists():
         document["rows"] = kept_rows(path, document)
+        document["change"] = _change(document["rows"])
     done = {(row["poses"], row["horizon"]) for row in document["rows"]}
     left = [job for job in settings.jobs() if (job.poses, job.horizon) not in done]
     work, total = 0, sum(job.poses * job.horizon for job in left)

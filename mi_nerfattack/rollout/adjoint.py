@@ -60,7 +60,7 @@ class Replay(AbstractAdjoint):
     Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
     independent of the horizon. Time: a backward pass renders every frame once more,
     then costs one product with the policy's derivative and one march derivative a
-    period; forward and backward together about 2.2 forward passes.
+    period; forward and backward together about 2.4 forward passes.
     """
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:

@@ -118,8 +118,9 @@ class Sweep:
         loop: the closed loop.
         drive: what it did.
         attached: whether images follow the state.
-        together: control periods whose images go through the policy at once; 1 where
-            images follow the state, or the policy has memory.
+        together: control periods whose images go through the policy at once, and whose
+            observations are held until then; 1 where images follow the state, or the
+            policy has memory.
         pending: derivatives by controls that act in periods already visited.
         d_memory: derivative by the policy's memory after the period.
     """

@@ -145,6 +145,9 @@ def test_memory_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path)
     assert main(command) == 1  # by more than 1 %
     assert driven == [(1, 3), (4, 3), (4, 3), (1, 9), (4, 9)]
     assert "1.20%" in capsys.readouterr().out
+    assert main(command) == 1  # with nothing left to measure
+    assert "1.20%" in capsys.readouterr().out
+    assert len(driven) == 5
     assert main([*command, "--poses", "1"]) == cli.EXIT_INPUT
     assert "name another file" in capsys.readouterr().err
     assert main([*command, "--poses", "0"]) == cli.EXIT_INPUT
