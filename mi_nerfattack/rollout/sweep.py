@@ -16,7 +16,7 @@ from mi_nerfattack.system.heap import release_heap
 from mi_nerfattack.vehicle.state import to_state
 
 #: Images that go back through the policy at once: what it does with one costs more.
-IMAGES = 8
+IMAGES = 4
 
 
 @dataclass(frozen=True)
