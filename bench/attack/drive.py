@@ -2,9 +2,9 @@
 
 The bundled intersection as it is, PilotNet on the route `right`, 12.5 m of road in 2.5
 seconds, past the hydrant (twice its size, 1.5 m tall) beside the lane: from less than
-1 % of the frame it grows to a fifth of it, and is passed. A longer horizon drives the
+1 % of the frame it grows to a quarter of it, and is passed. A longer horizon drives the
 same road in finer steps, so that frames of all horizons are alike. The policy's image
-is the camera's middle part of its shape, resized; so it drives alike at all sizes.
+is the camera's middle part of its shape, resized; so it drives much alike at all sizes.
 """
 
 from __future__ import annotations

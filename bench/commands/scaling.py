@@ -40,9 +40,13 @@ class BenchScaling:
 
         from bench.attack import scaling
         from bench.commands.speed import measure, read_sizes
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.io import files
 
-        parts = read_sizes(self.sizes), self.poses, self.objects, self.horizons
+        sizes = read_sizes(self.sizes)
+        if len({width * height for width, height in sizes}) < len(sizes):
+            raise InputError("--sizes: two of as many pixels; name one of them")
+        parts = sizes, self.poses, self.objects, self.horizons
         settings = scaling.Settings(*parts, self.repeats)
         files.check_writable(self.output)
         document = measure(scaling.run, settings, self.output, self._command())

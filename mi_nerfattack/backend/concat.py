@@ -24,12 +24,11 @@ def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
         evaluated arrays of the sum of the sizes.
     """
     index = _index_type(parts[0])
-    places, start = [], 0
-    for count in counts:
-        places.append(dr.opaque(index, start) + dr.arange(index, count))
+    result, start = _empty(parts[0], sum(counts)), 0
+    for part, count in zip(parts, counts, strict=True):
+        _put(result, part, dr.opaque(index, start) + dr.arange(index, count))
+        dr.eval(result)  # of parts of equal size it would make one kernel
         start += count
-    result = _lay(parts, places, start)
-    dr.eval(result)
     return result
 
 
@@ -38,28 +37,32 @@ def split(array: Any, count: int) -> list[Any]:
     index = dr.uint32_array_t(array)
     within = dr.arange(index, count)
     starts = range(0, dr.width(array), count)
-    parts = [
-        dr.gather(type(array), array, dr.opaque(index, start) + within)
-        for start in starts
-    ]
-    dr.eval(parts)
+    parts = []
+    for start in starts:
+        place = dr.opaque(index, start) + within
+        parts.append(dr.gather(type(array), array, place))
+        dr.eval(parts[-1])  # see `concat`
     return parts
 
 
-def _lay(parts: Sequence[Any], places: Sequence[Any], total: int) -> Any:
-    first = parts[0]
-    if isinstance(first, list):
-        return [_lay(items, places, total) for items in zip(*parts, strict=True)]
-    if is_dataclass(first):
-        names = [item.name for item in fields(first)]
-        values = {k: _lay([getattr(p, k) for p in parts], places, total) for k in names}
-        return type(first)(**values)
-    if not dr.is_array_v(first):
-        return first
-    target = dr.empty(type(first), total)
-    for part, place in zip(parts, places, strict=True):
+def _empty(part: Any, size: int) -> Any:
+    if isinstance(part, list):
+        return [_empty(item, size) for item in part]
+    if is_dataclass(part):
+        values = {f.name: _empty(getattr(part, f.name), size) for f in fields(part)}
+        return type(part)(**values)
+    return dr.empty(type(part), size) if dr.is_array_v(part) else part
+
+
+def _put(target: Any, part: Any, place: Any) -> None:
+    if isinstance(part, list):
+        for item, value in zip(target, part, strict=True):
+            _put(item, value, place)
+    elif is_dataclass(part):
+        for name in (item.name for item in fields(part)):
+            _put(getattr(target, name), getattr(part, name), place)
+    elif dr.is_array_v(part):
         dr.scatter(target, part, place)
-    return target
 
 
 def _index_type(part: Any) -> Any:

@@ -60,7 +60,7 @@ class AbstractSimulation(AbstractEnvironment):
         return self._disturbed(self._observe())
 
     def advance(self, control: float) -> None:
-        """Drive one period and render nothing."""
+        """Drive one period and render nothing; what changes the motion belongs here."""
         if self._steps < 0:
             raise InputError(f"environment {self.name!r}: step comes after reset")
         self.vehicle.advance(float(control))

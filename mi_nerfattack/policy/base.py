@@ -48,8 +48,9 @@ class AbstractPolicy(ABC):
         """Multiply cotangents by the derivative of `step`.
 
         Args:
-            image: as given to `step`.
-            goal: likewise.
+            image: as given to `step`; of a policy without memory, images of several
+                steps one after the other: each row of a batch stands for itself.
+            goal: as given to `step`.
             memory: likewise.
             cotangent: row (n,), derivative of the objective by the control.
             d_memory: derivative of the objective by the memory that `step`

@@ -241,7 +241,7 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.restore`; marches what comes after `kept`."""
         others = [_see(item, rays, stop) for item in rays.light(posed)[len(kept) :]]
         layers = [*kept, *others]
-        return Seen(depth_composite(layers), layers)
+        return Seen(depth_composite(layers), layers) if layers else nothing(rays)
 
     def forward(
         self,

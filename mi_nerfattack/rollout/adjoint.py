@@ -58,9 +58,10 @@ class Replay(AbstractAdjoint):
     """Keeps states, and the policy's memory where it has one; renders all again.
 
     Memory: 8 m bytes a vehicle and period, and the policy's memory; besides that
-    independent of the horizon. Time: a backward pass renders every frame once more,
-    then costs one product with the policy's derivative and one march derivative a
-    period; forward and backward together about 2.4 forward passes.
+    independent of the horizon: up to four images wait for the policy's derivative.
+    Time: a backward pass renders every frame once more, then costs a product with the
+    policy's derivative, and march derivatives of the rays that meet objects; forward
+    and backward together about 2.4 forward passes.
     """
 
     def keep(self, loop: ClosedLoop, step: Step) -> Any:
@@ -80,10 +81,10 @@ class Replay(AbstractAdjoint):
 class KeptBackgrounds(AbstractAdjoint):
     """Keeps how scene and objects looked in each frame; renders nothing again.
 
-    Memory: what :class:`Replay` keeps and 20 (k + 1) bytes a pixel and period for k
-    objects (colour, opacity and depth of each layer in single precision): with one,
-    0.5 MB a vehicle and period at 200x66, 2.8 MB at 366x188. Exact composites keep
-    20 (k + 2) bytes. Time: as Replay without rendering, so that forward and backward
+    Memory: what :class:`Replay` keeps and 20 bytes a layer, pixel and period (colour,
+    opacity and depth in single precision): with a scene and one object, 0.5 MB a
+    vehicle and period at 200x66, 2.8 MB at 366x188. Exact composites keep 20 more.
+    Time: as Replay without rendering, so that forward and backward
     together take less than 2 forward passes where the objects fill little of the
     frame. The choice as long as the memory suffices.
     """

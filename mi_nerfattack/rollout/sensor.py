@@ -61,7 +61,8 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """Accumulate the parameters' gradients and return the state's.
 
         Args:
-            observation: from :meth:`observe` with the same state and step.
+            observation: from :meth:`observe` with the same state and step; there may
+                have been others since.
             state: (m, n), as given to :meth:`observe`.
             d_image: derivative of the objective by the image, of its shape.
             attached: whether to differentiate by the state.

@@ -120,7 +120,7 @@ class Sweep:
         attached: whether images follow the state.
         together: control periods whose images go through the policy at once, and whose
             observations are held until then; 1 where images follow the state, or the
-            policy has memory.
+            gradient is taken apart. With memory, a policy takes them one by one.
         pending: derivatives by controls that act in periods already visited.
         d_memory: derivative by the policy's memory after the period.
     """
@@ -151,7 +151,9 @@ class Sweep:
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
         dr.eval(cotangent)
         self._waiting.append((step, image, cotangent))
-        by_pose = self.finish() if len(self._waiting) == self.together else None
+        alone = bool(step.memory or self.d_memory)
+        full = alone or len(self._waiting) == self.together
+        by_pose = self.finish() if full else None
         if by_pose is not None:
             for axis in range(3):
                 d_state[axis] += by_pose[axis]
@@ -205,8 +207,7 @@ def backward(
         TypeError: sensor or policy have no such derivatives.
     """
     sensor = differentiable(loop)
-    remembers = bool(loop.policy.initial_memory(drive.count))
-    alone = options.attached or remembers or options.recorder is not None
+    alone = options.attached or options.recorder is not None
     together = 1 if alone else max(1, IMAGES // drive.count)
     sweep = Sweep(loop, drive, options.attached, together)
     sensor.start_gradient(options.offsets)

@@ -117,7 +117,7 @@ def test_attack_prints_the_promised_keys(capsys, tmp_path):
     assert list(row["peak_memory_mb_by_horizon"]) == ["1", "2"]
     assert row["kernels_compiled_after_warmup"] == 0
     kept = row["kept_backgrounds"]["stated_mb_per_step"]
-    assert kept == pytest.approx(20 * 32 * 16 / 1e6)
+    assert kept == pytest.approx(2 * 20 * 32 * 16 / 1e6)  # scene and object
     assert row["batch"]["poses"] == 2
     single = row["launches_per_step"]["kept_backgrounds"]
     batch = row["batch"]["launches_per_step"]
@@ -174,6 +174,8 @@ def test_scaling_is_written_row_by_row_and_goes_on(capsys, monkeypatch, tmp_path
     assert main(command) == 0
     assert [job.poses for job in measured] == [1, 1, 1, 4]
     assert "0.50" in capsys.readouterr().out
+    assert main(["scaling", "--sizes", "32x16", "16x32"]) == cli.EXIT_INPUT
+    assert "two of as many pixels" in capsys.readouterr().err
     powers = json.loads(path.read_text())["exponents"]
     assert powers["pixels"]["iteration_ms"] == pytest.approx(1)
     assert powers["poses"]["iteration_mb"] == pytest.approx(0.5)

@@ -230,9 +230,18 @@ def test_the_heap_is_released_after_each_derivative_of_the_policy(monkeypatch):
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_periods_together_give_the_gradient_of_periods_alone(adjoint, monkeypatch):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"jitter_seed": 7, "disturbance": DISTURBANCE},
+        {"composite": InterleavedComposite()},
+    ],
+)
+def test_periods_together_give_the_gradient_of_periods_alone(
+    adjoint, changes, monkeypatch
+):
     """Rays that wait for a launch, and images for the policy, lose nothing."""
-    loop, _ = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
+    loop, _ = toy.make_loop(**changes)
     rollout = make_rollout(loop, 11, adjoint=adjoint)
     together = texture_gradient(rollout, POSES)
     monkeypatch.setattr(sweep, "IMAGES", 1)

@@ -62,7 +62,8 @@ class ViewRenderer:
 
     After the first view no kernel is compiled, and after the second (of one number of
     samples) none is traced, unless a plugin of the scene reads values while it is
-    traced. Not differentiable.
+    traced. So arrays of the scene may change between views; what a plugin holds as
+    plain numbers of Python is that of the first. Not differentiable.
 
     Args:
         scene: any scene; its own sensors are ignored.
