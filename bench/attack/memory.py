@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,10 +57,8 @@ def run(
     Raises:
         InputError: the file was made by another command, machine or version.
     """
-    document = results.stamp({"rows": []}, command)
-    if path.exists():
-        document["rows"] = kept_rows(path, document)
-        document["change"] = _change(document["rows"])
+    document = begin(path, command)
+    document["change"] = _change(document["rows"])
     done = {(row["poses"], row["horizon"]) for row in document["rows"]}
     left = [job for job in settings.jobs() if (job.poses, job.horizon) not in done]
     work, total = 0, sum(job.poses * job.horizon for job in left)
@@ -73,23 +73,40 @@ def run(
     return document
 
 
-def kept_rows(path: Path, wanted: dict[str, Any]) -> list[dict[str, Any]]:
-    """Read the rows of a document that has the same stamp, but for the date."""
-    found = files.read_json(path)
-    for key in ("command", "machine", "versions"):
-        if found.get(key) != wanted[key]:
-            raise InputError(
-                f"{path}: {key} {found.get(key)} there, {wanted[key]} here; name "
-                "another file"
-            )
-    return found["rows"]
+def begin(path: Path, command: list[str]) -> dict[str, Any]:
+    """Return a stamped document with the `rows` that a file has, if it is there.
+
+    Raises:
+        InputError: the file was made by another command, machine or version.
+    """
+    document = results.stamp({"rows": []}, command)
+    if path.exists():
+        found = files.read_json(path)
+        for key in ("command", "machine", "versions"):
+            if found.get(key) != document[key]:
+                raise InputError(
+                    f"{path}: {key} {found.get(key)} there, {document[key]} here; name "
+                    "another file"
+                )
+        document["rows"] = found["rows"]
+    return document
+
+
+@contextmanager
+def warm_worker(job: Job, way: str) -> Iterator[Worker]:
+    """Open a process that has done an iteration, and was not the first to compile it.
+
+    Compiling takes memory.
+    """
+    with Worker("attack", "ours", *job.arguments()) as worker:
+        worker.ask("compile", way)
+    with Worker("attack", "ours", *job.arguments()) as worker:
+        worker.ask("iterate", way)
+        yield worker
 
 
 def _peak_mb(job: Job) -> float:
-    with Worker("attack", "ours", *job.arguments()) as worker:
-        worker.ask("compile", WAY)  # elsewhere, since it takes memory
-    with Worker("attack", "ours", *job.arguments()) as worker:
-        worker.ask("iterate", WAY)
+    with warm_worker(job, WAY) as worker:
         return worker.ask("memory")["peak_memory_mb"]
 
 

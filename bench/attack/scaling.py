@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from bench import results
 from bench.attack.drive import Job
-from bench.attack.memory import kept_rows
-from bench.render.run import Progress, Worker
+from bench.attack.memory import begin, warm_worker
+from bench.render.run import Progress
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Count, checked
 
@@ -68,9 +67,7 @@ def run(
     Raises:
         InputError: the file was made by another command, machine or version.
     """
-    document = results.stamp({"rows": []}, command)
-    if path.exists():
-        document["rows"] = kept_rows(path, document)
+    document = begin(path, command)
     axes = settings.axes()
     jobs = list(dict.fromkeys(job for axis in axes.values() for job in axis.values()))
     done = {tuple(row["job"]) for row in document["rows"]}
@@ -115,10 +112,7 @@ def _measure(job: Job, repeats: int) -> dict[str, Any]:
     """Time iterations, and take the peak of a process that compiles nothing."""
     row: dict[str, Any] = {"job": job.arguments()}
     for way, name in WAYS.items():
-        with Worker("attack", "ours", *job.arguments()) as worker:
-            worker.ask("compile", way)  # elsewhere, since it takes memory
-        with Worker("attack", "ours", *job.arguments()) as worker:
-            worker.ask("iterate", way)
+        with warm_worker(job, way) as worker:
             times = [worker.ask("iterate", way)["seconds"] for _ in range(repeats)]
             row[f"{name}_ms"] = 1e3 * statistics.median(times)
             row[f"{name}_mb"] = worker.ask("memory")["peak_memory_mb"]

@@ -10,6 +10,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 
 def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
@@ -23,10 +24,9 @@ def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
     Returns:
         evaluated arrays of the sum of the sizes.
     """
-    index = _index_type(parts[0])
     result, start = _empty(parts[0], sum(counts)), 0
     for part, count in zip(parts, counts, strict=True):
-        _put(result, part, dr.opaque(index, start) + dr.arange(index, count))
+        put(result, part, dr.opaque(mi.UInt32, start) + dr.arange(mi.UInt32, count))
         dr.eval(result)  # of parts of equal size it would make one kernel
         start += count
     return result
@@ -34,12 +34,11 @@ def concat(parts: Sequence[Any], counts: Sequence[int]) -> Any:
 
 def split(array: Any, count: int) -> list[Any]:
     """Cut an array (n count,) into n of `count` entries, evaluated."""
-    index = dr.uint32_array_t(array)
-    within = dr.arange(index, count)
+    within = dr.arange(mi.UInt32, count)
     starts = range(0, dr.width(array), count)
     parts = []
     for start in starts:
-        place = dr.opaque(index, start) + within
+        place = dr.opaque(mi.UInt32, start) + within
         parts.append(dr.gather(type(array), array, place))
         dr.eval(parts[-1])  # see `concat`
     return parts
@@ -54,24 +53,19 @@ def _empty(part: Any, size: int) -> Any:
     return dr.empty(type(part), size) if dr.is_array_v(part) else part
 
 
-def _put(target: Any, part: Any, place: Any) -> None:
+def put(target: Any, part: Any, place: mi.UInt32) -> None:
+    """Scatter arrays, or dataclasses and lists of arrays, leaf by leaf.
+
+    Args:
+        target: of arrays to scatter into.
+        part: likewise, to scatter.
+        place: entry k goes to `place[k]`.
+    """
     if isinstance(part, list):
         for item, value in zip(target, part, strict=True):
-            _put(item, value, place)
+            put(item, value, place)
     elif is_dataclass(part):
         for name in (item.name for item in fields(part)):
-            _put(getattr(target, name), getattr(part, name), place)
+            put(getattr(target, name), getattr(part, name), place)
     elif dr.is_array_v(part):
         dr.scatter(target, part, place)
-
-
-def _index_type(part: Any) -> Any:
-    """Return the type of indices for the arrays of a part."""
-    if isinstance(part, list):
-        return _index_type(part[0])
-    if is_dataclass(part):
-        return _index_type(getattr(part, fields(part)[0].name))
-    kind = type(part)
-    while dr.depth_v(kind) > 1:
-        kind = dr.value_t(kind)
-    return dr.uint32_array_t(kind)

@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.concat import put
+
 
 @dataclass
 class Rays:
@@ -58,8 +60,7 @@ def put_rays(march: March, index: mi.UInt32) -> March:
         index: (n,), each number below n once.
     """
     result = March.zeros(dr.width(index))
-    for item in fields(March):
-        dr.scatter(getattr(result, item.name), getattr(march, item.name), index)
+    put(result, march, index)
     return result
 
 
