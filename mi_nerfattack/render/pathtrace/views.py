@@ -9,7 +9,7 @@ view into the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.render.camera.conventions import (
     mitsuba_sensor_dict,
@@ -59,7 +60,10 @@ def require_colour() -> None:
 class ViewRenderer:
     """Renders one scene with one camera from any number of poses.
 
-    After the first view no kernel is compiled. Not differentiable.
+    After the first view no kernel is compiled, and after the second (of one number of
+    samples) none is traced, unless a plugin of the scene reads values while it is
+    traced. So arrays of the scene may change between views; what a plugin holds as
+    plain numbers of Python is that of the first. Not differentiable.
 
     Args:
         scene: any scene; its own sensors are ignored.
@@ -74,6 +78,9 @@ class ViewRenderer:
         self._integrator = scene.integrator() if integrator is None else integrator
         self._sensor = mi.load_dict(mitsuba_sensor_dict(camera, np.eye(4), 1, film))
         self._parameters = mi.traverse(self._sensor)
+        _evaluate_means(scene)
+        self._frozen: Callable[..., Any] | None
+        self._frozen = freeze_method(self._record, self._state)
 
     def render(self, camera_to_world: np.ndarray, spp: int, seed: int) -> View:
         """Render one view.
@@ -88,20 +95,47 @@ class ViewRenderer:
         dr.make_opaque(to_world)
         self._parameters["to_world"] = to_world
         self._parameters.update()
-        image = mi.render(
+        image = self._launch(_grid_samples(spp), dr.opaque(mi.UInt32, seed)).numpy()
+        return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
+
+    def _launch(self, spp: int, seed: mi.UInt32) -> mi.TensorXf:
+        """Replay the launch, or trace it where it cannot be recorded."""
+        if self._frozen is not None:
+            try:
+                return self._frozen(spp, seed)
+            except RuntimeError:  # a plugin that reads values; or its own error, below
+                self._frozen = None
+        return self._record(spp, seed)
+
+    def _record(self, spp: int, seed: mi.UInt32) -> mi.TensorXf:
+        return mi.render(
             self.scene,
             sensor=self._sensor,
             integrator=self._integrator,
-            spp=_grid_samples(spp),
-            seed=mi.UInt32(seed),
-        ).numpy()
-        return View(image[..., :3], image[..., 3], self.depth(camera_to_world))
+            spp=spp,
+            seed=seed,
+        )
+
+    def _state(self, spp: int, seed: mi.UInt32) -> list[Any]:
+        del spp, seed
+        return [self.scene, self._sensor, self._integrator]
 
     def depth(self, camera_to_world: np.ndarray) -> np.ndarray:
         """Return the depth image alone; see `View.depth`."""
         o, d = generate_rays(self.camera, *pose_arrays(camera_to_world), 1)
         t = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True).t
         return t.numpy().reshape(self.camera.height, self.camera.width)
+
+
+def _evaluate_means(scene: Any) -> None:
+    """Evaluate the means of bitmaps, which Mitsuba leaves pending.
+
+    A recording would evaluate all of them in one kernel, in an order that differs from
+    process to process.
+    """
+    for node in mi.traverse(scene).hierarchy:
+        if node.class_name().startswith("BitmapTexture"):
+            dr.eval(node.mean())
 
 
 def _grid_samples(spp: int) -> int:
