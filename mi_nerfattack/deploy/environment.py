@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.rays import March
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -26,46 +25,43 @@ class CameraFrame:
         camera_to_world: (4, 4) float64, OpenCV axes, metres.
         linear: (height, width, 3) float32, what the image was made of; None where the
             environment gives eight bits alone.
-        beneath: the frame before objects were pasted, None where none were.
-        marches: of what lies in the frame layer by layer, a ray a pixel.
+        split: takes the frame apart: called with the names of the objects, gives layers
+            as `layers` does; None where objects are part of the scene, or there are
+            none.
     """
 
     image: np.ndarray
     depth: np.ndarray
     camera_to_world: np.ndarray
     linear: np.ndarray | None = None
-    beneath: CameraFrame | None = None
-    marches: Sequence[March] = ()
+    split: Callable[[Sequence[str]], dict[str, np.ndarray]] | None = None
+
+    @property
+    def light(self) -> np.ndarray:
+        """What the image was made of, or was decoded to: (height, width, 3), linear."""
+        if self.linear is not None:
+            return self.linear
+        return srgb_to_linear_numpy(self.image / np.float32(255))
 
     def layers(self, objects: Sequence[str]) -> dict[str, np.ndarray]:
         """Take the frame apart, for a file.
+
+        A layer is what reaches the camera of one thing, premultiplied: colours and
+        opacities of all layers add up to those of the frame.
 
         Args:
             objects: names of those that are shown; not looked at where their geometry
                 is the scene's.
 
         Returns:
-            by layer name: the frame as ``""`` (height, width, 4) and ``Z``, the scene
-            alone as ``scene`` and ``scene.Z`` (further fields: ``scene1``, ...), each
-            object (premultiplied) as ``NAME`` and ``NAME.Z``; linear, metres along the
-            ray.
+            by layer name: the frame as ``""`` (height, width, 4) and ``Z``; in the
+            same way ``scene`` and each object as ``NAME`` and ``NAME.Z``, and of the
+            surrogate further fields (``scene1``, ...) and what is seen behind all of
+            them (``background``). Linear; depths in metres along the ray.
         """
-        found = self._layer("")
-        if self.beneath is not None:
-            found |= self.beneath._layer("scene")
-        scenes = range(len(self.marches) - len(objects))
-        names = [*(f"scene{k or ''}" for k in scenes), *objects]
-        for name, march in zip(names, self.marches, strict=False):
-            found |= march.images(name, self.depth.shape)
-        return found
-
-    def _layer(self, name: str) -> dict[str, np.ndarray]:
-        colour = self.linear
-        if colour is None:
-            colour = srgb_to_linear_numpy(self.image / np.float32(255))
         opaque = np.ones((*self.depth.shape, 1), np.float32)
-        key = f"{name}.Z" if name else "Z"
-        return {name: np.concatenate([colour, opaque], axis=-1), key: self.depth}
+        whole = {"": np.concatenate([self.light, opaque], axis=-1), "Z": self.depth}
+        return whole if self.split is None else whole | self.split(objects)
 
 
 class AbstractEnvironment(ABC):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,9 @@ from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.rays import March
 from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.vehicle.route.route import Route
 from mi_nerfattack.vehicle.state import to_state
 
@@ -78,7 +81,8 @@ class AbstractSimulation(AbstractEnvironment):
         image = mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
         zero, draw = np.zeros(1), (self.noise_sd, self._seed, self._steps)
         seen = np.array(disturbed(image, zero, zero + self.blur_px, *draw))[0]
-        return replace(frame, image=np.round(255 * seen).astype(np.uint8))
+        image = np.round(255 * seen).astype(np.uint8)
+        return replace(frame, image=image, linear=frame.light)
 
     @abstractmethod
     def _observe(self) -> CameraFrame:
@@ -156,12 +160,45 @@ class SurrogateEnvironment(AbstractSimulation):
         total, far = seen.total, dr.inf if ends is None else ends.t_max
         linear = total.radiance + (1 - total.opacity) * sensor.behind(found)
         depth = dr.select(total.opacity >= OPAQUE, total.depth, far)
+        start = mi.Float(0)
         if sensor.clip.near_m:  # where rays start
-            depth += dr.norm(rays.origin - mi.Point3f(*map(float, pose[:3, 3])))
+            start = dr.norm(rays.origin - mi.Point3f(*map(float, pose[:3, 3])))
         return CameraFrame(
             np.round(255 * np.array(found.image)[0]).astype(np.uint8),
-            depth.numpy().reshape(shape),
+            (depth + start).numpy().reshape(shape),
             pose,
             linear.numpy().T.reshape(*shape, 3),
-            marches=seen.layers,
+            partial(_split, sensor, found, start, shape),
         )
+
+
+def _split(
+    sensor: FieldSensor,
+    found: Observation,
+    start: mi.Float,
+    shape: tuple[int, int],
+    objects: Sequence[str],
+) -> dict[str, np.ndarray]:
+    """Take an observation apart; see :meth:`CameraFrame.layers`.
+
+    Args:
+        sensor: that observed.
+        found: what it observed.
+        start: (n,) or one, metres from the camera to where rays start.
+        shape: height and width.
+        objects: names.
+    """
+    seen, ends = found.seen, found.ends
+    assert seen is not None
+    passed = 1 - seen.total.opacity
+    far = dr.inf if ends is None else ends.t_max
+    behind = March(passed * sensor.behind(found), passed)
+    shares = sensor.composite.shares(seen)
+    names = [f"scene{k or ''}" for k in range(len(shares) - len(objects))]
+    parts = zip((*names, *objects), shares, (m.depth for m in shares), strict=True)
+    layers = {}
+    for name, part, depth in (*parts, ("background", behind, far)):
+        layers |= part.images(name, shape)
+        depth = dr.select(part.opacity > 0, depth + start, dr.inf)
+        layers[f"{name}.Z"] = depth.numpy().reshape(shape)
+    return layers

@@ -15,7 +15,7 @@ from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
 from mi_nerfattack.render.batched import FIRST_RAYS, march_gradient
 from mi_nerfattack.render.march import RayTangent, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import March, Rays, pick_rays
+from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
 #: What to do where a backdrop has no derivative by the rays.
@@ -144,6 +144,10 @@ class AbstractComposite(ABC):
         """
         del scene, stop
 
+    def shares(self, seen: Seen) -> list[March]:
+        """Return what of each layer reaches the camera; they add up to the total."""
+        return seen.layers
+
     @abstractmethod
     def keep(self, seen: Seen) -> Any:
         """Return the part of what was seen that is costly to find again."""
@@ -230,6 +234,10 @@ class DepthComposite(AbstractComposite):
     def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
         """See :meth:`AbstractComposite.ahead`."""
         return scene_march(scene, stop) if isinstance(scene, PosedField) else None
+
+    def shares(self, seen: Seen) -> list[March]:
+        """See :meth:`AbstractComposite.shares`."""
+        return shares_by_depth(seen.layers)
 
     def keep(self, seen: Seen) -> Any:
         """See :meth:`AbstractComposite.keep`: all layers, 20 bytes a ray and layer."""
@@ -363,18 +371,8 @@ def depth_composite(layers: list[March]) -> March:
     ordered = sort_by_depth(layers)
     result = ordered[-1]
     for front in reversed(ordered[:-1]):
-        result = over(front, result)
+        result = front.over(result)
     return result
-
-
-def over(front: March, back: March) -> March:
-    """Lay one march over another; all that passes the front meets the back."""
-    passed = 1 - front.opacity
-    return March(
-        front.radiance + passed * back.radiance,
-        front.opacity + passed * back.opacity,
-        front.moment + passed * back.moment,
-    )
 
 
 def sort_by_depth(layers: list[March]) -> list[March]:

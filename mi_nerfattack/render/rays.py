@@ -111,6 +111,15 @@ class March:
             self.moment + dr.select(active, other.moment, 0),
         )
 
+    def over(self, back: March) -> March:
+        """Lay this march over another; all that passes it meets the one at the back."""
+        passed = 1 - self.opacity
+        return March(
+            self.radiance + passed * back.radiance,
+            self.opacity + passed * back.opacity,
+            self.moment + passed * back.moment,
+        )
+
     def pair(self, other: March) -> mi.Float:
         """Return the inner product with another march, ray by ray (n,)."""
         return (
@@ -140,3 +149,26 @@ class March:
         """Expected depth (A.3, normalised), metres; infinite where opacity is 0."""
         hit = self.opacity > 0
         return dr.select(hit, self.moment / dr.select(hit, self.opacity, 1), dr.inf)
+
+
+def shares_by_depth(layers: Sequence[March]) -> list[March]:
+    """Weaken each layer by those of smaller expected depth.
+
+    What is left of them adds up to their composite by depth. Of equal depths the first
+    in the list is in front.
+
+    Args:
+        layers: one march a layer, each of n rays.
+    """
+    depths, found = [layer.depth for layer in layers], []
+    for index, layer in enumerate(layers):
+        passed = mi.Float(1)
+        for other, front in enumerate(layers):
+            nearer = depths[other] < depths[index]
+            if other < index:
+                nearer |= depths[other] == depths[index]
+            if other != index:
+                passed *= dr.select(nearer, 1 - front.opacity, 1)
+        parts = layer.radiance, layer.opacity, layer.moment
+        found.append(March(*(passed * part for part in parts)))
+    return found

@@ -161,7 +161,11 @@ def test_surrogate_shows_what_the_sensor_of_attacks_sees():
     assert frame.image.std() > 5
     assert np.isinf(frame.depth).any() and np.isfinite(frame.depth).any()
     layers = frame.layers(["ball"])
-    assert set(layers) == {"", "Z", "scene", "scene.Z", "ball", "ball.Z"}
+    parts = ("scene", "ball", "background")
+    assert set(layers) == {"", "Z", *parts, *(f"{name}.Z" for name in parts)}
+    whole = sum(layers[name] for name in parts)
+    assert abs(whole - layers[""]).max() < 1e-6
+    assert min(layers[name][..., 3].max() for name in parts) > 0.1
     assert (linear_to_uint8(layers[""][..., :3]) == frame.image).mean() > 0.99
 
 

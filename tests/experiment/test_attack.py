@@ -160,8 +160,9 @@ def test_pasting_follows_depth_and_opacity():
         mi.Float(opacity),
         mi.Float(2.0 * opacity),
     )
-    pasted, _ = paste_layers(rgb, depth, [layer])
+    pasted, _, owner = paste_layers(rgb, depth, [layer])
     assert np.allclose(pasted[0, :, 0], [0.5, 0.0, 0.0, 0.5])
+    assert owner.tolist() == [[1, 0, 0, 1]]
 
 
 def test_bundled_demo_scenario_is_valid():

@@ -10,7 +10,12 @@ from helpers import small_fields as small
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mi_nerfattack.render.composite import depth_composite, over, sort_by_depth
+from mi_nerfattack.render.composite import (
+    DepthComposite,
+    Seen,
+    depth_composite,
+    sort_by_depth,
+)
 from mi_nerfattack.render.rays import March
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -86,11 +91,16 @@ def test_any_layers_against_a_sequential_fold(layers) -> None:
     assert depth == pytest.approx(expected, rel=1e-5)
     depths = [float(m.depth[0]) for m in sort_by_depth(marches)]
     assert depths == sorted(depths)
+    shares = DepthComposite().shares(Seen(depth_composite(marches), marches))
+    for name in ("radiance", "opacity", "moment"):
+        parts = sum(np.array(getattr(share, name)) for share in shares)
+        whole = np.array(getattr(depth_composite(marches), name))
+        np.testing.assert_allclose(parts, whole, atol=1e-5)
 
 
 def test_over_is_associative(rng: np.random.Generator) -> None:
     a, b, c = [layer(rng.random(3), rng.random(), 1 + rng.random()) for _ in range(3)]
-    left, right = read(over(over(a, b), c)), read(over(a, over(b, c)))
+    left, right = read(a.over(b).over(c)), read(a.over(b.over(c)))
     for x, y in zip(left, right, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-6)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -81,15 +82,11 @@ class Paster:
             )
         if not self.objects:
             return frame
-        layers = self.march(frame.camera_to_world)
-        linear, pose = frame.linear, frame.camera_to_world
-        if linear is None:
-            at = frame.image, frame.depth, layers
-            image, depth = paste_layers(*at, linear_to_uint8)
-        else:
-            linear, depth = paste_layers(linear, frame.depth, layers)
-            image = linear_to_uint8(linear)
-        return CameraFrame(image, depth, pose, linear, frame, layers)
+        pose = frame.camera_to_world
+        found = paste_layers(frame.light, frame.depth, self.march(pose))
+        linear, depth, _ = found
+        image = linear_to_uint8(linear)
+        return CameraFrame(image, depth, pose, linear, partial(_split, *found))
 
     def _record(self, rays: Rays) -> list[March]:
         return [march(posed, rays, STOP) for posed in self.objects]
@@ -109,32 +106,42 @@ def require_fields(objects: Sequence[Any]) -> None:
 
 
 def paste_layers(
-    image: np.ndarray,
-    depth: np.ndarray,
-    layers: Sequence[March],
-    encode: Callable[[np.ndarray], np.ndarray] = np.asarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    linear: np.ndarray, depth: np.ndarray, layers: Sequence[March]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Paste marches into an image one by one, as if they were opaque.
 
     Args:
-        image: (height, width, 3), as `encode` makes it; linear float32 by default.
+        linear: (height, width, 3), float32.
         depth: (height, width), metres along the ray; infinite where there is nothing.
         layers: marches of height * width rays, row by row from the top left.
-        encode: turns linear colours (height, width, 3) into those of the image.
 
     Returns:
-        image and depth with the layers in them.
+        image and depth with the layers in them, and whose a pixel is, (height, width):
+        0 for the image's own, k + 1 for that of layer k.
 
     Source: appendix B.3.
     """
-    shape = depth.shape
-    for layer in layers:
-        opacity = layer.opacity.numpy().reshape(shape)
-        nearness = layer.depth.numpy().reshape(shape)
+    owner = np.zeros(depth.shape, int)
+    for index, layer in enumerate(layers, start=1):
+        opacity = layer.opacity.numpy().reshape(depth.shape)
+        nearness = layer.depth.numpy().reshape(depth.shape)
         mask = (opacity >= OPAQUE) & (nearness < depth)
-        radiance = layer.radiance.numpy().T.reshape(*shape, 3)
-        colour = np.where(mask[..., None], radiance, 0)
-        colour = encode(colour / np.where(mask, opacity, 1)[..., None])
-        image = np.where(mask[..., None], colour, image)
+        radiance = layer.radiance.numpy().T.reshape(*depth.shape, 3)
+        colour = radiance / np.where(mask, opacity, 1)[..., None]
+        linear = np.where(mask[..., None], colour, linear)
         depth = np.where(mask, nearness, depth)
-    return image, depth
+        owner[mask] = index
+    return linear, depth, owner
+
+
+def _split(
+    linear: np.ndarray, depth: np.ndarray, owner: np.ndarray, objects: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Give each pixel to the layer whose it is; see :meth:`CameraFrame.layers`."""
+    whole = np.concatenate([linear, np.ones((*depth.shape, 1), np.float32)], axis=-1)
+    found = {}
+    for index, name in enumerate(("scene", *objects)):
+        own = owner == index
+        found[name] = np.where(own[..., None], whole, np.float32(0))
+        found[f"{name}.Z"] = np.where(own, depth, np.inf)
+    return found

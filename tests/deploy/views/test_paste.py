@@ -130,6 +130,13 @@ def test_wall_between_two_objects_hides_the_farther_alone():
     assert (alone.depth < 7).sum() > 3
     found = paste_objects(frame, CAMERA, [far, near])
     assert (found.image == alone.image).all() and (found.depth == alone.depth).all()
+    layers = found.layers(["far", "near"])
+    assert not layers["far"].any() and np.isinf(layers["far.Z"]).all()
+    assert layers["near"][..., 3].sum() == (alone.depth < 7).sum()
+    total = sum(layers[name] for name in ("scene", "far", "near"))
+    assert (total == layers[""]).all()
+    nearest = np.minimum(layers["scene.Z"], layers["near.Z"])
+    assert (nearest == layers["Z"]).all()
 
 
 def test_no_kernel_is_compiled_after_the_first_frame():
