@@ -13,6 +13,7 @@ from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.attack import Attack
 from mi_nerfattack.commands.bake import Bake
 from mi_nerfattack.commands.capture import Capture
+from mi_nerfattack.commands.check import Check
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.evaluate import Evaluate
@@ -43,6 +44,7 @@ COMMANDS: dict[str, type[Command]] = {
     "export": Export,
     "train": Train,
     "evaluate": Evaluate,
+    "check": Check,
     "attack": Attack,
 }
 

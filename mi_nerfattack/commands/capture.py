@@ -40,6 +40,8 @@ class Capture:
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.render.camera.intrinsics import from_fov
+        from mi_nerfattack.report.plots.place import routes_picture
+        from mi_nerfattack.vehicle.route.route import load_routes
 
         variant.ensure()
         for name in ("views", "width", "height", "spp"):
@@ -57,6 +59,12 @@ class Capture:
                 self.seed,
                 bars.counter("rendering views"),
             )
+            show = bars.counter("drawing the place")
+            show(0, 1)
+            picture = path.parent / "place.png"
+            routes_picture(picture, self.scene, load_routes(self.routes), camera)
+            show(1, 1)
+        print(f"{picture}: scene, routes and lanes from above; look at it first")
         print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
         folder = shlex.quote(str(path.parent))
         print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mi_nerfattack.deploy.sites import AbstractSite
     from mi_nerfattack.training.presets import Preset
     from mi_nerfattack.training.settings import ImitationSettings
+    from mi_nerfattack.vehicle.route.route import Route
 
 #: Environments that cannot train, and what to do.
 _REFUSED = {
@@ -130,9 +131,24 @@ class Train:
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result, command)
         write_trained(self.output, result.module, record)
+        picture = self.output.with_name(f"{self.output.stem}-place.png")
+        self._draw(picture, place, routes)
         Console().print(card_table(result.card))
         print(f"{self.output}: written; program and validation are beside it")
+        print(f"{picture}: where it was trained, from above")
         return 0
+
+    def _draw(self, picture: Path, place: Place, routes: list[Route]) -> None:
+        from mi_nerfattack.fields import load_field
+        from mi_nerfattack.render.posed import PosedField
+        from mi_nerfattack.report.plots.place import routes_picture
+        from mi_nerfattack.rollout.field_sensor import FieldSensor
+
+        look, sensor = (place.camera, place.mount), None
+        if place.field is not None:
+            sensor = FieldSensor(PosedField(load_field(place.field)), [], *look)
+        title = f"{self.output.name}: where it was trained"
+        routes_picture(picture, place.scene, routes, *look, sensor, title)
 
     def _place(self, preset: Preset) -> Place:
         from dataclasses import replace

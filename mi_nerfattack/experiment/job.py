@@ -177,7 +177,7 @@ class Job:
             return folder.checkpoint.flags
         flags: list[str] = []
         for check in (first_findings, further_findings):
-            flags += check(world, stages)
+            flags += check(world, stages.one)
             if flags and not anyway:
                 listed = "\n".join(f"  {line}" for line in flags)
                 raise InputError(

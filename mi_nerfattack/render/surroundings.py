@@ -99,6 +99,11 @@ class Surroundings:
         reach = (clip.far_m - clip.near_m) * ray_lengths(camera).ravel()
         self._reach = mi.Float(reach.tolist())
 
+    def through(self, camera: Camera, clip: Clip) -> Surroundings:
+        """Return what another camera sees of the same."""
+        parts = self.scene, self.behind, self._sampler
+        return Surroundings(*parts, camera, clip, self.seed)
+
     def see(self, rays: Rays, step: Any, sky: mi.Color3f) -> Ends:
         """Return where rays end, and what is seen there.
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.experiment.checks.ground import box_findings, ground_findings
 from mi_nerfattack.experiment.checks.standing import (
     lane_findings,
     meeting_findings,
     scene_findings,
     solids_of,
 )
-from mi_nerfattack.experiment.stages import Stages
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -22,6 +23,8 @@ from mi_nerfattack.vehicle.state import to_state
 #: A pixel shows an object where its texture can change the value by so much of 1; it
 #: is in view where such pixels are this share of a picture, in this share of pictures.
 CHANGE, PIXELS, PICTURES = 0.1, 0.001, 0.05
+#: Returns the drive in an environment with the look of a case and from a start.
+One = Callable[[str, str, int], Drive]
 
 _MOST_PICTURES = 20
 _RAW = 10.0  # a raw colour whose sigmoid is 1, whatever the levels
@@ -29,39 +32,39 @@ _OVER_M = 1.0  # beyond the end of a route, since starts are scattered
 _MESHES = ("mitsuba", "mujoco", "mujoco_gl")  # environments of the scene's meshes
 
 
-def first_findings(world: World, stages: Stages) -> Iterator[str]:
+def first_findings(world: World, one: One) -> Iterator[str]:
     """Check what one drive in each environment and the geometry tell.
 
-    The policy keeps its lane from the first start in every environment, objects in
-    their own textures; it comes to no end of the route; every object is in view;
-    objects stand beside the lane, on the ground, in the open and apart.
+    Scene and field lie beneath the route; the policy keeps its lane from the first
+    start in every environment, objects in their own textures; it comes to no end of
+    the route; every object is in view; objects stand beside the lane, on the ground,
+    in the open and apart.
 
     Args:
         world: objects look and stand as the scenario says.
-        stages: makes the drives, or has them.
+        one: makes the drives, or has them.
 
     Yields:
         a sentence each: what, where, and the remedy.
     """
-    first = stages.one(SURROGATE, OWN, 0)
+    yield from route_findings(world)
+    first = one(SURROGATE, OWN, 0)
     yield from departure_findings(world, [first])
     for label in world.deployments:
         if not world.is_open_loop(label):
-            yield from departure_findings(world, [stages.one(label, OWN, 0)])
+            yield from departure_findings(world, [one(label, OWN, 0)])
     yield from view_findings(world, first)
     yield from horizon_findings(world, first)
     yield from place_findings(world)
 
 
-def further_findings(world: World, stages: Stages) -> Iterator[str]:
+def further_findings(world: World, one: One) -> Iterator[str]:
     """Check that the policy keeps its lane from the other starts of the surrogate.
 
     Args and Yields: as :func:`first_findings`.
     """
     starts = range(1, len(world.initial))
-    yield from departure_findings(
-        world, [stages.one(SURROGATE, OWN, k) for k in starts]
-    )
+    yield from departure_findings(world, [one(SURROGATE, OWN, k) for k in starts])
 
 
 def departure_findings(world: World, drives: list[Drive]) -> Iterator[str]:
@@ -139,6 +142,14 @@ def _share_shown(world: World, k: int, pose: np.ndarray, step: int) -> float:
     return float((change >= CHANGE).mean())
 
 
+def route_findings(world: World) -> Iterator[str]:
+    """Tell of a route that is not on the ground of scene and field."""
+    yield from box_findings(world)
+    if (scene := mesh_scene(world)) is not None:
+        file = world.scenario.scene.deployment.file
+        yield from ground_findings(world, scene, file.name)
+
+
 def place_findings(world: World) -> Iterator[str]:
     """Tell of objects that stand where none can be driven past."""
     scenario = world.scenario
@@ -148,6 +159,13 @@ def place_findings(world: World) -> Iterator[str]:
     freedom = scenario.attack.freedom.build()
     yield from lane_findings(solids, world.route, scenario.vehicle.width_m, freedom)
     yield from meeting_findings(solids)
+    if (scene := mesh_scene(world)) is not None:
+        name = scenario.scene.deployment.file.name
+        yield from scene_findings(solids, world.route, scene, name)
+
+
+def mesh_scene(world: World) -> Any:
+    """Load the scene that deployments show the surfaces of; None without these."""
     if any(item.environment in _MESHES for item in world.deployments.values()):
-        file = scenario.scene.deployment.file
-        yield from scene_findings(solids, world.route, load_scene(file), file.name)
+        return load_scene(world.scenario.scene.deployment.file)
+    return None

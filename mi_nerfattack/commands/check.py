@@ -1,0 +1,71 @@
+"""``mi-nerfattack check``: look at a scenario before its attack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Check:
+    """Show a scenario from above and through the lens, and tell what is wrong with it.
+
+    Writes one picture: surrogate and scene from above with route, lane, objects, starts
+    and camera, and the first images. Tells why attack would refuse the scenario, and
+    what it would cost. Ends with 0, or with 1 if attack would refuse.
+    """
+
+    scenario: tyro.conf.Positional[Path]
+    """Scenario file (TOML)."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Picture to write (.png); SCENARIO-check.png in this folder by default."""
+    drives: bool = True
+    """Drive once from each start, unattacked, and time the attack; without, only what
+    needs no drive is told."""
+    json: bool = False
+    """End with one line of JSON in place of the sentences."""
+
+    def run(self) -> int:
+        """Check, draw and tell."""
+        import json
+        import shlex
+
+        from mi_nerfattack import variant
+        from mi_nerfattack.backend.threads import one_thread
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.experiment.checks import check as checks
+        from mi_nerfattack.io import files
+        from mi_nerfattack.scenario.policy import build_differentiable
+        from mi_nerfattack.scenario.scenario import load_scenario
+        from mi_nerfattack.scenario.world import build_world
+
+        picture = self.output or Path(f"{self.scenario.stem}-check.png")
+        if picture.suffix.lower() != ".png":
+            raise InputError(f"--output: {picture}; give a file that ends in .png")
+        files.check_writable(picture)
+        scenario, _ = load_scenario(self.scenario)
+        variant.ensure()
+        with StageBars() as bars, one_thread():
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            world = build_world(scenario, build_differentiable(scenario.policy))
+            check = checks.Check(world, show)
+            check.run(self.drives)
+            show("drawing", 0, 1, "")
+            check.picture(picture)
+            show("drawing", 1, 1, "")
+            check.price()
+        if self.json:
+            document = {**check.document(), "picture": str(picture)}
+            print(json.dumps(document, allow_nan=False))
+        else:
+            name = shlex.quote(str(self.scenario))
+            for line in checks.sentences(check, name, picture):
+                print(line)
+        return 1 if check.refused else 0

@@ -1,0 +1,104 @@
+"""Pictures of a place from above, in the surrogate and in a Mitsuba scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.views.paste import Paster
+from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
+from mi_nerfattack.render.camera.intrinsics import ray_lengths
+from mi_nerfattack.render.camera.outside import Overhead
+from mi_nerfattack.render.pathtrace.views import require_colour
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.surroundings import Clip
+from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.vehicle.state import to_state
+
+#: What is higher is left out of the surrogate's picture, metres: from where no view
+#: was fitted, fields hold matter that no view sees.
+TOP_M = 4.0
+
+
+def surrogate_above(
+    sensor: FieldSensor, overhead: Overhead, top_m: float = TOP_M
+) -> np.ndarray:
+    """Render the surrogate and its objects from above.
+
+    Args:
+        sensor: gives fields, objects and composite.
+        overhead: camera.
+        top_m: what is higher is left out.
+
+    Returns:
+        (height, width, 3), uint8, sRGB.
+    """
+    camera, clip = overhead.camera, Clip(overhead.height_m - top_m)
+    around = sensor.surroundings
+    above = FieldSensor(
+        sensor.scene,
+        sensor.objects,
+        camera,
+        overhead.mount,
+        stop=sensor.stop,
+        composite=sensor.composite,
+        surroundings=None if around is None else around.through(camera, clip),
+        clip=clip,
+    )
+    image = above.observe(to_state(overhead.state[None]), 0).image
+    return np.round(255 * np.array(image)[0].clip(0, 1)).astype(np.uint8)
+
+
+def scene_above(
+    scene: Any,
+    overhead: Overhead,
+    open_at: np.ndarray,
+    objects: Sequence[PosedField] = (),
+    spp: int = 16,
+) -> np.ndarray:
+    """Render a Mitsuba scene from above; what hides the open ground is left out.
+
+    Args:
+        scene: `mi.Scene`, metric, z up.
+        overhead: camera.
+        open_at: (n, 2), metres, points of the ground to see: below a ceiling, too.
+        objects: pasted as by `Paster`.
+        spp: samples per pixel.
+
+    Returns:
+        (height, width, 3), uint8, sRGB.
+    """
+    require_colour()
+    camera, pose = overhead.camera, overhead.camera_to_world
+    near = max(overhead.height_m - _lid(scene, open_at), 0.01)
+    description = mitsuba_sensor_dict(camera, pose, spp)
+    clip = {"near_clip": near, "far_clip": overhead.height_m + 1e4}
+    sensor = mi.load_dict({**description, **clip})
+    image: Any = mi.render(scene, sensor=sensor, spp=spp, seed=mi.UInt32(0))
+    linear = np.array(image)[..., :3]
+    if not objects:
+        return linear_to_uint8(linear)
+    rays = PixelRays(camera).at(pose)
+    start = mi.Float((near * ray_lengths(camera)).ravel().tolist())
+    ray = mi.Ray3f(rays.origin + start * rays.direction, rays.direction)
+    t = start + scene.ray_intersect_preliminary(ray, coherent=True).t
+    depth = dr.select(dr.isfinite(t), t, dr.inf).numpy().reshape(linear.shape[:2])
+    frame = CameraFrame(linear_to_uint8(linear), depth, pose, linear)
+    return Paster(camera, objects).paste(frame).image
+
+
+def _lid(scene: Any, points: np.ndarray, from_m: float = 2.0) -> float:
+    """Return the height below which points (n, 2) are seen from above, metres."""
+    top = float(scene.bbox().max[2]) + 1.0
+    start = np.column_stack([points, np.full(len(points), from_m)])
+    ray = mi.Ray3f(upload_rows(mi.Point3f, start), mi.Vector3f(0, 0, 1))
+    free = scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
+    return min(top, from_m + float(free.min()) - 0.05)

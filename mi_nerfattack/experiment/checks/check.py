@@ -1,0 +1,268 @@
+"""A scenario looked at before its attack: findings, cost, and a picture."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.deploy.driving import drive
+from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
+from mi_nerfattack.deploy.views.mitsuba import MitsubaView
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.experiment.checks.before_attack import (
+    first_findings,
+    further_findings,
+    mesh_scene,
+    place_findings,
+    route_findings,
+)
+from mi_nerfattack.experiment.checks.cost import Cost, estimate
+from mi_nerfattack.experiment.checks.ground import likeness_findings
+from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
+from mi_nerfattack.render.camera.outside import chase_mount
+from mi_nerfattack.report.plots.place import Look, Overlay, place_picture
+from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
+from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.world import World, object_footprints
+
+_LONGEST_PX = 560  # of the pictures from above
+_CHASE = 400, 200, 75.0  # pixels and field of view
+_SPP = 4
+
+
+@dataclass(eq=False)
+class Check:
+    """What is known of a scenario before its attack.
+
+    Attributes:
+        world: what the scenario describes; it stays as it was.
+        on_progress: told of a stage, units done, all units, and a remark.
+        refused: why `attack` would refuse the scenario, a sentence each.
+        doubts: what it would not refuse, and is seldom meant.
+        cost: None where no attack could be tried.
+        drives: that were made, unattacked.
+        frames: the first of each environment.
+    """
+
+    world: World
+    on_progress: Callable[[str, int, int, str], None] = lambda *told: None
+    refused: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    cost: Cost | None = None
+    drives: list[Drive] = field(default_factory=list)
+    frames: dict[str, CameraFrame] = field(default_factory=dict)
+    _period_s: dict[str, float] = field(default_factory=dict)
+    _open: dict[str, AbstractEnvironment] = field(default_factory=dict)
+
+    def run(self, drives: bool = True) -> None:
+        """Find what there is to find.
+
+        Args:
+            drives: make the drives of the checks before an attack, and time some of
+                its control periods; otherwise only what needs none is found.
+        """
+        world = self.world
+        departure_limit(world.route.lane_width_m, world.scenario.vehicle.width_m)
+        with ExitStack() as stack:
+            for label in world.labels:
+                self._told(lambda label=label: self._begin(label, stack))
+            if drives and not self.refused:
+                self._told(self._drive)
+            else:
+                self._take(route_findings(world))
+                self._take(place_findings(world))
+        base = self.frames.get(SURROGATE)
+        for label, frame in self.frames.items():
+            if label != SURROGATE and base is not None:
+                camera = world.surrogate.camera
+                found = likeness_findings(camera, base, frame, label)
+                self.doubts += found
+
+    def _begin(self, label: str, stack: ExitStack) -> None:
+        """Open an environment and look once."""
+        environment = self.world.open(label)
+        stack.callback(environment.close)
+        world = self.world
+        seed = world.scenario.seed
+        self.frames[label] = environment.reset(world.route, world.initial[0], seed)
+        self._open[label] = environment
+
+    def _drive(self) -> None:
+        found: list[Iterator[str]] = [first_findings(self.world, self._one)]
+        found.append(further_findings(self.world, self._one))
+        try:
+            for findings in found:
+                self._take(findings)
+        except (InputError, SetupError):
+            self._take(place_findings(self.world))
+            raise
+
+    def price(self) -> None:
+        """Estimate the cost, if the drives could be made; its memory counts ours."""
+        world = self.world
+        driven = {x for x in world.labels if not world.is_open_loop(x)}
+        if self._period_s.keys() >= driven:
+            self._told(self._price)
+
+    def _price(self) -> None:
+        self.on_progress("timing the attack", 0, 1, "")
+        self.cost = estimate(self.world, self._period_s)
+        self.on_progress("timing the attack", 1, 1, "")
+
+    def _one(self, label: str, case: str, run: int) -> Drive:
+        """Drive as the attack's first drives do."""
+        world, times = self.world, [time.perf_counter()]
+        horizon = world.horizon
+
+        def on_step(step: int) -> None:
+            times.append(time.perf_counter())
+            self.on_progress(f"driving: {label}, run {run}", step + 1, horizon, "")
+
+        start, seed = world.initial[run], world.scenario.seed + run
+        how = world.policy, world.route, start, seed, horizon, on_step, case, run, label
+        found = drive(self._open[label], *how)
+        self._period_s[label] = float(np.median(np.diff(times)))
+        self.drives.append(found)
+        return found
+
+    def _told(self, work: Callable[[], None]) -> None:
+        """Do something whose error is a reason to refuse."""
+        try:
+            work()
+        except (InputError, SetupError) as err:
+            self.refused.append(str(err))
+
+    def _take(self, findings: Iterator[str]) -> None:
+        for line in findings:
+            self.refused.append(line)  # what was found before an error counts
+
+    def document(self) -> dict[str, Any]:
+        """Return all that was found, as JSON takes it."""
+        scenario = self.world.scenario
+        return {
+            "scenario": scenario.name,
+            "refused": self.refused,
+            "doubts": self.doubts,
+            "cost": None if self.cost is None else self.cost.document(),
+            "route": {
+                "name": self.world.route.name,
+                "length_m": self.world.route.length,
+                "horizon": self.world.horizon,
+            },
+            "objects": {
+                item.id: posed.placed.translation.tolist()
+                for item, posed in zip(
+                    scenario.objects, self.world.surrogate.objects, strict=True
+                )
+            },
+        }
+
+    def picture(self, path: Path) -> None:
+        """Write the picture of the scenario."""
+        world = self.world
+        overlay = self._overlay()
+        overhead = overlay.overhead(_LONGEST_PX)
+        grounds = {"Surrogate, from above": surrogate_above(world.surrogate, overhead)}
+        looks = {
+            f"First image in {label}": Look(
+                frame.image, world.surrogate.camera, frame.camera_to_world
+            )
+            for label, frame in list(self.frames.items())[:2]
+        }
+        if (scene := mesh_scene(world)) is not None:
+            objects = world.surrogate.objects
+            near = world.route.pose_at(np.array(overlay.driven))[:, :2]
+            name = f"{world.scenario.scene.deployment}, from above"
+            image = scene_above(scene, overhead, near, objects, _SPP)
+            grounds[name] = image
+            camera, mount = from_fov(*_CHASE), chase_mount(overlay.car_width_m)
+            view = MitsubaView(scene, camera, _SPP)
+            view.show(objects)
+            pose = mount_matrix(world.initial[:1], mount)[0]
+            behind = view.render(pose, 0).image
+            looks["Start, from behind the car"] = Look(behind, camera, pose, True)
+        told = [f"REFUSED: {line}" for line in self.refused]
+        told += [f"LOOK AT: {line}" for line in self.doubts]
+        name = world.scenario.name
+        place_picture(path, overlay, overhead, grounds, looks, told, name)
+
+    def _overlay(self) -> Overlay:
+        world = self.world
+        route, scenario = world.route, world.scenario
+        start = scenario.drive.start_m
+        end = start + world.horizon * scenario.vehicle.dt_s * route.speed_ms
+        names = [item.id for item in scenario.objects]
+        posed = world.surrogate.objects
+        paths = {
+            f"unattacked drive, {d.environment}": d.states[:, :2]
+            for d in self.drives
+            if d.run == 0 and d.case == OWN
+        }
+        return Overlay(
+            [route],
+            (start, end if route.closed else min(end, route.length)),
+            dict(zip(names, object_footprints(world), strict=True)),
+            {n: _top(item) for n, item in zip(names, posed, strict=True)},
+            world.initial,
+            scenario.vehicle.width_m,
+            world.surrogate.camera,
+            paths,
+        )
+
+
+def _top(posed: Any) -> np.ndarray:
+    """Return the middle of the upper side of an object's box, metres."""
+    field, pose = posed.field, posed.placed
+    middle = (field.lower + field.upper) / 2
+    top = np.array([middle[0], middle[1], field.upper[2]])
+    return pose.scale * pose.rotation @ top + pose.translation
+
+
+def duration(seconds: float) -> str:
+    """Say how long something takes, in two figures."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = seconds / 60
+    if minutes < 90:
+        return f"{round(minutes)} min"
+    return f"{minutes / 60:.{0 if minutes >= 600 else 1}f} h"
+
+
+def sentences(check: Check, scenario_path: str, picture: Path | None) -> list[str]:
+    """Tell in words what was found, what it costs, and what to do next."""
+    world, cost = check.world, check.cost
+    period = world.scenario.vehicle.dt_s
+    lines = [
+        f"{world.scenario.name}: route {world.route.name!r} of "
+        f"{world.route.length:.1f} m, {world.horizon} control periods of {period:g} s; "
+        f"objects: {', '.join(item.id for item in world.scenario.objects)}; "
+        f"environments: {', '.join(world.labels)}"
+    ]
+    if cost is not None:
+        lines.append(
+            f"cost: at most {cost.iterations} iterations, {cost.random_looks} random "
+            f"looks, {cost.frames} frames; about {duration(cost.wall_s)} as busy as "
+            f"this machine is, {math.ceil(cost.memory_mb / 100) / 10:.1f} GB of "
+            f"memory, {cost.disk_mb:.0f} MB of disk"
+        )
+    lines += [f"refused: {line}" for line in check.refused]
+    lines += [f"look at: {line}" for line in check.doubts]
+    if picture is not None:
+        lines.append(f"picture: {picture}")
+    command = f"mi-nerfattack attack {scenario_path} -o runs/{Path(scenario_path).stem}"
+    if check.refused:
+        lines.append(
+            "next: mend the scenario and check again; to attack all the same: "
+            f"{command} --anyway"
+        )
+    else:
+        lines.append(f"next: {command}")
+    return lines

@@ -1,0 +1,123 @@
+"""What an attack would cost, from a few control periods of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from mi_nerfattack.attack.baseline import equal_count
+from mi_nerfattack.rollout.adjoint import KeptBackgrounds
+from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.world import World, build_attack
+from mi_nerfattack.system.memory import peak_memory_mb
+
+_PERIODS = 6  # of the iterations that are timed
+_KEPT_BYTES = 20  # of a pixel, layer, period and pose
+_PICTURES_MB = 10.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Estimate of an attack that uses all its iterations.
+
+    Attributes:
+        iterations: at most.
+        random_looks: that it is compared with.
+        horizon: control periods of a drive.
+        frames: rendered, passes back included.
+        wall_s: seconds, on this machine with the load that it has.
+        memory_mb: at most.
+        disk_mb: of the run folder.
+        period_s: seconds of a control period: of an iteration there, back, and of a
+            drive in each environment.
+    """
+
+    iterations: int
+    random_looks: int
+    horizon: int
+    frames: int
+    wall_s: float
+    memory_mb: float
+    disk_mb: float
+    period_s: dict[str, float]
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON takes it."""
+        return asdict(self)
+
+
+def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
+    """Time two short iterations of the attack, and add up what all would take.
+
+    Args:
+        world: what the scenario describes; its textures are as before afterwards.
+        drive_s: seconds of a control period of a drive by environment.
+    """
+    scenario, horizon = world.scenario, world.horizon
+    forward, backward, update, disk = _iteration(world)
+    section, count = scenario.attack, scenario.attack.max_iterations
+    looks = scenario.baseline.textures or equal_count(count, backward / forward)
+    iteration = horizon * (forward + backward) + update
+    periods = {SURROGATE: 4 * scenario.drive.runs + looks}
+    for label in world.deployments:
+        deployed = min(looks, scenario.baseline.deployment_textures)
+        runs = 1 if world.is_open_loop(label) else scenario.drive.runs
+        periods[label] = 4 * runs + deployed
+    drives = sum(n * drive_s.get(label, 0.0) for label, n in periods.items())
+    passes = count + 3  # attribution is about three more
+    wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
+    again = 1 if isinstance(section.adjoint.build(), KeptBackgrounds) else 2
+    frames = section.poses * (again * passes + looks + 1) + sum(periods.values())
+    return Cost(
+        count,
+        looks,
+        horizon,
+        frames * horizon,
+        wall,
+        peak_memory_mb() + _kept_mb(world),
+        disk + _PICTURES_MB,
+        {"forward": forward, "backward": backward, **drive_s},
+    )
+
+
+def _iteration(world: World) -> tuple[float, float, float, float]:
+    """Return seconds of a period there, back, of an update; MB of files of a run."""
+    scenario = world.scenario
+    periods = min(_PERIODS, world.horizon)
+    drive = scenario.drive.model_copy(update={"horizon": periods, "length_m": None})
+    short = replace(world, scenario=scenario.model_copy(update={"drive": drive}))
+    original = world.appearance()
+    try:
+        attack = build_attack(short)
+        attack.step()  # compiles
+        times = [time.perf_counter()]
+
+        def on_step(step: int) -> None:
+            del step
+            times.append(time.perf_counter())
+
+        attack.step(on_step)
+        end = time.perf_counter()
+        kept = sum(value.nbytes for value in attack.tensors().values())
+    finally:
+        world.show(original)
+    forward = (times[periods] - times[0]) / periods
+    backward = (times[2 * periods] - times[periods]) / periods
+    return forward, backward, end - times[-1], (kept + _field_bytes(world)) / 1e6
+
+
+def _field_bytes(world: World) -> int:
+    named = [item.field for item in world.scenario.objects]
+    return sum(item.file.stat().st_size for item in named if item is not None)
+
+
+def _kept_mb(world: World) -> float:
+    """Return what `kept_backgrounds` keeps for all periods but the timed ones."""
+    section, camera = world.scenario.attack, world.surrogate.camera
+    if not isinstance(section.adjoint.build(), KeptBackgrounds):
+        return 0.0
+    layers = len(world.surrogate.scene) + len(world.fields)
+    pixels = camera.width * camera.height * section.poses
+    return _KEPT_BYTES * layers * pixels * max(0, world.horizon - _PERIODS) / 1e6

@@ -1,0 +1,344 @@
+"""A place in one picture: rendered from above with all that drives there, and views.
+
+Lane centres have arrows in the direction of travel; the lane's borders are white lines.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+
+from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
+from mi_nerfattack.deploy.views.mitsuba import MitsubaView
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.outside import Overhead, seen_at
+from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.report.plots.charts import DPI, RC, save
+from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.vehicle.route.route import Route
+
+WIDTH_PX = 1600
+BORDER, CENTRE, START, END = "white", "#00E5FF", "#00C853", "#FF1744"
+OBJECT, CAMERA = "#FFEA00", "#FF6D00"
+_PARTS, _ARROWS = 240, 7  # of a route
+_REAR, _FRONT = 0.5, 1.9  # of a car's middle rear axle, in widths
+_EDGE: Any = {"color": "black", "alpha": 0.6}
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """What is drawn over pictures of a place, all in metres of the world.
+
+    Attributes:
+        routes: lane centres.
+        driven: arc lengths of start and end of a drive along the first route; None
+            where there is none, and all routes count alike.
+        objects: outlines (n, 2) on the ground by id.
+        tops: points (3,) above the objects by id.
+        starts: states (n, 3) that drives start from; the first is the nominal one.
+        car_width_m: of the car.
+        camera: the car's; its frustum is drawn at the first start.
+        paths: driven positions (n, 2) by title.
+    """
+
+    routes: Sequence[Route]
+    driven: tuple[float, float] | None = None
+    objects: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tops: Mapping[str, np.ndarray] = field(default_factory=dict)
+    starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    car_width_m: float = 1.8
+    camera: Camera | None = None
+    paths: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def overhead(self, longest_px: int) -> Overhead:
+        """Frame all of it from above."""
+        points = [_along(route)[:, :2] for route in self.routes]
+        points += [self.starts[:, :2], *self.objects.values()]
+        margin = max(1.5 * route.lane_width_m for route in self.routes)
+        return Overhead.covering(np.concatenate(points), margin, longest_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A picture that a camera at a pose made of a place.
+
+    Attributes:
+        image: (h, w, 3), uint8, sRGB.
+        camera, camera_to_world: that made it, OpenCV axes.
+        from_behind: whether the car is in front of it: route and car are drawn, too.
+    """
+
+    image: np.ndarray
+    camera: Camera
+    camera_to_world: np.ndarray
+    from_behind: bool = False
+
+
+def place_picture(
+    path: str | Path,
+    overlay: Overlay,
+    overhead: Overhead,
+    grounds: Mapping[str, np.ndarray],
+    looks: Mapping[str, Look] | None = None,
+    told: Sequence[str] = (),
+    title: str = "",
+) -> None:
+    """Write the picture of a place as PNG.
+
+    Args:
+        path: the file.
+        overlay: what is drawn.
+        overhead: camera of all grounds.
+        grounds: rendered pictures from above by title.
+        looks: pictures through cameras by title.
+        told: sentences below.
+        title: above all.
+    """
+    looks = looks or {}
+    left, right, bottom, top = overhead.extent
+    width_in = WIDTH_PX / DPI
+    lines = [line for text in told for line in _wrapped(text)]
+    aspect = (top - bottom) / (right - left)
+    map_in = min((width_in / len(grounds) - 0.6) * aspect, 7.0) + 0.85
+    view_in, shapes = 0.0, []
+    if looks:
+        shapes = [look.image.shape[1] / look.image.shape[0] for look in looks.values()]
+        view_in = (width_in - 0.15 * len(looks)) / sum(shapes)
+        view_in = min(view_in, 2.8) + 0.3
+    text_in = 0.17 * len(lines) + 0.1 if lines else 0.0
+    heights = [map_in, 0.55, *([view_in] if looks else []), *([text_in] * bool(lines))]
+    with matplotlib.rc_context(RC):
+        figure = Figure((width_in, sum(heights) + 0.4), DPI, layout="constrained")
+        rows = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)
+        rows[0, 0].suptitle(title, x=0.01, ha="left", fontweight="bold")
+        for k, (name, image) in enumerate(grounds.items()):
+            axis = rows[0, 0].add_subplot(1, len(grounds), k + 1)
+            _draw_ground(axis, overlay, overhead, name, image)
+        handles = _handles(overlay)
+        style = {"ncols": 5, "frameon": False, "columnspacing": 1.2}
+        rows[1, 0].legend(handles=handles, loc="center", fontsize=8, **style)
+        if looks:
+            axes = rows[2, 0].subplots(
+                1, len(looks), width_ratios=shapes, squeeze=False
+            )
+            for axis, (name, look) in zip(axes[0], looks.items(), strict=True):
+                _draw_look(axis, overlay, name, look)
+        if lines:
+            for k, line in enumerate(lines):
+                rows[-1, 0].text(0.01, 1 - (k + 0.5) / len(lines), line, va="center")
+        save(path, figure)
+
+
+def routes_picture(
+    path: str | Path,
+    scene_path: str | Path,
+    routes: Sequence[Route],
+    camera: Camera,
+    mount: CameraMount | None = None,
+    sensor: FieldSensor | None = None,
+    title: str = "",
+) -> None:
+    """Write the picture of a scene with all its routes, without objects and drives.
+
+    Cost: some seconds of path tracing.
+
+    Args:
+        path: PNG file.
+        scene_path: Mitsuba XML.
+        routes: at least one; the first three are looked along from their starts.
+        camera: that looks.
+        mount: of the camera; None for the default.
+        sensor: shows the scene's field, too, from above; None where there is none.
+        title: above all.
+    """
+    overlay = Overlay(routes)
+    overhead = overlay.overhead(560)
+    scene = load_scene(scene_path)
+    middles = [route.pose_at(route.length / 2) for route in routes]
+    image = scene_above(scene, overhead, np.stack(middles)[:, :2], spp=4)
+    grounds = {f"{Path(scene_path).name}, from above": image}
+    if sensor is not None:
+        above = surrogate_above(sensor, overhead)
+        grounds = {"Field, from above": above, **grounds}
+    view, looks = MitsubaView(scene, camera, 4), {}
+    for route in routes[:3]:
+        pose = mount_matrix(route.pose_at(0.0)[None], mount or CameraMount())[0]
+        shown = view.render(pose, 0).image
+        looks[f"Start of {route.name}"] = Look(shown, camera, pose)
+    place_picture(path, overlay, overhead, grounds, looks, title=title)
+
+
+def _draw_ground(
+    axis: Axes, overlay: Overlay, overhead: Overhead, name: str, image: np.ndarray
+) -> None:
+    left, right, bottom, top = overhead.extent
+    axis.imshow(image, extent=(left, right, bottom, top), interpolation="bilinear")
+    for route in overlay.routes:
+        _draw_route(axis, route, overlay)
+    for k, path in enumerate(overlay.paths.values()):
+        axis.plot(*path.T, color=_PATHS[k % len(_PATHS)], linewidth=1.1, zorder=5)
+    if overlay.camera is not None and len(overlay.starts):
+        reach = 0.25 * max(right - left, top - bottom)
+        corners = _frustum(overlay.starts[0], overlay.camera, reach)
+        axis.add_patch(
+            Polygon(corners, facecolor=CAMERA, edgecolor=CAMERA, alpha=0.22, zorder=4)
+        )
+    for state in overlay.starts[::-1]:
+        corners = car_outline(state, overlay.car_width_m)
+        axis.add_patch(Polygon(corners, fill=False, edgecolor=START, zorder=6))
+    for label, outline in overlay.objects.items():
+        axis.fill(*outline.T, fill=False, edgecolor=OBJECT, linewidth=2, zorder=7)
+        x, y = outline.mean(0).tolist()
+        axis.annotate(
+            label, (x, y), (8, 8), textcoords="offset points", **_note(OBJECT)
+        )
+    axis.set_xlim(left, right)
+    axis.set_ylim(bottom, top)
+    axis.set_aspect("equal")
+    axis.set_title(name, loc="left")
+    axis.set_xlabel("x (m)")
+    axis.set_ylabel("y (m)")
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+
+
+def _note(colour: str) -> dict[str, Any]:
+    box = {"facecolor": "black", "alpha": 0.65, "edgecolor": "none", "pad": 1.5}
+    return {"color": colour, "fontsize": 8, "bbox": box, "zorder": 9}
+
+
+def _draw_route(axis: Axes, route: Route, overlay: Overlay) -> None:
+    along = _along(route)
+    for side in (-0.5, 0.5):
+        border = _beside(along, side * route.lane_width_m)
+        axis.plot(*border.T, **{**_EDGE, "linewidth": 2.2})
+        axis.plot(*border.T, color=BORDER, linewidth=1.0, linestyle=(0, (4, 2)))
+    axis.plot(*along[:, :2].T, color=CENTRE, linewidth=1.0, linestyle=":")
+    begin, end = overlay.driven or (0.0, route.length)
+    arc = np.linspace(begin, end, _PARTS)
+    line = route.pose_at(arc)
+    axis.plot(*line[:, :2].T, color=CENTRE, linewidth=1.8, zorder=3)
+    for s in np.linspace(begin, end, _ARROWS + 2)[1:-1]:
+        tail, head = route.pose_at(np.array([s - 0.01 * (end - begin), s]))[:, :2]
+        style = {"arrowstyle": "-|>", "color": CENTRE, "mutation_scale": 14}
+        axis.annotate("", head, tail, arrowprops=style, zorder=6)
+    axis.plot(*line[0, :2], "o", color=START, markeredgecolor="black", zorder=8)
+    if not route.closed or overlay.driven:
+        axis.plot(*line[-1, :2], "s", color=END, markeredgecolor="black", zorder=8)
+    if overlay.driven is None:
+        at = (6, 6)
+        x, y, _ = line[-1].tolist()
+        axis.annotate(
+            route.name, (x, y), at, textcoords="offset points", **_note(CENTRE)
+        )
+
+
+def _draw_look(axis: Axes, overlay: Overlay, name: str, look: Look) -> None:
+    height, width = look.image.shape[:2]
+    axis.imshow(look.image, extent=(0, width, height, 0), interpolation="nearest")
+
+    def draw(points: np.ndarray, **style: Any) -> None:
+        at = seen_at(look.camera, look.camera_to_world, points)
+        axis.plot(*at.T, **style)
+
+    if look.from_behind:
+        for route in overlay.routes:
+            along = _along(route)
+            draw(_raised(along[:, :2]), color=CENTRE, linewidth=1.2)
+            for side in (-0.5, 0.5):
+                border = _raised(_beside(along, side * route.lane_width_m))
+                draw(border, color=BORDER, linewidth=1.0, linestyle=(0, (4, 2)))
+        for ring in _car_box(overlay.starts[0], overlay.car_width_m):
+            draw(ring, color=START, linewidth=1.5)
+    for k, (label, top) in enumerate(overlay.tops.items()):
+        at = seen_at(look.camera, look.camera_to_world, top[None])[0]
+        if np.isfinite(at).all() and (0 <= at).all() and (at <= (width, height)).all():
+            free = at[0], max(at[1] - 0.15 * height, (0.05 + 0.09 * (k % 3)) * height)
+            pointer = {"arrowstyle": "-", "color": OBJECT}
+            axis.annotate(
+                label, at, free, ha="center", arrowprops=pointer, **_note(OBJECT)
+            )
+    axis.set_xlim(0, width)
+    axis.set_ylim(height, 0)
+    axis.set_title(name, loc="left")
+    axis.set_anchor("N")
+    axis.set_axis_off()
+
+
+_PATHS = ("#2979FF", "#D500F9", "#76FF03", "#FF9100")
+
+
+def _handles(overlay: Overlay) -> list[Any]:
+    def line(label: str, colour: str, **style: Any) -> Line2D:
+        return Line2D([], [], label=label, color=colour, **style)
+
+    dot = {"linestyle": "none", "markeredgecolor": "black"}
+    whole = "route, in the direction of travel"
+    handles: list[Any] = [
+        line(whole, CENTRE, linewidth=2, marker=">"),
+        line("lane borders", "#8a8a8a", linestyle=(0, (4, 2))),
+        line("start", START, marker="o", **dot),
+        line("end", END, marker="s", **dot),
+    ]
+    if overlay.objects:
+        handles.append(Patch(fill=False, edgecolor="#c9b800", label="object's box"))
+    if len(overlay.starts):
+        handles.append(Patch(fill=False, edgecolor=START, label="cars at the starts"))
+    if overlay.camera is not None:
+        handles.append(Patch(facecolor=CAMERA, alpha=0.4, label="what the camera sees"))
+    for k, name in enumerate(overlay.paths):
+        handles.append(line(name, _PATHS[k % len(_PATHS)], linewidth=2))
+    return handles
+
+
+def _along(route: Route) -> np.ndarray:
+    """Return poses (n, 3) along a whole route."""
+    return route.pose_at(np.linspace(0, route.length, _PARTS))
+
+
+def _beside(poses: np.ndarray, left_m: float) -> np.ndarray:
+    x, y, theta = poses.T
+    return np.stack([x - left_m * np.sin(theta), y + left_m * np.cos(theta)], axis=1)
+
+
+def _raised(points: np.ndarray, height_m: float = 0.02) -> np.ndarray:
+    return np.column_stack([points, np.full(len(points), height_m)])
+
+
+def _frustum(state: np.ndarray, camera: Camera, reach: float) -> np.ndarray:
+    half = math.radians(camera.fov_x_deg) / 2
+    angles = state[2] + np.linspace(-half, half, 24)
+    arc = state[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([state[None, :2], arc])
+
+
+def car_outline(state: np.ndarray, width_m: float) -> np.ndarray:
+    """Return the corners (4, 2) of a car, whose state is that of its rear axle."""
+    front, rear, y = _FRONT * width_m, -_REAR * width_m, width_m / 2
+    corners = np.array([[front, y], [rear, y], [rear, -y], [front, -y]])
+    c, s = np.cos(state[2]), np.sin(state[2])
+    return corners @ np.array([[c, s], [-s, c]]) + state[:2]
+
+
+def _car_box(state: np.ndarray, width_m: float) -> list[np.ndarray]:
+    """Return the edges of a car's box as lines, (n, 3) each."""
+    corners = car_outline(state, width_m)
+    ring = np.concatenate([corners, corners[:1]])
+    low, high = _raised(ring, 0.1 * width_m), _raised(ring, 0.8 * width_m)
+    posts = [np.stack([a, b]) for a, b in zip(low[:4], high[:4], strict=True)]
+    return [low, high, *posts]
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, 150, subsequent_indent="    ")
