@@ -303,7 +303,7 @@ class _Drives(AbstractWork):
         environment, policy, routes = opened
         number, drive_number = divmod(index, self.settings.runs)
         route = routes[number]
-        rules = EvaluateSettings(objects=0, horizon=self.settings.horizon)
+        rules = EvaluateSettings(objects=(), horizon=self.settings.horizon)
         arguments = (
             environment,
             policy,
@@ -311,7 +311,7 @@ class _Drives(AbstractWork):
             NO_OBJECT,
             drive_number,
             (),
-            _no_ground,
+            None,
         )
         driven = evaluate_run(*arguments, rules)
         limit = departure_limit(route.lane_width_m, rules.car_width_m)
@@ -355,8 +355,3 @@ def write_figure(path: Path, document: dict[str, Any]) -> None:
             f"{document['frames']} frames and {document['gradient_steps']} gradient "
             f"steps each; {len(document['settings']['seeds'])} seeds"
         )
-
-
-def _no_ground(points: np.ndarray) -> np.ndarray:
-    """Return no height: nothing is put beside the road."""
-    return np.full(len(points), np.nan)

@@ -1,7 +1,7 @@
-"""Where studies put an object: drawn by training's rule, before any result is seen.
+"""Where studies put an object: drawn before any result is seen.
 
-Every place is drawn by `deploy.placement.Roadside`, which puts objects beside lanes for
-the training of the policy; the first draw counts, whatever it gives.
+Every place is drawn by `roadside.Roadside`, by which objects stood beside lanes in the
+training of the bundled policy; the first draw counts, whatever it gives.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.deploy.placement import Ground, Roadside, scene_ground
+from bench.study.roadside import Ground, Roadside, scene_ground
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.pathtrace.load import load_scene

@@ -15,12 +15,14 @@ from mi_nerfattack.commands.shared.evaluate_options import (
     PlaceOptions,
     PolicyOptions,
     parse_conditions,
+    parse_scales,
     policy_camera,
 )
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
+    from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.evaluation.evaluate import EvaluateSettings
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
     from mi_nerfattack.evaluation.work import EvaluateWork, Evaluation
@@ -34,9 +36,10 @@ if TYPE_CHECKING:
 class Evaluate:
     """Drive a policy in the closed loop, per environment and route, and print its card.
 
-    Every drive starts at random near the route's start: once alone, once past objects
-    with random textures. The expert drives from the same starts. Finished drives are
-    kept: the same command continues after Ctrl-C, and more runs add to them.
+    Every drive starts at random near the route's start: once alone, once past each
+    number of objects with random textures. The expert drives from the same starts.
+    Finished drives are kept: the same command continues after Ctrl-C, and more runs or
+    numbers of objects add to them.
     """
 
     policy: tyro.conf.Positional[str | None] = None
@@ -50,8 +53,12 @@ class Evaluate:
     """Routes by name; all by default."""
     runs: int = 20
     """Drives of each environment, route and case."""
-    objects: int = 1
-    """Objects beside the road at a time; 0 leaves the drives with objects out."""
+    objects: tuple[int, ...] = (1,)
+    """Numbers of objects beside the road at a time, a case each: 1 6; every route is
+    driven without, too, and by 0 without alone."""
+    scale: tuple[float, ...] = ()
+    """Least and most factor to the natural size: of all objects, or of each --object in
+    turn, as in 1 1 0.8 1.3; the natural size by default."""
     seed: int = 1
     """Of starts, places, textures and images; training chooses its best epoch by the
     drives of seed 0."""
@@ -99,7 +106,7 @@ class Evaluate:
         start = time.monotonic()
         with StageBars() as bars:
             bars.say(f"drives are kept in {work.folder}")
-            if self.objects and not work.place.objects:
+            if any(self.objects) and not work.place.objects:
                 town = "a town its --scene, " * (self.where.server is not None)
                 bars.say(f"no drives past objects: {town}a scene its --object FILE")
             found = run_evaluation(work, workers, bars.counter("driving", "step "))
@@ -145,19 +152,24 @@ class Evaluate:
         place, seen = self.where.build(), policy_camera(self.policy)
         if seen is not None:
             place = replace(place, camera=seen[0], mount=seen[1])
-        routes, settings = self._routes(place.routes), self._settings()
+        routes, settings = self._routes(place.routes), self._settings(place)
         check_policy(section.build(), place, routes)
         identities = identify(section, place, under, routes, settings)
         return EvaluateWork(
             section, place, under, routes, settings, self.drives, identities
         )
 
-    def _settings(self) -> EvaluateSettings:
+    def _settings(self, place: Place) -> EvaluateSettings:
         from mi_nerfattack.training.presets import EVALUATIONS
 
+        settings = EVALUATIONS[self.where.place]
+        scales = parse_scales(self.scale, len(place.objects))
         return replace(
-            EVALUATIONS[self.where.place],
+            settings,
             runs=self.runs,
+            roadside=replace(
+                settings.roadside, scales=scales or settings.roadside.scales
+            ),
             objects=self.objects,
             seed=self.seed,
             horizon=self.horizon,

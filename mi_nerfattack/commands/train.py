@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.evaluate_options import parse_scales
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -30,11 +31,11 @@ _REFUSED = {
 class Train:
     """Train a driving policy on frames of any environments of a place.
 
-    Collects frames (three quarters with an object of random texture beside the road),
-    trains PilotNet to imitate the expert, lets it drive and trains it on what it saw
-    (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA. The
-    validation is written beside the policy, as JSON, and so is the policy as a program
-    of torch.export.
+    Collects frames (three quarters with 1 to 6 objects of random texture beside the
+    road), trains PilotNet to imitate the expert, lets it drive and trains it on what it
+    saw (DAgger), and ends with its closed-loop error. Stopped, it continues from DATA.
+    The validation is written beside the policy, as JSON, and so is the policy as a
+    program of torch.export.
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -85,8 +86,13 @@ class Train:
     """Environments of these validations; all that are used by default."""
     runs: int = 2
     """Drives of each case of the last validation."""
-    objects: int = 1
-    """Objects of random texture beside the road in the last validation."""
+    most_objects: int | None = None
+    """Most objects beside the road in a frame; each number from 1 is equally likely."""
+    scale: tuple[float, ...] = ()
+    """Least and most factor to the natural size: of all objects, or of each --object in
+    turn, as in 1 1 0.8 1.3; the preset's by default."""
+    objects: tuple[int, ...] = (1,)
+    """Numbers of objects of random texture beside the road in the last validation."""
     workers: int | None = None
     """Processes that collect; one a core by default."""
     seed: int = 0
@@ -191,8 +197,13 @@ class Train:
         from mi_nerfattack.training.settings import ImitationSettings
         from mi_nerfattack.training.train import TrainSettings
 
+        count = len(self._place(preset).objects)
+        collecting, drives = preset.collecting, EVALUATIONS[preset.place]
+        scales = parse_scales(self.scale, count) or collecting.roadside.scales
+        roadside = replace(collecting.roadside, scales=scales)
+        most = collecting.objects if self.most_objects is None else self.most_objects
         drives = replace(
-            EVALUATIONS[preset.place], runs=self.runs, objects=self.objects
+            drives, runs=self.runs, objects=self.objects, roadside=roadside
         )
         return ImitationSettings(
             frames=preset.frames,
@@ -203,11 +214,11 @@ class Train:
             seed=self.seed,
             validate_every=self.validate_every,
             validate_in=self.validate_in,
-            collecting=preset.collecting,
+            collecting=replace(collecting, objects=most, roadside=roadside),
             training=TrainSettings(
                 preset.epochs, self.batch, learning_rate=self.learning_rate
             ),
-            validation=replace(drives, runs=1, objects=0),
+            validation=replace(drives, runs=1, objects=()),
             final=replace(drives, seed=1),  # not the drives that chose the best epoch
         )
 

@@ -21,6 +21,8 @@ from .place import bundled_place as bundled_place
 from .registry import make_environment as make_environment
 from .replay.environment import ReplayEnvironment as ReplayEnvironment
 from .replay.environment import open_recording as open_recording
+from .roadside.rule import Roadside as Roadside
+from .roadside.surroundings import Surroundings as Surroundings
 from .sites import ANY_WEATHER as ANY_WEATHER
 from .sites import AbstractSite as AbstractSite
 from .sites import PlaceSite as PlaceSite

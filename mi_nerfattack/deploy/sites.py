@@ -13,12 +13,12 @@ import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.placement import Ground, scene_ground
 from mi_nerfattack.deploy.registry import (
     ENVIRONMENTS,
     environment_versions,
     make_environment,
 )
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.io import load_grid
@@ -27,7 +27,7 @@ from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
 from mi_nerfattack.render.pathtrace.load import load_scene, scene_files
 from mi_nerfattack.vehicle.expert import AbstractExpert, expert_for
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.route.route import Route, load_routes
 
 #: The environment whose light does not change.
 SURROGATE = "surrogate"
@@ -69,7 +69,7 @@ ANY_WEATHER = Weather(tuple(DAYLIGHT), (-1.0, -0.5, 0.0, 0.5, 1.0))
 
 
 class AbstractSite(ABC):
-    """Source of environments, objects and ground; picklable, to be sent to workers.
+    """Source of environments and objects; picklable, to be sent to workers.
 
     Attributes:
         name: of the environments, and of the folder of their frames.
@@ -114,8 +114,8 @@ class AbstractSite(ABC):
         """
 
     @abstractmethod
-    def load_ground(self) -> Ground:
-        """Load the height of the ground where objects can stand."""
+    def load_surroundings(self) -> Surroundings:
+        """Load what decides where objects can stand."""
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -182,14 +182,21 @@ class PlaceSite(AbstractSite):
         count = max(len(paths), least) if paths else 0
         return [load_grid(path) for path in islice(cycle(paths), count)]
 
-    def load_ground(self) -> Ground:
-        """Load the place's scene."""
-        return scene_ground(load_scene(self.place.scene))
+    def load_surroundings(self) -> Surroundings:
+        """Load the place's scene, and all its routes."""
+        place = self.place
+        return Surroundings(
+            load_scene(place.scene),
+            load_routes(place.routes),
+            place.camera,
+            place.mount,
+            place.period,
+        )
 
     def describe(self) -> dict[str, Any]:
         """Return checksums of the files, and the numbers."""
         place = self.place
-        paths = [*scene_files(place.scene), *place.objects]
+        paths = [*scene_files(place.scene), *place.objects, place.routes]
         if place.field is not None:
             paths.append(place.field)
         return {

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -15,7 +16,9 @@ import numpy as np
 from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.placement import Ground, Roadside, Scatter
+from mi_nerfattack.deploy.roadside.rule import Roadside
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
+from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import card_figures
 from mi_nerfattack.fields.grid import GridField
@@ -23,7 +26,12 @@ from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.policy.base import AbstractPolicy, Memory
 from mi_nerfattack.ranges import Count, Whole, checked
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive, departure_limits
+from mi_nerfattack.rollout.drive import (
+    NO_OBJECT,
+    Drive,
+    departure_limits,
+    random_case,
+)
 from mi_nerfattack.vehicle.expert import AbstractExpert
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -38,37 +46,46 @@ STARTS = Scatter(0.25, 0.75, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0.0
 class EvaluateSettings:
     """Choices of an evaluation; the same settings give the same drives.
 
-    Start, places and textures of a drive depend on seed, route and number of the
-    drive alone: they are the same in every environment, and more runs add drives.
+    Start, places and textures of a drive depend on seed, route, number of the drive
+    and number of objects alone: they are the same in every environment, the start with
+    any number of objects, and more runs or numbers of objects add drives.
 
     Args:
         runs: drives of each route, environment and case.
-        objects: with random textures beside the road at a time; 0 leaves the case
-            with random objects out.
+        objects: numbers of objects with random textures beside the road, a case each;
+            every route is driven without, too.
         seed: of starts, places and textures.
         margin_m: arc length before the end of an open route at which a drive ends.
         horizon: most steps of a drive.
         scatter: of the starts.
-        ahead_m: arc length from a drive's start to the objects, least and, measured
-            back from its end, most.
         car_width_m: for departures from the lane.
-        roadside: sizes and places of the objects.
+        roadside: the rule by which the objects stand.
     """
 
     runs: Count = 20
-    objects: Whole = 1
+    objects: tuple[Whole, ...] = (1,)
     seed: Whole = 0
     margin_m: float = 2.0
     horizon: Count = 1000
     scatter: Scatter = STARTS
-    ahead_m: tuple[float, float] = (8.0, 2.0)
     car_width_m: float = 1.8
     roadside: Roadside = field(default_factory=Roadside)
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """Names of the cases."""
-        return (NO_OBJECT, RANDOM) if self.objects else (NO_OBJECT,)
+        """Names of the cases, that without objects first."""
+        return tuple(self.counts)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of objects of each case, ascending."""
+        several = sorted(set(self.objects) - {0})
+        return {NO_OBJECT: 0, **{random_case(count): count for count in several}}
+
+    @property
+    def most(self) -> int:
+        """The largest number of objects."""
+        return max(self.counts.values())
 
     def steps(self, route: Route, period: float = 0.1) -> int:
         """Return the number of steps of `period` seconds of a drive, at least 1."""
@@ -123,7 +140,7 @@ def evaluate_run(
     case: str,
     run: int,
     objects: Sequence[GridField],
-    ground: Ground,
+    surroundings: Surroundings | None,
     settings: EvaluateSettings,
     on_step: Callable[[int], None] | None = None,
 ) -> Drive:
@@ -133,19 +150,21 @@ def evaluate_run(
         environment: shows nothing but its world afterwards.
         policy: drives.
         route: from its start.
-        case: "no_object" or "random".
+        case: one of the settings'.
         run: number of the drive, from 0.
         objects: stand beside the road, in turns; their own textures come back.
-        ground: of the world.
+        surroundings: of the objects; None in the case without.
         settings: see there.
         on_step: called after each step.
     """
-    rng = _generator(settings, route, run)
+    rng = _generator(settings, route, run, 0)
     pose, seed = random_start(route, settings, rng), int(rng.integers(2**31))
     steps = settings.steps(route, environment.period)
-    shown = objects if case == RANDOM else ()
-    with own_textures(shown):
-        posed = list(_roadside(route, shown, ground, settings, run, rng))
+    count = settings.counts[case]
+    with own_textures(objects if count else ()):
+        posed = place_objects(
+            environment.period, route, count, run, objects, surroundings, settings
+        )
         environment.show(posed)
         try:
             with one_thread():
@@ -161,7 +180,7 @@ def evaluate(
     environments: Sequence[AbstractEnvironment],
     routes: Sequence[Route],
     objects: Sequence[GridField],
-    ground: Ground,
+    surroundings: Surroundings | None,
     settings: EvaluateSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
@@ -171,22 +190,24 @@ def evaluate(
         policy: drives.
         environments: with different names.
         routes: with different names.
-        objects: at least `settings.objects` of them; none: no random case.
-        ground: where they can stand.
+        objects: at least `settings.most` of them; none: no case with objects.
+        surroundings: of the objects; may be None without.
         settings: see there.
         progress: called after each step of a drive.
 
     Returns:
-        {ENVIRONMENT: {ROUTE: {"no_object" | "random": figures}}}, see `make_card`.
+        {ENVIRONMENT: {ROUTE: {CASE: figures}}}, see `make_card`.
 
     Raises:
-        InputError: before the first drive, a lane that is too narrow for the car or a
-            route too short for objects; then whatever a drive raises.
+        InputError: before the first drive, a lane that is too narrow for the car or
+            objects that find no place; then whatever a drive raises.
     """
     cases = settings.cases if objects else (NO_OBJECT,)
     limits = departure_limits(routes, settings.car_width_m)
-    if RANDOM in cases:
-        check_roadside(routes, settings, len(objects))
+    if objects:
+        for environment in environments:
+            period = environment.period
+            check_places(period, routes, objects, surroundings, settings)
     jobs = [
         (environment, route, case, run)
         for environment in environments
@@ -204,7 +225,7 @@ def evaluate(
         progress(done, total)
 
     for environment, route, case, run in jobs:
-        arguments = (case, run, objects, ground, settings, count)
+        arguments = (case, run, objects, surroundings, settings, count)
         found = evaluate_run(environment, policy, route, *arguments)
         drives.setdefault((environment.name, route.name, case), []).append(found)
     return make_card(drives, limits)
@@ -249,59 +270,82 @@ def own_textures(objects: Sequence[GridField]) -> Iterator[None]:
             item.set_parameter("texture", texture)
 
 
-def check_roadside(
-    routes: Sequence[Route], settings: EvaluateSettings, count: int
+def check_places(
+    period: float,
+    routes: Sequence[Route],
+    objects: Sequence[GridField],
+    surroundings: Surroundings | None,
+    settings: EvaluateSettings,
 ) -> None:
-    """Check that objects find room beside routes.
+    """Draw the places of all drives.
 
     Args:
-        routes: all must be long enough.
+        period: seconds between two images.
+        routes: that are driven.
+        objects: all that there are.
+        surroundings: theirs.
         settings: see there.
-        count: number of fields at hand.
 
     Raises:
-        InputError: a route is too short, or the fields are too few.
+        InputError: the objects are too few, or do not find a place.
     """
-    for route in routes:
-        first, last = _object_stretch(route, settings)
-        if first > last or settings.objects > count:
-            raise InputError(
-                f"EvaluateSettings: ahead_m {settings.ahead_m} on route "
-                f"{route.name!r} of {route.length:.1f} m, objects {settings.objects} "
-                f"of {count}; the route must be longer, and each object a field of its "
-                "own; or leave the objects out (objects 0)"
-            )
+    with own_textures(objects):
+        for route in routes:
+            for count in settings.counts.values():
+                for run in range(settings.runs):
+                    arguments = (route, count, run, objects, surroundings, settings)
+                    place_objects(period, *arguments)
 
 
-def _object_stretch(route: Route, settings: EvaluateSettings) -> tuple[float, float]:
-    """Return the least and the most arc length of objects, metres."""
-    first, before = settings.ahead_m
-    return first, route.length - settings.margin_m - before
+def place_objects(
+    period: float,
+    route: Route,
+    count: int,
+    run: int,
+    objects: Sequence[GridField],
+    surroundings: Surroundings | None,
+    settings: EvaluateSettings,
+) -> list[PosedField]:
+    """Give some objects random textures, and put them beside the road.
+
+    Args:
+        period: seconds between two images.
+        route: that is driven.
+        count: how many objects.
+        run: number of the drive; other runs begin with other objects.
+        objects: all that there are; they get the textures.
+        surroundings: theirs; None without objects.
+        settings: see there.
+
+    Raises:
+        InputError: the objects are too few, or do not find a place.
+    """
+    if not count:
+        return []
+    if count > len(objects) or surroundings is None:
+        raise InputError(
+            f"EvaluateSettings.objects: {count}, and {len(objects)} fields are there; "
+            "each object needs a field of its own and a scene to stand in; or 0"
+        )
+    rng = _generator(settings, route, run, count)
+    kinds = sorted((run + index) % len(objects) for index in range(count))
+    fields = [objects[kind] for kind in kinds]
+    for item in fields:
+        texture = random_texture(item, "mixed", int(rng.integers(2**31)))
+        item.set_parameter("texture", texture)
+    rule = settings.roadside
+    # a horizon too near for objects to be seen does not bring them nearer
+    horizon = max(settings.horizon, math.ceil(rule.view_s / period))
+    steps = replace(settings, horizon=horizon).steps(route, period)
+    stretch = 0.0, (steps - 1) * route.speed_ms * period
+    poses = rule.draw(fields, surroundings, route, stretch, rng, kinds)
+    return [PosedField(item, pose) for item, pose in zip(fields, poses, strict=True)]
 
 
 def _generator(
-    settings: EvaluateSettings, route: Route, run: int
+    settings: EvaluateSettings, route: Route, run: int, objects: int
 ) -> np.random.Generator:
-    """Return the source of all draws of a drive."""
-    return np.random.default_rng([settings.seed, zlib.crc32(route.name.encode()), run])
-
-
-def _roadside(
-    route: Route,
-    objects: Sequence[GridField],
-    ground: Ground,
-    settings: EvaluateSettings,
-    run: int,
-    rng: np.random.Generator,
-) -> Iterator[PosedField]:
-    """Give some of the objects random textures and places."""
-    if not objects:
-        return
-    check_roadside([route], settings, len(objects))
-    stretch = _object_stretch(route, settings)
-    for index in range(settings.objects):
-        item = objects[(run + index) % len(objects)]
-        texture = random_texture(item, "mixed", int(rng.integers(2**31)))
-        item.set_parameter("texture", texture)
-        pose = settings.roadside.draw(item, route, stretch, ground, rng)
-        yield PosedField(item, pose)
+    """Return the source of the draws of a drive, or of its objects."""
+    name = zlib.crc32(route.name.encode())
+    entropy = [settings.seed, name, run]
+    return np.random.default_rng([*entropy, objects] if objects else entropy)

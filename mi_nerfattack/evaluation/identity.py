@@ -54,7 +54,7 @@ def identify(
         place: likewise.
         environments: likewise.
         routes: likewise.
-        settings: the number of runs does not count.
+        settings: the numbers of runs and objects do not count.
 
     Returns:
         by label of the environment and name of the route, for `resumable.Unit`.
@@ -71,7 +71,7 @@ def identify(
         under.label: PlaceSite(under.name, place, _weather(under.conditions)).describe()
         for under in environments
     }
-    choices = {**asdict(settings), "runs": None}
+    choices = {**asdict(settings), "runs": None, "objects": None}
     return {
         (under.label, route.name): {
             **shared,

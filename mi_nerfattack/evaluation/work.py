@@ -16,13 +16,14 @@ from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import environment_versions, make_environment
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.deploy.sites import CARLA, PlaceSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
     EXPERT,
     EvaluateSettings,
     ExpertPolicy,
-    check_roadside,
+    check_places,
     evaluate_run,
     make_card,
 )
@@ -31,13 +32,14 @@ from mi_nerfattack.evaluation.identity import (
     policy_content,
     short_digest,
 )
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
-from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive, departure_limits
+from mi_nerfattack.rollout.drive import NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.scenario.policy import AbstractPolicySection
 from mi_nerfattack.system.workers import (
     AbstractWork,
@@ -110,7 +112,7 @@ class EvaluateWork(AbstractWork):
         ]
 
     def open(self) -> Opened:
-        """Load policy, objects and ground."""
+        """Load policy, objects and their surroundings."""
         return Opened(self)
 
     def do(self, opened: Opened, index: int, report: OnUnits) -> None:
@@ -197,9 +199,7 @@ class Opened:
     def __init__(self, work: EvaluateWork) -> None:
         self._work = work
         self._policy = work.policy.build()
-        site = PlaceSite(work.environments[0].name, work.place)
-        self._objects = site.load_objects(work.settings.objects)
-        self._ground = site.load_ground()
+        self._objects, self._surroundings = load_objects(work)
         self._key: tuple[str, bool] | None = None
         self._environment: AbstractEnvironment | None = None
 
@@ -216,7 +216,7 @@ class Opened:
             case,
             job.run,
             self._objects,
-            self._ground,
+            self._surroundings,
             self._work.settings,
             on_step,
         )
@@ -279,14 +279,12 @@ def run_evaluation(
         progress: called with control periods done and wanted.
 
     Raises:
-        InputError: before the first drive, a lane narrower than the car, a route too
-            short for objects, an environment that cannot be made, several processes
+        InputError: before the first drive, a lane narrower than the car, objects
+            that find no place, an environment that cannot be made, several processes
             for CARLA, drives of another evaluation in the folder, or one that cannot
             be made; later, a policy that does not take the images.
     """
     limits = departure_limits(work.routes, work.settings.car_width_m)
-    if RANDOM in work.cases:
-        check_roadside(work.routes, work.settings, work.settings.objects)
     _check_workers(work, workers)
     jobs = work.jobs
     steps = [work.steps(job) for job in jobs]
@@ -294,6 +292,10 @@ def run_evaluation(
     left = [index for index, item in enumerate(found) if item is None]
     done, total = sum(steps) - sum(steps[index] for index in left), sum(steps)
     # what cannot be made is told now, not after the hours of those before it
+    if any(jobs[index].case not in (EXPERT, NO_OBJECT) for index in left):
+        objects, surroundings = load_objects(work)
+        arguments = (work.routes, objects, surroundings, work.settings)
+        check_places(work.place.period, *arguments)
     for under in dict.fromkeys(jobs[index].environment for index in left):
         make_environment(under.name, work.place, under.conditions).close()
     files.make_folder(work.folder)
@@ -315,6 +317,16 @@ def run_evaluation(
         seconds.setdefault((label, job.case), []).append(item[1])
     means = {key: sum(values) / len(values) for key, values in seconds.items()}
     return Evaluation(make_card(drives, limits), drives, means)
+
+
+def load_objects(
+    work: EvaluateWork,
+) -> tuple[list[GridField], Surroundings | None]:
+    """Load the objects of an evaluation and their surroundings, where it has any."""
+    if work.cases == (NO_OBJECT,):
+        return [], None
+    site = PlaceSite(work.environments[0].name, work.place)
+    return site.load_objects(work.settings.most), site.load_surroundings()
 
 
 def _check_workers(work: EvaluateWork, workers: AbstractWorkers) -> None:

@@ -15,6 +15,7 @@ from mi_nerfattack.io import files
 #: Height and width of the images, pixels.
 IMAGE_SHAPE = (66, 200)
 ARCHITECTURE = "pilotnet-goal"
+MOST_GOALS = 1000
 
 
 class PilotNet(nn.Module):
@@ -116,7 +117,7 @@ class PilotNet(nn.Module):
         try:
             goals = json.loads(metadata["goals"])
             max_control = json.loads(metadata["max_control"])
-            if type(goals) is not int or not 1 <= goals <= 1000:
+            if type(goals) is not int or not 1 <= goals <= MOST_GOALS:
                 raise ValueError(f"goals {goals!r}")
             if not isinstance(max_control, float):
                 raise ValueError(f"max_control {max_control!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -32,6 +33,7 @@ NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK = (
 )
 #: In the order of documents and plots.
 CASES = (NO_OBJECT, OWN, RANDOM, BEST_RANDOM, ATTACK)
+_SEVERAL = re.compile(rf"{RANDOM}_([2-9]|[1-9][0-9]+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ class Drive:
     Args:
         environment: its name, one of `ENVIRONMENTS` or your own.
         route: name of the reference route.
-        case: one of `CASES`.
+        case: one of `CASES`, or of :func:`random_case`.
         run: index among the drives of one route, environment and case, from 0.
         seed: seed of this drive.
         states: (T+1, 3), x and y in metres and heading in radians, initial state
@@ -67,7 +69,7 @@ class Drive:
     time_s: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.case not in CASES:
+        if self.case not in CASES and not _SEVERAL.fullmatch(self.case):
             raise InputError(f"Drive.case: {self.case!r}; one of {', '.join(CASES)}")
         for name in ("run", "seed"):
             object.__setattr__(self, name, int(getattr(self, name)))
@@ -105,6 +107,11 @@ class Drive:
     def departed(self, limit: float) -> np.ndarray:
         """Return a boolean per step, (T,): whether the distance exceeds the limit."""
         return self.distance_m > limit
+
+
+def random_case(objects: int) -> str:
+    """Name the case of so many objects with random textures: random, random_6."""
+    return RANDOM if objects == 1 else f"{RANDOM}_{objects}"
 
 
 def departure_limit(lane_width_m: float, car_width_m: float) -> float:

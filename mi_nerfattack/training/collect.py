@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.placement import Roadside, Scatter
+from mi_nerfattack.deploy.roadside.rule import Roadside
+from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.random_textures import random_texture
@@ -34,10 +35,11 @@ _REMEDY = "choose another folder for the frames, or remove this one"
 
 
 class ShardRecord(Record):
-    """Conditions under which the frames of a shard were rendered; frames by goal."""
+    """Conditions of a shard's frames; how many by goal, groups by number of objects."""
 
     conditions: dict[str, Any]
     goals: dict[str, int]
+    objects: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -49,27 +51,29 @@ class CollectSettings:
         frames: wanted.
         seed: of everything random.
         shard: frames that are written together, under the same conditions.
-        group: states that are drawn around one point, with the same object.
-        groups_a_texture: groups that share a texture.
-        object_share: share of the groups with an object.
-        original_share: share of these where it keeps its own texture.
+        group: states that are drawn around one point, with the same objects.
+        objects: most of them at a time; each number from 1 is equally likely.
+        object_share: share of the groups with objects.
+        original_share: share of the textures that are an object's own; each object has
+            one texture a shard.
         spread_m: states of a group lie within this arc length of their centre.
-        ahead_m: arc length from a group's centre to its object, range.
+        ahead_m: arc length from a group's centre to where the drive ends from which
+            its objects are in view; it begins `spread_m` before the centre.
         margin_m: arc length before and after an open route, from where frames come
             too.
         scatter: deviations of the states from the route.
-        roadside: sizes and positions of the objects.
+        roadside: the rule by which the objects stand.
     """
 
     frames: Count = 9000
     seed: int = 0
     shard: Count = 64
     group: Count = 8
-    groups_a_texture: Count = 2
+    objects: Count = 6
     object_share: Share = 0.75
     original_share: Share = 0.1
     spread_m: float = 3.0
-    ahead_m: tuple[float, float] = (4.0, 20.0)
+    ahead_m: float = 8.0
     margin_m: float = 2.0
     scatter: Scatter = field(default_factory=Scatter)
     roadside: Roadside = field(default_factory=Roadside)
@@ -99,7 +103,7 @@ def collect(
     frames depend neither on the number of workers nor on interruptions, however hard.
 
     Args:
-        site: makes the environments, and gives objects and ground.
+        site: makes the environments, and gives objects and their surroundings.
         routes: they take turns by chance, longer ones more often.
         source: of the states.
         settings: see there.
@@ -162,7 +166,7 @@ class _Shards(AbstractWork):
         return Unit(path, self.identity, ShardRecord, _REMEDY)
 
     def open(self) -> _Opened:
-        """Load objects, ground and what the source needs."""
+        """Load objects, surroundings and what the source needs."""
         return _Opened(self.site, self.settings, self.source.prepare())
 
     def do(self, opened: _Opened, index: int, report: OnUnits) -> None:
@@ -172,6 +176,7 @@ class _Shards(AbstractWork):
         )
         conditions = self.site.draw(rng)
         environment = opened.environment(conditions)
+        opened.paint(rng)
         wanted, rows = self.settings.size(index), []
         images: list[np.ndarray] = []
         for goal, (image, control) in self._rows(opened, environment, rng):
@@ -181,10 +186,13 @@ class _Shards(AbstractWork):
             if len(rows) == wanted:
                 break
         goals, controls = (np.array(column) for column in zip(*rows, strict=True))
-        counts = {str(goal): int((goals == goal).sum()) for goal in np.unique(goals)}
         self.unit(self.path(index)).write(
             shard_columns(np.stack(images), goals, controls),
-            ShardRecord(conditions=asdict(conditions), goals=counts),
+            ShardRecord(
+                conditions=asdict(conditions),
+                goals=_counts(goals),
+                objects=_counts(opened.shown),
+            ),
         )
 
     def close(self, opened: _Opened) -> None:
@@ -199,30 +207,34 @@ class _Shards(AbstractWork):
     ) -> Iterator[tuple[int, Labelled]]:
         """Yield goals and labelled frames without end."""
         experts = {route.name: expert_of(self.site, route) for route in self.routes}
-        states = _draw_states(self.routes, self.settings, rng)
-        for number, (route, arc, poses) in enumerate(states):
-            opened.dress(environment, route, arc, number, rng)
+        for route, arc, poses in _draw_states(self.routes, self.settings, rng):
+            opened.dress(environment, route, arc, rng)
             scenery = Scenery(environment, route, experts[route.name], poses, rng)
             for labelled in self.source.frames(opened.prepared, scenery):
                 yield route.goal, labelled
 
 
 class _Opened:
-    """What a worker keeps from shard to shard: one environment, objects, ground.
+    """What a worker keeps from shard to shard: one environment, objects, surroundings.
 
     Args:
         site: see `collect`.
         settings: see `collect`.
         prepared: what the source needs.
+
+    Attributes:
+        shown: number of objects of each group of the shard.
     """
 
     def __init__(
         self, site: AbstractSite, settings: CollectSettings, prepared: Any
     ) -> None:
         self.site, self.settings, self.prepared = site, settings, prepared
-        self.objects = site.load_objects() if settings.object_share > 0 else []
+        wanted = settings.object_share > 0
+        self.objects = site.load_objects(settings.objects) if wanted else []
         self.own = [item.texture.numpy().copy() for item in self.objects]
-        self.ground = site.load_ground() if self.objects else None
+        self.surroundings = site.load_surroundings() if self.objects else None
+        self.shown: list[int] = []
         self._open: tuple[Any, AbstractEnvironment] | None = None
 
     def environment(self, conditions: Any) -> AbstractEnvironment:
@@ -238,40 +250,63 @@ class _Opened:
             self._open[1].close()
         self._open = None
 
+    def paint(self, rng: np.random.Generator) -> None:
+        """Begin a shard: give each object a random texture, or its own."""
+        self.shown = []
+        for item, own in zip(self.objects, self.own, strict=True):
+            keep = rng.uniform() < self.settings.original_share
+            texture = random_texture(item, "mixed", int(rng.integers(2**31)))
+            item.set_parameter("texture", own if keep else texture)
+
     def dress(
         self,
         environment: AbstractEnvironment,
         route: Route,
         arc: float,
-        number: int,
         rng: np.random.Generator,
     ) -> None:
-        """Put an object beside the road, or none; change its texture now and then.
+        """Put objects beside the road, as many as find a place, or none.
 
         Args:
-            environment: shows it.
-            route: beside which it stands.
+            environment: shows them.
+            route: beside which they stand.
             arc: arc length of the group's centre, metres.
-            number: of the group in its shard.
             rng: source of all draws.
         """
-        settings = self.settings
-        if self.ground is None:
-            environment.show([])
-            return
-        turn, rest = divmod(number, settings.groups_a_texture)
-        index = turn % len(self.objects)
-        chosen = self.objects[index]
-        if rest == 0:
-            keep = rng.uniform() < settings.original_share
-            texture = random_texture(chosen, "mixed", int(rng.integers(2**31)))
-            chosen.set_parameter("texture", self.own[index] if keep else texture)
-        posed = []
-        if rng.uniform() < settings.object_share:
-            reach = (arc + settings.ahead_m[0], arc + settings.ahead_m[1])
-            pose = settings.roadside.draw(chosen, route, reach, self.ground, rng)
-            posed = [PosedField(chosen, pose)]
+        settings, posed = self.settings, []
+        if self.surroundings is not None and rng.uniform() < settings.object_share:
+            count = int(rng.integers(1, settings.objects + 1))
+            chosen = sorted(rng.permutation(len(self.objects))[:count].tolist())
+            fields = [self.objects[index] for index in chosen]
+            stretch = _stretch(route, arc, settings)
+            poses = settings.roadside.find(
+                fields, self.surroundings, route, stretch, rng, chosen
+            )
+            pairs = zip(fields, poses, strict=True)
+            posed = [PosedField(item, pose) for item, pose in pairs if pose is not None]
+        self.shown.append(len(posed))
         environment.show(posed)
+
+
+def _stretch(
+    route: Route, arc: float, settings: CollectSettings
+) -> tuple[float, float]:
+    """Return the drive from which a group's objects are in view; no longer a route's.
+
+    At the ends of an open route it is as long, and ends where the frames do.
+    """
+    begin, end = arc - settings.spread_m, arc + settings.ahead_m
+    if route.closed:
+        return begin, end
+    least, most = -settings.margin_m, route.length + settings.margin_m
+    shift = max(least - begin, 0.0) + min(most - end, 0.0)
+    return max(begin + shift, least), min(end + shift, most)
+
+
+def _counts(values: Any) -> dict[str, int]:
+    """Count equal integers."""
+    names, counts = np.unique(values, return_counts=True)
+    return {str(n): int(count) for n, count in zip(names, counts, strict=True)}
 
 
 def _draw_states(

@@ -12,10 +12,10 @@ import torch
 
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.evaluate import check_roadside
+from mi_nerfattack.evaluation.evaluate import check_places
 from mi_nerfattack.io import files
 from mi_nerfattack.io.locks import exclusive, remove_partial
-from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, PilotNet
+from mi_nerfattack.policy.pilotnet import IMAGE_SHAPE, MOST_GOALS, PilotNet
 from mi_nerfattack.rollout.drive import departure_limits
 from mi_nerfattack.system.workers import AbstractWorkers
 from mi_nerfattack.training.collect import OnFrames, collect
@@ -64,7 +64,8 @@ def imitate(
 
     Args:
         sites: with different names; those of `settings`.
-        routes: to drive; their goals are those of the policy.
+        routes: to drive; the policy has goals from 0 to their largest, or as many as
+            the first weights.
         settings: see there.
         folder: of frames and checkpoints.
         workers: who collects.
@@ -74,14 +75,17 @@ def imitate(
 
     Raises:
         InputError: before the first frame, no frames wanted, an unknown site, one
-            that cannot be opened, a goal missing, a camera, a route, first weights or
-            frames of `more` that do not fit, or another process that works in the
-            folder; then, where the folder holds what was made with other settings.
+            that cannot be opened, a camera, a route, first weights or frames of `more`
+            that do not fit, objects without a place, or another process that works in
+            the folder; then, where the folder holds what was made with other settings.
     """
     _check(sites, routes, settings, more)
     torch.manual_seed(settings.seed)
     car = sites[0].car
-    module = PilotNet(len(routes), car.max_control, car.control_unit)
+    goals = 1 + max(route.goal for route in routes)
+    if start is not None:
+        goals = max(goals, start.goals)
+    module = PilotNet(goals, car.max_control, car.control_unit)
     if start is not None:
         _take_weights(module, start)
     if more:
@@ -141,12 +145,12 @@ class _Imitation:
     def __enter__(self) -> _Imitation:
         """Load what validation drives in, after the workers have gone."""
         site, settings = self.sites[0], self.settings
-        wanted = max(settings.validation.objects, settings.final.objects)
+        wanted = max(settings.validation.most, settings.final.most)
         self._loop = ClosedLoop(
             [site.open(site.typical()) for site in self._validated()],
             self.routes,
             site.load_objects(wanted),
-            site.load_ground(),
+            site.load_surroundings() if wanted else None,
             self.settings.validation,
             self.settings.validate_every,
             self._steps("validation"),
@@ -267,13 +271,18 @@ def _check(
     names = [site.name for site in sites]
     if unknown := sorted(set(settings.sites) - set(names)):
         raise InputError(f"frames: of {', '.join(unknown)}; there is {names}")
-    goals = sorted(route.goal for route in routes)
     frames = sum(settings.frames.values())
-    if not sites or not (frames or more) or goals != list(range(len(routes))):
+    if not sites or not routes or not (frames or more):
         raise InputError(
-            f"imitate: {frames} frames of {names}, goals {goals}; at least one frame, "
-            "and goals 0, 1, 2, ..."
+            f"imitate: {frames} frames of {names}, {len(routes)} routes; at least one "
+            "frame and one route"
         )
+    for route in routes:
+        if route.goal >= MOST_GOALS:
+            raise InputError(
+                f"route {route.name!r}: goal {route.goal}; PilotNet has at most "
+                f"{MOST_GOALS} goals, from 0: number the manoeuvres closely"
+            )
     for site in sites:
         check_camera(site)
     size = settings.collecting.shard
@@ -283,15 +292,32 @@ def _check(
             f"frames: {frames}, one shard of up to {size}; at least two, of which one "
             "is held out, or give validation_frames"
         )
-    measured = (settings.validation, settings.final)
-    found = len(sites[0].load_objects(max(drives.objects for drives in measured)))
-    for drives in measured:
-        departure_limits(routes, drives.car_width_m)
-        if drives.objects and found:
-            check_roadside(routes, drives, found)
+    _check_objects(sites[0], routes, settings)
     # what cannot be made is told now, not after the hours of those before it
     for site in sites:
         site.open(site.typical()).close()
+
+
+def _check_objects(
+    site: AbstractSite, routes: Sequence[Route], settings: ImitationSettings
+) -> None:
+    """Raise `InputError` for objects that find no place."""
+    measured = (settings.validation, settings.final)
+    for drives in measured:
+        departure_limits(routes, drives.car_width_m)
+    collecting = settings.collecting
+    wanted = collecting.objects if collecting.object_share else 0
+    most = max(wanted, *(drives.most for drives in measured))
+    objects = site.load_objects(most) if most else []
+    if not objects:
+        return
+    surroundings = site.load_surroundings()
+    for drives in measured:
+        check_places(site.period, routes, objects, surroundings, drives)
+    if wanted:  # near the ends of a route there may be none; somewhere there must
+        rng, rule = np.random.default_rng(settings.seed), collecting.roadside
+        for route in routes:
+            rule.draw(objects[:1], surroundings, route, (0.0, route.length), rng)
 
 
 def check_camera(site: AbstractSite) -> None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mi_nerfattack.deploy.car import SMALL_CAR
-from mi_nerfattack.deploy.placement import Roadside, Scatter
+from mi_nerfattack.deploy.roadside.rule import Roadside
+from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import ANY_WEATHER, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
@@ -43,14 +44,13 @@ class Preset:
     collecting: CollectSettings = field(default_factory=CollectSettings)
 
 
-#: Beside the small car's track. Places are cleared for half a full-size car, 0.9 m,
-#: 0.75 m more than half of the small one: 5 cm are left beside it.
-_ROOM_ROADSIDE = Roadside((0.15, 0.4), (0.4, 0.9), clearance_m=0.05 - 0.75)
+#: Beside the small car's track, in its scale.
+_ROOM_ROADSIDE = Roadside(((0.2, 0.5),), gap_m=(0.05, 0.6), clearance_m=0.05)
 
 #: The small car's track: a tenth of the lengths of the intersection.
 _ROOM = CollectSettings(
     spread_m=0.3,
-    ahead_m=(0.8, 2.5),
+    ahead_m=1.6,
     margin_m=0.2,
     scatter=Scatter(lateral_sd_m=0.08, lateral_max_m=0.2),
     roadside=_ROOM_ROADSIDE,
@@ -85,7 +85,6 @@ EVALUATIONS: Mapping[str, EvaluateSettings] = {
     "intersection": EvaluateSettings(),
     "room": EvaluateSettings(
         scatter=Scatter(0.03, 0.09, np.deg2rad(3.0).item(), np.deg2rad(9.0).item(), 0),
-        ahead_m=(0.8, 0.5),
         car_width_m=SMALL_CAR.width,
         roadside=_ROOM_ROADSIDE,
     ),

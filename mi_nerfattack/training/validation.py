@@ -13,7 +13,7 @@ import pydantic
 from typing_extensions import TypedDict
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.placement import Ground
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings, evaluate
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -91,7 +91,7 @@ class ClosedLoop(AbstractValidation):
         environments: with different names.
         routes: to drive.
         objects: stand beside the road; may be empty.
-        ground: of the world.
+        surroundings: of the objects; None without.
         settings: number of drives, starts, cases.
         every: epochs from one measurement to the next.
         progress: called with steps done and wanted.
@@ -100,7 +100,7 @@ class ClosedLoop(AbstractValidation):
     environments: Sequence[AbstractEnvironment]
     routes: Sequence[Route]
     objects: Sequence[GridField]
-    ground: Ground
+    surroundings: Surroundings | None
     settings: EvaluateSettings = field(default_factory=EvaluateSettings)
     every: int = 4
     progress: Callable[[int, int], None] = lambda done, total: None
@@ -119,7 +119,7 @@ class ClosedLoop(AbstractValidation):
         """Drive, and return all figures; see `evaluation.evaluate.evaluate`."""
         # the parameters of a policy that drives are frozen
         policy = TorchPolicy(copy.deepcopy(module))
-        arguments = (self.routes, self.objects, self.ground, self.settings)
+        arguments = (self.routes, self.objects, self.surroundings, self.settings)
         return evaluate(policy, self.environments, *arguments, self.progress)
 
     def describe(self) -> dict[str, Any]:

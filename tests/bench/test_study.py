@@ -56,6 +56,18 @@ def test_places_are_drawn_once_and_for_all_sizes(tmp_path):
     assert other.position_m != first.position_m
 
 
+def test_places_are_those_that_the_protocols_were_committed_with():
+    """The first place of each route, as the rule drew it before any result."""
+    limits = distribution.LATERAL_M, distribution.ARC_M
+    found = [Place(route, *limits, 0).pose(NATURAL_M) for route in ROUTES]
+    expected = [
+        [-16.92941042, -5.89178344, 0.11999512],
+        [0.10573977, -5.57416764, 0.0],
+        [-3.59223909, -4.75881706, 0.0],
+    ]
+    np.testing.assert_allclose([p.translation for p in found], expected, atol=1e-6)
+
+
 def test_every_row_of_every_study_is_a_scenario(tmp_path):
     for study in (steps, robust, textures, seeds, distribution):
         keys = [json.dumps(key) for key in study.keys()]

@@ -272,6 +272,9 @@ def test_one_process_asks_a_server_that_may_keep_a_state():
         (["--object", "nothing.safetensors"], "nothing.safetensors: does not exist"),
         (["--output", "no/folder/card.json"], "no/folder/card.json"),
         (["--place", "moon"], "place: 'moon'"),
+        (["--scale", "1", "2", "3"], "--scale: 1.0 2.0 3.0; least and most"),
+        (["--scale", "2", "1"], "2.0 to 1.0; the smaller comes first"),
+        (["--objects", "-1"], "EvaluateSettings.objects: (-1,)"),
     ],
 )
 def test_bad_options_are_one_message(place, capsys, change, message):
@@ -289,11 +292,29 @@ def test_routes_that_cannot_be_measured_are_told_before_the_first_drive(
     files.write_json("routes.json", narrow)
     assert cli.main(place) == 2
     assert "route 'straight': its lane is 1.7 m wide" in capsys.readouterr().err
-    short = {"straight": {**ROUTES["straight"], "points_m": [[0, 0], [9, 0]]}}
+    short = {"straight": {**ROUTES["straight"], "points_m": [[0, 0], [5, 0]]}}
     files.write_json("routes.json", short)
     save_field("box.safetensors", small_grid())
     assert cli.main([*place, "--object", "box.safetensors"]) == 2
-    assert "on route 'straight' of 9.0 m" in capsys.readouterr().err
+    assert "route 'straight': places for 0 of 1" in capsys.readouterr().err
+
+
+def test_numbers_of_objects_are_cases_and_add_drives(place, capsys):
+    save_field("box.safetensors", small_grid())
+    command = [*place, "--object", "box.safetensors", "--horizon", "3", "--json"]
+    assert cli.main(command) == 0
+    first = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
+    kept = {path: path.stat().st_mtime_ns for path in Path("runs").rglob("run_*")}
+    assert cli.main([*command, "--objects", "0", "1", "6", "--scale", "1", "2"]) == 0
+    scaled = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
+    assert list(scaled) == ["no_object", "random", "random_6"]
+    assert cli.main([*command, "--objects", "6", "1", "--page", "page"]) == 0
+    found = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]
+    assert {case: found[case] for case in first} == first
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
+    assert "random_6" in Path("page/still-drive.md").read_text()
+    starts = [[run["start"] for run in found[case]["per_run"]] for case in found]
+    assert starts[0] == starts[1] == starts[2]
 
 
 def test_an_environment_that_is_not_installed_is_one_message(

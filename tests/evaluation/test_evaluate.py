@@ -14,14 +14,14 @@ from helpers.roadside import (
     Grey,
     PaintedEnvironment,
     bent,
-    flat_ground,
     small_grid,
     straight,
+    surroundings,
 )
 
 from mi_nerfattack.deploy.place import Conditions, bundled_place
-from mi_nerfattack.deploy.placement import scene_ground
 from mi_nerfattack.deploy.registry import make_environment
+from mi_nerfattack.deploy.sites import PlaceSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import (
     EvaluateSettings,
@@ -35,7 +35,6 @@ from mi_nerfattack.evaluation.evaluate import (
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
-from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.report.table import card_table
 from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, departure_limit
 from mi_nerfattack.training.presets import EVALUATIONS
@@ -115,7 +114,7 @@ def test_starts_are_cut_and_depend_on_seed_route_and_run_alone():
     assert np.abs(np.rad2deg(poses[:, 2])).max() <= 9.0
     np.testing.assert_array_equal(poses[:, 0], 0)
     few, many = EvaluateSettings(runs=2, horizon=2), EvaluateSettings(horizon=2)
-    arguments = (Counting(), straight(), NO_OBJECT, 1, [], flat_ground)
+    arguments = (Counting(), straight(), NO_OBJECT, 1, [], None)
     one = evaluate_run(surrogate(), *arguments, few)
     other = evaluate_run(surrogate("mujoco"), *arguments, many)
     np.testing.assert_array_equal(one.states, other.states)
@@ -123,7 +122,7 @@ def test_starts_are_cut_and_depend_on_seed_route_and_run_alone():
 
 
 def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
-    grid = small_grid()
+    grid, around = small_grid(), surroundings(straight())
     seen = []
     for name in ("surrogate", "mitsuba"):
         environment = surrogate(name)
@@ -136,7 +135,7 @@ def test_objects_are_the_same_in_every_environment_and_keep_their_textures():
                 case,
                 run,
                 [grid],
-                flat_ground,
+                around,
                 settings,
             )
             for case in settings.cases
@@ -191,7 +190,7 @@ def test_evaluate_drives_everything_and_counts_steps():
         environments,
         [straight(), bent()],
         [small_grid()],
-        flat_ground,
+        surroundings(straight(), bent()),
         settings,
         lambda done, total: calls.append((done, total)),
     )
@@ -213,18 +212,19 @@ def test_evaluate_drives_everything_and_counts_steps():
             {"car_width_m": 4.0},
             "route 'straight': its lane is 3.5 m wide, the vehicle 4.0",
         ),
-        (1, {"ahead_m": (40.0, 2.0)}, "'left' of 12.0 m.*objects 0"),
-        (1, {"objects": 2}, "objects 2 of 1"),
+        (1, {"runs": 2}, "'left': places for 0 of 1 .* 0.0 to 2.5 m .*move routes"),
+        (1, {"objects": (2,)}, "objects: 2, and 1 fields are there"),
     ],
 )
 def test_what_cannot_be_measured_is_told_before_the_first_drive(
     objects, change, message
 ):
-    short = Route("left", 1, np.array([[0.0, 0.0], [12.0, 0.0]]))
-    long = Route("straight", 0, np.array([[0.0, 0.0], [90.0, 0.0]]))
-    policy, settings = Counting(), EvaluateSettings(runs=1, **change)
+    short = Route("left", 1, np.array([[0.0, 0.0], [5.0, 0.0]]))
+    long = Route("straight", 0, np.array([[0.0, 0.0], [40.0, 0.0]]))
+    policy, settings = Counting(), EvaluateSettings(**({"runs": 1} | change))
     fields = [small_grid() for _ in range(objects)]
-    arguments = ([surrogate()], [long, short], fields, flat_ground, settings)
+    around = surroundings(long, short)
+    arguments = ([surrogate()], [long, short], fields, around, settings)
     with pytest.raises(InputError, match=message):
         evaluate(policy, *arguments)
     assert not policy.seen
@@ -256,10 +256,10 @@ def test_the_room_has_starts_in_its_lane_and_objects_that_find_a_place():
     starts = np.array([random_start(route, settings, rng) for _ in range(100)])
     assert np.abs(route.cross_track_numpy(starts)).max() < limit
     environment = make_environment("mitsuba", tiny(room), Conditions(spp=1))
-    ground = scene_ground(load_scene(room.scene))
+    around = PlaceSite("mitsuba", room).load_surroundings()
     grid, few = load_grid(room.objects[0]), replace(settings, horizon=2)
     for run in range(8):
-        arguments = (route, RANDOM, run, [grid], ground, few)
+        arguments = (route, RANDOM, run, [grid], around, few)
         driven = evaluate_run(environment, Counting(), *arguments)
         assert not driven.departed(limit).any()
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from mi_nerfattack.deploy.car import CAR, Car
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.render.camera.intrinsics import Camera, from_fov
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.training.collect import CollectSettings
 from mi_nerfattack.vehicle.route.route import Route
@@ -29,8 +30,10 @@ def bent() -> Route:
     return Route("left", 1, np.concatenate([[[0, 0]], arc, [[18, 30]]]))
 
 
-def flat_ground(points: np.ndarray) -> np.ndarray:
-    return np.zeros(len(points))
+def surroundings(*routes: Route, scene=None) -> Surroundings:
+    """Of a camera 200 px wide, on flat ground 100 m wide unless a scene is given."""
+    scene = scene or mi.load_dict({"type": "scene", "ground": plate(0.0, 0.0, 50.0)})
+    return Surroundings(scene, routes, from_fov(200, 66, 90.0), CameraMount(), 0.1)
 
 
 def small_grid() -> GridField:
@@ -147,20 +150,20 @@ class PaintedSite(AbstractSite):
     def load_objects(self, least=1):
         return [small_grid() for _ in range(max(1, least))] if self.objects else []
 
-    def load_ground(self):
-        return flat_ground
+    def load_surroundings(self):
+        return surroundings(straight(), bent())
 
     def describe(self):
         return {"environment": self.name, "size": self.size_px}
 
 
+def plate(z, y, half_y):
+    to_world = mi.ScalarTransform4f().translate([0, y, z]).scale([50, half_y, 1])
+    return {"type": "rectangle", "to_world": to_world}
+
+
 def kerb_scene():
     """Road at z = 0 for y < 3, pavement above; a wall; nothing beyond 50 m."""
-
-    def plate(z, y, half_y):
-        to_world = mi.ScalarTransform4f().translate([0, y, z]).scale([50, half_y, 1])
-        return {"type": "rectangle", "to_world": to_world}
-
     wall = mi.ScalarTransform4f().translate([20, 0, 1.5]).scale([0.5, 0.5, 1.5])
     return mi.load_dict(
         {
@@ -176,5 +179,5 @@ def kerb_scene():
 
 
 def small(**changes) -> CollectSettings:
-    base = {"frames": 24, "group": 4, "shard": 12, "seed": 5}
+    base = {"frames": 24, "group": 4, "shard": 12, "seed": 5, "objects": 1}
     return CollectSettings(**(base | changes))

@@ -6,14 +6,23 @@ import dataclasses
 import json
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 from helpers.kernels import nothing_compiled
-from helpers.roadside import Grey, PaintedSite, bent, painted, small, straight
+from helpers.roadside import (
+    Grey,
+    PaintedSite,
+    bent,
+    painted,
+    small,
+    straight,
+    surroundings,
+)
 
 from mi_nerfattack.deploy.place import Place
-from mi_nerfattack.deploy.placement import Scatter
+from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -50,9 +59,12 @@ def states_of(site: PaintedSite) -> np.ndarray:
     return np.concatenate([np.stack(item.states) for item in site.opened])
 
 
+def record_of(shard: Path) -> dict:
+    return json.loads(files.read_safetensors(shard, ())[1]["kept.record"])
+
+
 def conditions_of(shards: list[Path]) -> list[dict]:
-    about = [files.read_safetensors(shard, ())[1]["kept.record"] for shard in shards]
-    return [json.loads(record)["conditions"] for record in about]
+    return [record_of(shard)["conditions"] for shard in shards]
 
 
 def test_frames_carry_the_experts_control_and_goal(site, tmp_path):
@@ -94,13 +106,43 @@ def test_conditions_change_from_shard_to_shard(site, tmp_path):
     assert len(site.opened) == changes
 
 
-def test_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
-    collect(site, [straight()], Scattered(), small(frames=480), tmp_path, HERE)
+def test_up_to_six_objects_come_and_go_ahead_of_the_vehicles(site, tmp_path):
+    settings = small(frames=160, objects=6)
+    shards = collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
     seen = [objects for item in site.opened for objects in item.seen]
+    assert {len(objects) for objects in seen} == set(range(7))
     assert 0.55 < np.mean([bool(objects) for objects in seen]) < 0.95
     for objects, state in zip(seen, states_of(site), strict=True):
         for posed in objects:
-            assert 0 < posed.pose.translation[0] - state[0] < 24
+            x, y, _ = posed.pose.translation
+            # in view from 3 m before the group to 8 m after it, or at the route's end
+            assert -6 < x - state[0] < 34
+            assert abs(y) > 1.75 + 0.3 + 0.2
+    counts = [record_of(shard)["objects"] for shard in shards]
+    groups = sum(int(n) * times for count in counts for n, times in count.items())
+    assert 4 * groups == sum(map(len, seen))
+
+
+@dataclasses.dataclass(frozen=True)
+class IslandSite(PaintedSite):
+    """Ends where its route does, at x = 40 m, and 8 m before it begins."""
+
+    def load_surroundings(self):
+        to_world = mi.ScalarTransform4f().translate([16, 0, 0]).scale([24, 50, 1])
+        ground = {"type": "rectangle", "to_world": to_world}
+        scene = mi.load_dict({"type": "scene", "ground": ground})
+        return surroundings(straight(), scene=scene)
+
+
+def test_no_ground_is_wanted_beyond_a_routes_end(tmp_path):
+    """Near the end objects stand before it, or there are fewer."""
+    site, settings = IslandSite(), small(frames=96, object_share=1.0)
+    collect(site, [straight()], Scattered(), settings, tmp_path, HERE)
+    shown = [objects for item in site.opened for objects in item.seen]
+    late = [o for o, s in zip(shown, states_of(site), strict=True) if s[0] > 36]
+    assert late and all(late)
+    ends = [posed.pose.translation[0] for objects in shown for posed in objects]
+    assert 30 < max(ends) < 40
 
 
 def test_no_objects_when_none_are_wanted(site, tmp_path):

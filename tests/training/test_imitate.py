@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.roadside import PaintedSite, bent, flat_ground, small, straight
+from helpers.roadside import PaintedSite, bent, small, straight
 from helpers.shards import write_shard
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.io import files
@@ -43,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 SITE = PaintedSite("mitsuba", size_px=(200, 66))
 HERE = InThisProcess()
-DRIVE = EvaluateSettings(runs=1, objects=0, horizon=3)
+DRIVE = EvaluateSettings(runs=1, objects=(), horizon=3)
 SETTINGS = ImitationSettings(
     frames={"mitsuba": 64},
     dagger_frames={"mitsuba": 32},
@@ -55,6 +56,8 @@ SETTINGS = ImitationSettings(
     final=DRIVE,
 )
 ROUTES = [straight(), bent()]
+#: Nothing is seen for a minute of a drive of 8 s.
+UNSEEN = Roadside(view_s=60.0)
 
 
 def test_imitation_runs_from_frames_to_card_and_resumes(tmp_path):
@@ -165,7 +168,7 @@ def test_validation_every_second_epoch_and_after_the_last(data):
 
 def test_training_goes_on_after_a_closed_loop(data):
     environment = SITE.open(SITE.typical())
-    loop = ClosedLoop([environment], [straight()], [], flat_ground, DRIVE, every=1)
+    loop = ClosedLoop([environment], [straight()], [], None, DRIVE, every=1)
     module = PilotNet(1)
     before = loop.measure(module)
     assert all(parameter.requires_grad for parameter in module.parameters())
@@ -234,8 +237,12 @@ def test_presets_have_the_figures_of_the_paper():
             "route 'straight': its lane is 3.5 m wide, the vehicle 4.0 m",
         ),
         (
-            {"final": dataclasses.replace(DRIVE, objects=1, ahead_m=(37.0, 2.0))},
-            "on route 'straight' of 40.0 m, objects 1 of 1; the route must be longer",
+            {"final": dataclasses.replace(DRIVE, objects=(1,), roadside=UNSEEN)},
+            "route 'straight': places for 0 of 1 objects",
+        ),
+        (
+            {"collecting": small(roadside=UNSEEN)},
+            "route 'straight': places for 0 of 1 objects",
         ),
     ],
 )
@@ -260,13 +267,15 @@ def test_sites_without_frames_need_not_be_there(change):
 
 
 def test_goals_cameras_and_weights_must_fit(tmp_path):
-    with pytest.raises(InputError, match=r"goals \[1\]"):
-        imitate([SITE], [bent()], SETTINGS, tmp_path, HERE)
+    far = dataclasses.replace(bent(), goal=1000)
+    with pytest.raises(InputError, match="'left': goal 1000; PilotNet has at most"):
+        imitate([SITE], [far], SETTINGS, tmp_path, HERE)
     small_camera = PaintedSite("mitsuba", size_px=(100, 50))
     with pytest.raises(InputError, match=r"100 x 50 px; PilotNet takes 200 x 66"):
         imitate([small_camera], ROUTES, SETTINGS, tmp_path, HERE)
     with pytest.raises(InputError, match=r"start: .*\(2, 1.5, 'rad/s'\) are needed"):
-        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=PilotNet(5))
+        start = PilotNet(2, unit="rad")
+        imitate([SITE], ROUTES, SETTINGS, tmp_path, HERE, start=start)
     assert not list(tmp_path.iterdir())  # told before the first frame
 
 
@@ -383,3 +392,23 @@ def test_train_names_a_missing_scene(tmp_path, capsys):
     assert run_train(tmp_path, *arguments) == 2
     assert f"{missing}: does not exist" in capsys.readouterr().err
     assert not (tmp_path / "policy.safetensors").exists()
+
+
+@pytest.mark.parametrize("goals", [(2, 1), (2, 2)])
+def test_goals_are_numbers_of_manoeuvres_not_of_routes(tmp_path, goals):
+    """They need not begin with 0, and routes may share one."""
+    pairs = zip(ROUTES, goals, strict=True)
+    routes = [dataclasses.replace(route, goal=goal) for route, goal in pairs]
+    settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
+    found = imitate([SITE], routes, settings, tmp_path, HERE)
+    assert found.module.goals == 3
+    data = FrameDataset.from_shards(find_shards(tmp_path))
+    assert set(data.goals) == set(goals)
+
+
+def test_first_weights_may_have_more_goals(tmp_path):
+    """A policy for three manoeuvres goes on with routes of one."""
+    settings = dataclasses.replace(SETTINGS, dagger_rounds=0)
+    start = PilotNet(3)
+    found = imitate([SITE], [straight()], settings, tmp_path, HERE, start=start)
+    assert found.module.goals == 3

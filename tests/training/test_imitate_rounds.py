@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 SITE = PaintedSite("mitsuba", size_px=(200, 66))
 HERE = InThisProcess()
 ROUTES = [straight(), bent()]
-DRIVE = EvaluateSettings(runs=1, objects=0, horizon=2)
+DRIVE = EvaluateSettings(runs=1, objects=(), horizon=2)
 SETTINGS = ImitationSettings(
     frames={"mitsuba": 48},
     dagger_frames={"mitsuba": 24},

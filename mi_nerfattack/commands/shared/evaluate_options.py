@@ -172,6 +172,24 @@ def parse_conditions(
     return tuple(found)
 
 
+def parse_scales(
+    numbers: tuple[float, ...], objects: int
+) -> tuple[tuple[float, float], ...]:
+    """Return the ranges of --scale as pairs; none where it is not given.
+
+    Args:
+        numbers: least and most, in turns.
+        objects: number of fields.
+    """
+    pairs = tuple(zip(numbers[::2], numbers[1::2], strict=False))
+    if len(numbers) % 2 or len(pairs) not in (0, 1, objects):
+        raise InputError(
+            f"--scale: {' '.join(map(str, numbers))}; least and most of all objects, "
+            f"or of each of the {objects} --object files"
+        )
+    return pairs
+
+
 def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
     """Return the camera that a policy's TOML file describes, where it describes one.
 

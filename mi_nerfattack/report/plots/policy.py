@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
-from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.rollout.drive import RANDOM, Drive
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "random": {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (5, 1.2))},
     "no_object": {"color": BLUE, "linewidth": 0.9},
     "expert": {"color": GREY, "linewidth": 0.8, "linestyle": ":"},
 }
-_LABELS = {
-    "no_object": "alone",
-    "random": "past objects of random texture",
-    "expert": "expert, alone",
-}
+_LABELS = {"no_object": "alone", "expert": "expert, alone"}
+_PAST = {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (5, 1.2))}
+#: Of further numbers of objects.
+_COLORS = (ORANGE, "#882255", "#117733", "#AA4499")
 _ROW_IN, _LEGEND_IN = 1.9, 0.5
 
 
@@ -45,8 +43,10 @@ def plot_errors(
         )
         for row, route in zip(grid, routes, strict=True):
             for axis, environment in zip(row, environments, strict=True):
-                for case in _STYLES:
-                    _draw(axis, drives.get((environment, route, case), ()), case)
+                for case, style in _styles(drives).items():
+                    for drive in drives.get((environment, route, case), ()):
+                        error = drive.cross_track_m
+                        axis.plot(drive.time_s, error, alpha=0.8, **style)
                 for sign in (-1, 1):
                     limit = sign * limits[route]
                     axis.axhline(limit, color="black", linewidth=1, linestyle=":")
@@ -58,19 +58,29 @@ def plot_errors(
         figure.legend(handles=_handles(drives), loc="outside lower center", ncols=4)
 
 
-def _draw(axis: Axes, drives: Sequence[Drive], case: str) -> None:
-    for drive in drives:
-        axis.plot(drive.time_s, drive.cross_track_m, alpha=0.8, **_STYLES[case])
+def _styles(drives: Mapping[tuple[str, str, str], Any]) -> dict[str, dict[str, Any]]:
+    """Return how the cases are drawn, those with objects below the others."""
+    present = list(dict.fromkeys(key[2] for key in drives))
+    past = [case for case in present if case not in _STYLES]
+    styles = {
+        case: {**_PAST, "color": color}
+        for case, color in zip(past, cycle(_COLORS), strict=False)
+    }
+    return styles | {case: s for case, s in _STYLES.items() if case in present}
 
 
 def _handles(drives: Mapping[tuple[str, str, str], Any]) -> list[Line2D]:
-    present = {key[2] for key in drives}
     handles = [
-        Line2D([], [], label=label, **{**_STYLES[case], "linewidth": 2})
-        for case, label in _LABELS.items()
-        if case in present
+        Line2D([], [], label=_label(case), **{**style, "linewidth": 2})
+        for case, style in _styles(drives).items()
     ]
     return [
         *handles,
         Line2D([], [], color="black", linestyle=":", label="lane's limit"),
     ]
+
+
+def _label(case: str) -> str:
+    count = case.removeprefix(f"{RANDOM}_")
+    past = "an object" if count == RANDOM else f"{count} objects"
+    return _LABELS.get(case, f"past {past} of random texture")

@@ -1,4 +1,4 @@
-"""Where vehicles and roadside objects are put along a route, at random."""
+"""The rule by which studies put one object beside a lane; protocols rest on it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from scipy.stats import truncnorm
 
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.ranges import NonNegative, Share, checked
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -22,37 +20,6 @@ Ground = Callable[[np.ndarray], np.ndarray]
 
 _TRIES = 64
 _HALF_CAR_M = 0.9
-
-
-@dataclass(frozen=True)
-@checked("Scatter")
-class Scatter:
-    """Deviations of vehicles from the lane centre, normal and cut.
-
-    Args:
-        lateral_sd_m, lateral_max_m: offset to the left, metres; 0 for none.
-        heading_sd, heading_max: angle to the route, radians; 0 for none.
-        close_share: share of the vehicles whose deviations are a fifth of the drawn.
-    """
-
-    lateral_sd_m: NonNegative = 0.5
-    lateral_max_m: NonNegative = 1.5
-    heading_sd: NonNegative = 0.12
-    heading_max: NonNegative = 0.4
-    close_share: Share = 0.4
-
-    def states(
-        self, route: Route, arc: np.ndarray, rng: np.random.Generator
-    ) -> np.ndarray:
-        """Draw states (n, 3) at arc lengths (n,), metres."""
-        count = len(arc)
-        factor = np.where(rng.uniform(size=count) < self.close_share, 0.2, 1.0)
-        lateral = cut_normal(self.lateral_sd_m, self.lateral_max_m, count, rng)
-        heading = cut_normal(self.heading_sd, self.heading_max, count, rng)
-        states = route.pose_at(arc, factor * lateral)
-        # the route's own heading jumps at the vertices of the polyline
-        states[:, 2] = route.heading_at(arc) + factor * heading
-        return states
 
 
 @dataclass(frozen=True)
@@ -137,13 +104,3 @@ def _first_below(scene: Any, points: np.ndarray, top: float) -> np.ndarray:
     x, y = upload_rows(mi.Point2f, points[:, :2])
     ray = mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1))
     return top - scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
-
-
-def cut_normal(
-    sd: float, largest: float, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Draw (count,) normal numbers of standard deviation `sd` within +-largest."""
-    if sd == 0 or largest == 0:
-        return np.zeros(count)
-    cut = largest / sd
-    return sd * np.asarray(truncnorm.rvs(-cut, cut, size=count, random_state=rng))

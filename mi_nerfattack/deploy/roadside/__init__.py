@@ -1,0 +1,1 @@
+"""Where objects stand beside the routes of a scene, drawn at random."""

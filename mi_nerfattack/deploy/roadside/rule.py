@@ -1,0 +1,212 @@
+"""The rule that puts objects where such things stand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
+from mi_nerfattack.deploy.roadside.surroundings import KERB_M, Surroundings
+from mi_nerfattack.deploy.roadside.view import Seen, look
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.ranges import Count, NonNegative, Positive, Seconds, checked
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.vehicle.route.route import Route
+
+_TRIES = 32  # places of an object that are tried together,
+_LOOKED_AT = 8  # and of those that are free, looked at together
+_ROUNDS = 6
+_AHEAD_S = 4.0  # of driving, from a drive's end to the farthest objects
+_ALONG = math.radians(4)  # long objects stand along the road, but for this,
+_BEND = math.radians(5)  # where it turns by less than this over their length
+
+
+@dataclass(frozen=True)
+@checked("Roadside")
+class Roadside:
+    """Where such things stand: beside the road, on the ground, free, and in view.
+
+    Objects stand off the lanes of all routes, beyond the kerb where a route has one,
+    on even ground with nothing above it, clear of walls and of one another. One whose
+    occupied box is at least 1.5 times as long as wide stands along the road to 4
+    degrees, either way round; others at any angle. Each is seen from a drive along the
+    lane's centre: in frames of `view_s` together, not necessarily in a row, about
+    `view_px` pixels or more show a part of it that neither the scene nor another object
+    hides, as 64 of its points tell.
+
+    Args:
+        scales: range of the factor to the natural size, of each object in turns.
+        gap_m: range of the distance from the road's edge (the kerb, or else the lane's
+            edge) to an object's near side, metres; the lower end holds to all lanes.
+        clearance_m: from walls, poles and other objects, metres.
+        view_s: seconds of the drive in which an object is seen.
+        view_px: pixels in which it is seen.
+    """
+
+    scales: tuple[tuple[Positive, Positive], ...] = ((1.0, 1.0),)
+    gap_m: tuple[NonNegative, NonNegative] = (0.3, 2.5)
+    clearance_m: NonNegative = 0.3
+    view_s: Seconds = 1.0
+    view_px: Count = 12
+
+    def __post_init__(self) -> None:
+        """Check the order of the ranges."""
+        for low, high in (*self.scales, self.gap_m):
+            if low > high:
+                raise InputError(f"Roadside: {low} to {high}; the smaller comes first")
+        if not self.scales:
+            raise InputError("Roadside.scales: none; at least one range")
+
+    def draw(
+        self,
+        fields: Sequence[GridField],
+        surroundings: Surroundings,
+        route: Route,
+        stretch: tuple[float, float],
+        rng: np.random.Generator,
+        kinds: Sequence[int] | None = None,
+    ) -> list[Pose]:
+        """Draw a pose of each object.
+
+        Args:
+            fields: upright, standing on z = 0 of their frames.
+            surroundings: scene, lanes and camera.
+            route: that is driven.
+            stretch: arc lengths between which it is driven, metres.
+            rng: source of all draws.
+            kinds: number of each in `scales`, which repeat; 0, 1, 2 ... by default.
+
+        Raises:
+            InputError: no place found for all of them.
+        """
+        poses = self.find(fields, surroundings, route, stretch, rng, kinds)
+        found = [pose for pose in poses if pose is not None]
+        if len(found) < len(fields):
+            begin, end = stretch
+            raise InputError(
+                f"route {route.name!r}: places for {len(found)} of {len(fields)} "
+                f"objects, off the lanes, on free ground and in view for {self.view_s} "
+                f"s of a drive from {begin:.1f} to {end:.1f} m of it; ask for fewer or "
+                "other sizes of them, or move routes or obstacles"
+            )
+        return found
+
+    def find(
+        self,
+        fields: Sequence[GridField],
+        surroundings: Surroundings,
+        route: Route,
+        stretch: tuple[float, float],
+        rng: np.random.Generator,
+        kinds: Sequence[int] | None = None,
+    ) -> list[Pose | None]:
+        """Draw as :meth:`draw`, with None for objects that find no place."""
+        eyes = surroundings.drive(route, *stretch)
+        placed: list[tuple[Stands, Seen]] = []
+        poses: list[Pose | None] = []
+        for kind, field in zip(kinds or range(len(fields)), fields, strict=True):
+            shape, scales = Shape.of(field), self.scales[kind % len(self.scales)]
+            pose = None
+            for _ in range(_ROUNDS):
+                stands = self._draw_stands(
+                    shape, scales, surroundings, route, stretch, rng
+                )
+                stands = self._free(stands, surroundings, [item for item, _ in placed])
+                chosen = self._seen(stands, surroundings, eyes, placed)
+                if chosen is not None:
+                    placed.append(chosen)
+                    pose = chosen[0].pose(0)
+                    break
+            poses.append(pose)
+        return poses
+
+    def _draw_stands(
+        self,
+        shape: Shape,
+        scales: tuple[float, float],
+        surroundings: Surroundings,
+        route: Route,
+        stretch: tuple[float, float],
+        rng: np.random.Generator,
+    ) -> Stands:
+        """Draw places beside the road; those without ground drop out."""
+        scale = rng.uniform(*scales, _TRIES)
+        ahead = _AHEAD_S * route.speed_ms
+        arc = rng.uniform(stretch[0], stretch[1] + ahead, _TRIES)
+        side = rng.choice([-1.0, 1.0], _TRIES)
+        gap = rng.uniform(*self.gap_m, _TRIES)
+        turn = rng.uniform(-1, 1, _TRIES)
+        back = np.pi * rng.integers(2, size=_TRIES)
+        if shape.is_long:
+            turn = _ALONG * turn + back + (shape.size[0] < shape.size[1]) * np.pi / 2
+        else:
+            turn *= np.pi
+        half = scale[:, None] * shape.size[:2] / 2
+        reach = half[:, 0] * np.abs(np.sin(turn)) + half[:, 1] * np.abs(np.cos(turn))
+        lateral = surroundings.kerb(route, arc, side) + gap + reach
+        known = np.isfinite(lateral)
+        if shape.is_long:
+            ends = arc + half.max(1) * [[-1.0], [1.0]]
+            known &= np.abs(np.diff(route.heading_at(ends), axis=0)[0]) < _BEND
+        arc, lateral = arc[known], (side * lateral)[known]
+        centre = route.pose_at(arc, lateral)[:, :2]
+        ground = surroundings.height(centre)
+        lane = surroundings.height(route.pose_at(arc)[:, :2])
+        stands = Stands(
+            shape, centre, ground, route.heading_at(arc) + turn[known], scale[known]
+        )
+        return stands[np.abs(ground - lane) < KERB_M[1]]
+
+    def _free(
+        self, stands: Stands, surroundings: Surroundings, placed: Sequence[Stands]
+    ) -> Stands:
+        """Keep what stands off the lanes, on free ground, clear of other objects."""
+        for other in placed:
+            stands = stands[stands.apart(other, self.clearance_m)]
+        if not len(stands):
+            return stands
+        step = float(min(0.1, stands.half.min() / 2))
+        outline = stands.lattice(5 * step)
+        stands = stands[~surroundings.on_lanes(outline, self.gap_m[0])]
+        if not len(stands):
+            return stands
+        return stands[surroundings.stand_free(stands, step, self.clearance_m)]
+
+    def _seen(
+        self,
+        stands: Stands,
+        surroundings: Surroundings,
+        eyes: np.ndarray,
+        placed: list[tuple[Stands, Seen]],
+    ) -> tuple[Stands, Seen] | None:
+        """Return the first that is seen and leaves the others in view; None for none.
+
+        Of the others, `placed` then has what is left in view.
+        """
+        for own, seen in self._views(stands, surroundings, eyes):
+            for other, _ in placed:
+                seen = seen.without(other)
+            if not self._long_enough(seen, surroundings.period):
+                continue
+            others = [(other, view.without(own)) for other, view in placed]
+            if all(self._long_enough(v, surroundings.period) for _, v in others):
+                placed[:] = others
+                return own, seen
+        return None
+
+    def _views(
+        self, stands: Stands, surroundings: Surroundings, eyes: np.ndarray
+    ) -> Iterator[tuple[Stands, Seen]]:
+        """Look at boxes, some at a time."""
+        for start in range(0, len(stands), _LOOKED_AT):
+            some = stands[start : start + _LOOKED_AT]
+            for row, seen in enumerate(look(surroundings, eyes, some)):
+                yield some[row : row + 1], seen
+
+    def _long_enough(self, seen: Seen, period: float) -> bool:
+        frames = math.ceil(self.view_s / period - 1e-6)
+        return int((seen.pixels() >= self.view_px).sum()) >= frames

@@ -1,0 +1,116 @@
+"""In which frames of a drive objects are seen, and how large."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_nerfattack.deploy.roadside.footprint import Stands
+from mi_nerfattack.deploy.roadside.surroundings import Surroundings
+from mi_nerfattack.render.camera.distortion import distort, undistort
+from mi_nerfattack.render.camera.intrinsics import Camera
+
+_NEAREST_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points of one object that are seen in the frames of a drive, k of them.
+
+    Attributes:
+        frames: of the drive.
+        frame: (k,), number of the frame.
+        image: (k, 2), right and down in the image, pixels.
+        eye: (k, 3), where the camera is, metres.
+        point: (k, 3), metres.
+    """
+
+    frames: int
+    frame: np.ndarray
+    image: np.ndarray
+    eye: np.ndarray
+    point: np.ndarray
+
+    def pixels(self) -> np.ndarray:
+        """Estimate in how many pixels of each frame the object is seen, (frames,).
+
+        Those with a point in them are counted. An area of w by h pixels touches
+        (w + 1) (h + 1) of them on average, which is taken off.
+        """
+        touched = np.zeros(self.frames)
+        if not len(self.frame):
+            return touched
+        cells = np.floor(self.image).astype(int)
+        order = np.lexsort((cells[:, 1], cells[:, 0], self.frame))
+        frame, cells, image = self.frame[order], cells[order], self.image[order]
+        fresh = (np.diff(cells, axis=0, prepend=-1) != 0).any(1)
+        first = np.flatnonzero(np.diff(frame, prepend=-1))
+        fresh[first] = True
+        span = np.maximum.reduceat(image, first) - np.minimum.reduceat(image, first)
+        count = np.add.reduceat(fresh.astype(int), first)
+        touched[frame[first]] = count * (span / (span + 1)).prod(1)
+        return touched
+
+    def without(self, box: Stands) -> Seen:
+        """Leave out the points behind the first of some boxes."""
+        rows = ~box.hides(self.eye, self.point)
+        parts = ("frame", "image", "eye", "point")
+        return replace(self, **{name: getattr(self, name)[rows] for name in parts})
+
+
+def look(
+    surroundings: Surroundings, poses: np.ndarray, stands: Stands
+) -> Iterator[Seen]:
+    """Find the points of each box that the scene does not hide, box by box.
+
+    Args:
+        surroundings: scene and camera.
+        poses: camera_to_world (m, 4, 4).
+        stands: the boxes.
+    """
+    points = stands.body()
+    turns, eyes = poses[:, :3, :3], poses[:, :3, 3]
+    # one product for all frames: (n, points, m, 3)
+    local = points @ turns.transpose(1, 0, 2).reshape(3, -1)
+    local = local.reshape(*points.shape[:2], *eyes.shape)
+    local -= (eyes[:, None] @ turns)[:, 0]
+    image, inside = project(surroundings.camera, local)
+    box, which, frame = np.nonzero(inside)
+    eye, point = eyes[frame], points[box, which]
+    open_ = surroundings.visible(eye, point) if len(box) else np.zeros(0, bool)
+    for row in range(len(stands)):
+        mine = open_ & (box == row)
+        where = image[box[mine], which[mine], frame[mine]]
+        yield Seen(len(poses), frame[mine], where, eye[mine], point[mine])
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where points are in the image, and whether they are in it.
+
+    Args:
+        camera: intrinsics.
+        points: (..., 3), metres, in the camera's frame.
+
+    Returns:
+        (..., 2), right and down, pixels, and (...,).
+    """
+    depth = np.maximum(points[..., 2], _NEAREST_M)
+    x, y = points[..., 0] / depth, points[..., 1] / depth
+    inside = points[..., 2] > _NEAREST_M
+    if camera.is_distorted:  # beyond the image it may fold back into it
+        across, down = _border(camera)
+        inside &= (np.abs(x) <= across) & (np.abs(y) <= down)
+        x, y = distort(x, y, *camera.distortion)
+    u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
+    inside &= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return np.stack([u, v], -1), inside
+
+
+def _border(camera: Camera) -> tuple[float, float]:
+    """Return the largest undistorted |x| and |y| of the image's border."""
+    u, v = np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33)
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    x, y = undistort(x, y, *camera.distortion)
+    return float(np.abs(x).max()), float(np.abs(y).max())
