@@ -14,7 +14,7 @@ import numpy as np
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.io import exr, files
-from mi_nerfattack.report.plots.strip import first_person_strip
+from mi_nerfattack.report.plots.strip import aligned_steps, first_person_strip
 from mi_nerfattack.rollout.drive import CASES, NO_OBJECT, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
@@ -41,9 +41,8 @@ def write_pictures(
     rows: dict[str, list[np.ndarray]] = {}
     nominal = [d for d in drives if d.run == 0 and d.case in looks]
     nominal.sort(key=lambda d: (environment_order(d.environment), CASES.index(d.case)))
-    longest = max(nominal, key=lambda d: len(d.controls))
-    columns = _steps(longest, STRIP_FRAMES)
-    for drive in nominal:
+    places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)
+    for drive, columns in zip(nominal, passed, strict=True):
         if look := looks[drive.case]:
             world.show(look)
         environment = world.open(drive.environment, empty=look is None)
@@ -52,14 +51,13 @@ def write_pictures(
             written = _steps(drive, EXR_FRAMES)
             wanted = {*columns, *written}
             for step, frame in _again(environment, world, drive, wanted):
-                if step in columns:
-                    row.append(frame.image)
+                row += [frame.image] * columns.count(step)
                 if step in written:
                     _write_frame(output / "frames", world, drive, step, frame)
         finally:
             environment.close()
-    times = [step * world.scenario.vehicle.dt_s for step in columns]
-    first_person_strip(output / "strip.png", rows, times)
+    titles = [f"{place:.1f} m" for place in places]
+    first_person_strip(output / "strip.png", rows, titles)
 
 
 def _steps(drive: Drive, count: int) -> list[int]:

@@ -7,17 +7,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
+from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
 from mi_nerfattack.evaluation.textures import texture_figures
 from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.attribution import attribute, write_attribution
+from mi_nerfattack.experiment.checks.before_attack import mesh_scene
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.pictures import write_pictures
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.plots import drives as plots
 from mi_nerfattack.report.table import write_steps
@@ -25,6 +31,8 @@ from mi_nerfattack.rollout.drive import ATTACK, OWN, Drive, Lane
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World, object_footprints
+
+_GROUND_PX = 400  # of the longer edge of pictures from above
 
 
 @dataclass(frozen=True)
@@ -127,6 +135,7 @@ def _write_images(
     world, limit = done.world, done.lane.wheel_m
     images = _write_plots(output, world, done.driven, history, limit)
     unit = world.scenario.vehicle.car().control_unit
+    images["Trajectories over the ground"] = _write_triptych(output, done)
     images |= write_control_changes(output, done.replayed, unit)
     names = [item.id for item in world.scenario.objects]
     found = attribute(done.attack, names, limit, on_step)
@@ -209,3 +218,34 @@ def _write_plots(
     plots.errors(images["Cross-track error"], drives, limit)
     plots.convergence(images["Convergence of the attack"], history)
     return images
+
+
+def _write_triptych(output: Path, done: Finished) -> Path:
+    """Draw unperturbed, surrogate and transferred drives over the rendered ground."""
+    world, route = done.world, done.world.route
+    others = [x for x in world.deployments if not world.is_open_loop(x)]
+    pairs = [
+        (OWN, [*others, SURROGATE][0]),
+        *((ATTACK, x) for x in [SURROGATE, *others]),
+    ]
+    groups = [
+        [d for d in done.driven if (d.case, d.environment) == pair] for pair in pairs
+    ]
+    points = [d.states[:, :2] for group in groups for d in group]
+    seen = np.concatenate([*points, *object_footprints(world)])
+    overhead = Overhead.covering(seen, route.lane_width_m, _GROUND_PX)
+    scene = mesh_scene(world)
+    bare = None if scene is None else scene_above(scene, overhead, points[0], 4)
+    panels = []
+    for (case, label), drives in zip(pairs, groups, strict=True):
+        world.show(done.look(case))
+        if label == SURROGATE or bare is None:
+            ground = surrogate_above(world.surrogate, overhead)
+        else:
+            objects = world.surrogate.objects
+            ground = Paster(overhead.camera, objects).paste(bare).image
+        panels.append(plots.Panel(drives, ground, object_footprints(world)))
+    world.show(done.look(ATTACK))
+    path, lane = output / "triptych.png", (route.lane_width_m, done.lane.wheel_m)
+    plots.triptych(path, panels, overhead, route.points, *lane)
+    return path

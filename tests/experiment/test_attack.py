@@ -73,7 +73,7 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
         assert metadata["scenario"] == "kill"
         bare, _ = read_layers(output / "frames" / f"{environment}_no_object_0000.exr")
         assert "object" not in bare
-    plots = ("overhead", "errors", "convergence", "strip")
+    plots = ("overhead", "triptych", "errors", "convergence", "strip")
     for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000
     assert "<title>kill</title>" in (output / "report.html").read_text()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -12,13 +11,11 @@ import numpy as np
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
 from mi_nerfattack.render.camera.intrinsics import ray_lengths
 from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.render.pathtrace.views import require_colour
-from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.surroundings import Clip
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.state import to_state
@@ -61,20 +58,17 @@ def scene_above(
     scene: Any,
     overhead: Overhead,
     open_at: np.ndarray,
-    objects: Sequence[PosedField] = (),
     spp: int = 16,
-) -> np.ndarray:
+) -> CameraFrame:
     """Render a Mitsuba scene from above; what hides the open ground is left out.
+
+    A `Paster` of the same camera puts objects into the frame.
 
     Args:
         scene: `mi.Scene`, metric, z up.
         overhead: camera.
         open_at: (n, 2), metres, points of the ground to see: below a ceiling, too.
-        objects: pasted as by `Paster`.
         spp: samples per pixel.
-
-    Returns:
-        (height, width, 3), uint8, sRGB.
     """
     require_colour()
     camera, pose = overhead.camera, overhead.camera_to_world
@@ -84,15 +78,12 @@ def scene_above(
     sensor = mi.load_dict({**description, **clip})
     image: Any = mi.render(scene, sensor=sensor, spp=spp, seed=mi.UInt32(0))
     linear = np.array(image)[..., :3]
-    if not objects:
-        return linear_to_uint8(linear)
     rays = PixelRays(camera).at(pose)
     start = mi.Float((near * ray_lengths(camera)).ravel().tolist())
     ray = mi.Ray3f(rays.origin + start * rays.direction, rays.direction)
     t = start + scene.ray_intersect_preliminary(ray, coherent=True).t
     depth = dr.select(dr.isfinite(t), t, dr.inf).numpy().reshape(linear.shape[:2])
-    frame = CameraFrame(linear_to_uint8(linear), depth, pose, linear)
-    return Paster(camera, objects).paste(frame).image
+    return CameraFrame(linear_to_uint8(linear), depth, pose, linear)
 
 
 def _lid(scene: Any, points: np.ndarray, from_m: float = 2.0) -> float:

@@ -16,6 +16,7 @@ from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.views.above import scene_above, surrogate_above
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
+from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.experiment.checks.before_attack import (
     first_findings,
@@ -181,8 +182,8 @@ class Check:
             objects = world.surrogate.objects
             near = world.route.pose_at(np.array(overlay.driven))[:, :2]
             name = f"{world.scenario.scene.deployment}, from above"
-            image = scene_above(scene, overhead, near, objects, _SPP)
-            grounds[name] = image
+            bare = scene_above(scene, overhead, near, _SPP)
+            grounds[name] = Paster(overhead.camera, objects).paste(bare).image
             camera, mount = from_fov(*_CHASE), chase_mount(overlay.car_width_m)
             view = MitsubaView(scene, camera, _SPP)
             view.show(objects)

@@ -7,6 +7,7 @@ with different widths and dashes too. Figures are 1200 pixels wide.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 
 from mi_nerfattack.evaluation.metrics import environment_order
+from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, chart, save
 from mi_nerfattack.rollout.drive import (
     ATTACK,
@@ -94,6 +97,87 @@ def overhead(
             axis.set_xlabel("x (m)")
             axis.set_ylabel("y (m)")
         _legend_below(figure, _map_handles(drives, bool(object_footprints), limit))
+        save(path, figure)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Drives of a case in an environment, and what lies beneath them.
+
+    Attributes:
+        drives: of one environment and case.
+        ground: (h, w, 3), uint8, rendered from above with the objects in it.
+        footprints: corners (n, 2) of each object on the ground, metres.
+    """
+
+    drives: Sequence[Drive]
+    ground: np.ndarray
+    footprints: Sequence[np.ndarray]
+
+    @property
+    def title(self) -> str:
+        """Case and environment."""
+        first = self.drives[0]
+        case = "unperturbed" if first.case == OWN else _LABELS[first.case]
+        return f"{case}, {first.environment}"
+
+
+def triptych(
+    path: str | Path,
+    panels: Sequence[Panel],
+    overhead: Overhead,
+    route_points: np.ndarray,
+    lane_width_m: float,
+    limit: float,
+) -> None:
+    """Plot trajectories over rendered ground, a panel per case and environment.
+
+    Args:
+        path: PNG file.
+        panels: side by side.
+        overhead: camera of all grounds.
+        route_points: (n, 2), lane centre, metres.
+        lane_width_m: lane width, metres.
+        limit: departure limit, metres; steps beyond are marked with crosses.
+
+    Source: appendix, figure C.3.
+    """
+    extent = left, right, bottom, top = overhead.extent
+    with matplotlib.rc_context(RC):
+        figure, axes = _map_panels(
+            len(panels), np.array([left, bottom]), np.array([right, top])
+        )
+        for k, (axis, panel) in enumerate(zip(axes, panels, strict=True)):
+            axis.imshow(panel.ground, extent=extent, interpolation="nearest")
+            for border in _borders(route_points, lane_width_m):
+                axis.plot(*border.T, color="white", linewidth=0.9, linestyle="--")
+            for footprint in panel.footprints:
+                axis.fill(*footprint.T, fill=False, edgecolor=_OBJECT, linewidth=1.5)
+            for drive in panel.drives:
+                style = _style(drive.case, linestyle="-")
+                around = [
+                    withStroke(linewidth=style["linewidth"] + 1.5, foreground="w")
+                ]
+                axis.plot(*drive.states[:, :2].T, path_effects=around, **style)
+                out = drive.states[1:][drive.departed(limit)]
+                axis.plot(out[:, 0], out[:, 1], **_cross(drive.case))
+            axis.set_xlim(left, right)
+            axis.set_ylim(bottom, top)
+            axis.set_aspect("equal")
+            axis.set_title(f"({chr(97 + k)}) {panel.title}", loc="left")
+            axis.set_xlabel("x (m)")
+        axes[0].set_ylabel("y (m)")
+        drives = [drive for panel in panels for drive in panel.drives]
+        handles = [
+            Line2D([], [], label="drive, unperturbed", **_style(OWN)),
+            Line2D([], [], label="drive, attack", **_style(ATTACK, linestyle="-")),
+            Line2D([], [], color=_CENTRE, linestyle="--", label="lane borders"),
+            Patch(fill=False, edgecolor="#c9a800", label="object's box"),
+        ]
+        if any(np.any(drive.departed(limit)) for drive in drives):
+            label = f"departed (> {limit:.2f} m)"
+            handles.append(Line2D([], [], label=label, **_cross(ATTACK)))
+        _legend_below(figure, handles)
         save(path, figure)
 
 
@@ -238,14 +322,19 @@ def _map_panels(count: int, low: np.ndarray, high: np.ndarray) -> tuple[Figure, 
 
 
 def _draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
-    tangent = np.gradient(route, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    offset = lane_width_m / 2 * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    left, right = route + offset, route - offset
+    left, right = _borders(route, lane_width_m)
     axis.fill(*np.concatenate([left, right[::-1]]).T, facecolor=_LANE, zorder=0)
     for edge in (left, right):
         axis.plot(*edge.T, color="#b5b5b5", linewidth=0.8, zorder=1)
     axis.plot(*route.T, color=_CENTRE, linewidth=1, linestyle="--", zorder=2)
+
+
+def _borders(route: np.ndarray, lane_width_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the left and the right border of a lane, (n, 2) each."""
+    tangent = np.gradient(route, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    offset = lane_width_m / 2 * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    return route + offset, route - offset
 
 
 def _cross(case: str) -> dict[str, Any]:

@@ -166,7 +166,7 @@ def routes_picture(
     overhead = overlay.overhead(560)
     scene = load_scene(scene_path)
     middles = [route.pose_at(route.length / 2) for route in routes]
-    image = scene_above(scene, overhead, np.stack(middles)[:, :2], spp=4)
+    image = scene_above(scene, overhead, np.stack(middles)[:, :2], spp=4).image
     grounds = {f"{Path(scene_path).name}, from above": image}
     if sensor is not None:
         above = surrogate_above(sensor, overhead)

@@ -1,4 +1,4 @@
-"""A strip of first-person frames: one row per drive, one column per time."""
+"""A strip of first-person frames: one row per drive, one column per place."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.vehicle.route.route import Route
 
 SCALE = 2
 GAP_PX = 6
@@ -21,18 +23,18 @@ _BACKGROUND, _INK, _ABSENT = (255, 255, 255), (20, 20, 20), (225, 225, 225)
 def first_person_strip(
     path: str | Path,
     rows: Mapping[str, Sequence[np.ndarray]],
-    times_s: Sequence[float],
+    titles: Sequence[str],
 ) -> None:
     """Write a labelled grid of frames as an image.
 
     Pixels are doubled, not interpolated, so that the picture shows what the policy
-    saw. A row shorter than the times (the drive ended) is filled with plain grey.
+    saw. A row shorter than the titles (the drive ended) is filled with plain grey.
 
     Args:
         path: PNG or JPEG file.
         rows: frames of each row by label, sRGB, uint8, (H, W, 3), those of a row of
             one size; a line break in a label starts another line.
-        times_s: time of each column, seconds.
+        titles: of the columns.
     """
     sizes = [frames[0].shape[:2] for frames in rows.values()]
     width = max(width for _, width in sizes)
@@ -40,18 +42,17 @@ def first_person_strip(
     label_px = 2 * GAP_PX + max(_text_width(font, label) for label in rows)
     header_px = FONT_PX + 2 * GAP_PX
     column_px, row_px = SCALE * width + GAP_PX, [SCALE * h + GAP_PX for h, _ in sizes]
-    size = (label_px + column_px * len(times_s), header_px + sum(row_px))
+    size = (label_px + column_px * len(titles), header_px + sum(row_px))
     sheet = Image.new("RGB", size, _BACKGROUND)
     draw = ImageDraw.Draw(sheet)
-    for column, time in enumerate(times_s):
+    for column, text in enumerate(titles):
         centre = label_px + column * column_px + SCALE * width // 2
-        text = f"{time:.1f} s"
         draw.text((centre, header_px // 2), text, _INK, font, anchor="mm")
     top = header_px
     for (label, frames), height in zip(rows.items(), row_px, strict=True):
         middle = (GAP_PX, top + height // 2)
         draw.text(middle, label, _INK, font, anchor="lm", spacing=GAP_PX)
-        for column in range(len(times_s)):
+        for column in range(len(titles)):
             left = label_px + column * column_px
             if column < len(frames):
                 sheet.paste(_enlarged(frames[column]), (left, top))
@@ -60,6 +61,33 @@ def first_person_strip(
                 draw.rectangle(((left, top), corner), fill=_ABSENT)
         top += height
     files.write_image(path, np.asarray(sheet))
+
+
+def aligned_steps(
+    route: Route, drives: Sequence[Drive], count: int
+) -> tuple[np.ndarray, list[list[int]]]:
+    """Choose the steps at which drives pass the same places on their route.
+
+    Args:
+        route: of all drives.
+        drives: at least one.
+        count: of places, equally spaced from the first start to the farthest end.
+
+    Returns:
+        the places, arc lengths (count,) in metres; and of each drive the step nearest
+        to each place, in order, without the places that it ends before.
+    """
+    arcs = [route.project_numpy(drive.states[:-1]).arc_length for drive in drives]
+    if route.closed:
+        arcs = [np.unwrap(arc, period=route.length) for arc in arcs]
+    low, high = min(arc[0] for arc in arcs), max(arc.max() for arc in arcs)
+    places, steps = np.linspace(low, high, count), []
+    for arc in arcs:
+        last = arc.max() + np.abs(np.diff(arc, append=arc[-1])).max() + 1e-6
+        reached = places[places <= last]
+        nearest = np.abs(arc - reached[:, None]).argmin(1)
+        steps.append(np.maximum.accumulate(nearest).tolist())
+    return places, steps
 
 
 def _enlarged(frame: np.ndarray) -> Image.Image:

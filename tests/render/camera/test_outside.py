@@ -71,7 +71,7 @@ def test_a_room_is_seen_below_its_ceiling():
     )
     corners = np.array([[-4.0, -3.0], [4.0, 3.0]])
     overhead = Overhead.covering(corners, 0.0, 80)
-    image = scene_above(scene, overhead, np.zeros((1, 2)), spp=4).astype(int)
+    image = scene_above(scene, overhead, np.zeros((1, 2)), spp=4).image.astype(int)
     assert image.shape == (60, 80, 3)
     red = image[..., 0] > 2 * image[..., 2] + 20
     rows, columns = np.nonzero(red)
