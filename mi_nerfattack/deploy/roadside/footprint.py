@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera.pose import Pose
 
@@ -30,8 +31,14 @@ class Shape:
 
     @staticmethod
     def of(field: GridField) -> Shape:
-        """Measure a field."""
+        """Measure a field.
+
+        Raises:
+            InputError: nothing of it is occupied.
+        """
         cells = field.occupancy.cells
+        if not cells.any():
+            raise InputError("object: no cell of its field is occupied; make it anew")
         cell = (field.upper - field.lower) / cells.shape
         occupied, rng = np.flatnonzero(cells), np.random.default_rng(0)
         chosen = occupied[rng.integers(len(occupied), size=_POINTS)]

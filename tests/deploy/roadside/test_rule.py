@@ -22,11 +22,17 @@ from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.deploy.roadside.footprint import Shape, Stands
 from mi_nerfattack.deploy.roadside.rule import Roadside
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
+from mi_nerfattack.deploy.roadside.view import project
 from mi_nerfattack.deploy.sites import PlaceSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.render.camera.intrinsics import (
+    from_fov,
+    generate_rays,
+    pose_arrays,
+)
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -96,6 +102,25 @@ def test_boxes_hide_what_is_behind_them():
     assert hidden.tolist() == [True, False, False, False, False]
     turned = stands((0, 0, np.pi / 2)).hides(eye, np.array([[5.0, 2.5, 0.5]] * 5))
     assert turned.all()  # 4 m wide across the view
+
+
+def test_points_are_where_a_lens_shows_them():
+    """Along the ray of each pixel's centre; far outside, where the lens folds, none."""
+    camera = replace(from_fov(40, 20, 90.0), k1=-0.1, p1=0.005)
+    rays = generate_rays(camera, *pose_arrays(np.eye(4)[None]), 1)[1].numpy().T
+    image, inside = project(camera, 7.0 * rays)
+    assert inside.all()
+    u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
+    np.testing.assert_allclose(image, np.stack([u, v], -1).reshape(-1, 2), atol=1e-3)
+    outside = np.array([[2.8, 0, 1], [0, 1, 1], [0.1, 0.1, -1]], float)
+    assert not project(camera, outside)[1].any()
+
+
+def test_an_object_without_matter_is_refused():
+    field = small_grid()
+    field.occupy(Occupancy(np.zeros((4, 4, 4), bool)))
+    with pytest.raises(InputError, match="no cell of its field is occupied"):
+        draw([field], kerbed())
 
 
 def kerbed() -> Surroundings:
