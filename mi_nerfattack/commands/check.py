@@ -58,14 +58,14 @@ class Check:
             check = checks.Check(world, show)
             check.run(self.drives)
             show("drawing", 0, 1, "")
-            check.picture(picture)
+            drawn = picture if check.picture(picture) else None
             show("drawing", 1, 1, "")
             check.price()
         if self.json:
-            document = {**check.document(), "picture": str(picture)}
+            document = {**check.document(), "picture": drawn and str(drawn)}
             print(json.dumps(document, allow_nan=False))
         else:
             name = shlex.quote(str(self.scenario))
-            for line in checks.sentences(check, name, picture):
+            for line in checks.sentences(check, name, drawn):
                 print(line)
         return 1 if check.refused else 0

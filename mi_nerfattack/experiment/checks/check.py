@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,7 @@ class Check:
     drives: list[Drive] = field(default_factory=list)
     frames: dict[str, CameraFrame] = field(default_factory=dict)
     _period_s: dict[str, float] = field(default_factory=dict)
-    _open: dict[str, AbstractEnvironment] = field(default_factory=dict)
+    _open: tuple[str, AbstractEnvironment] | None = None
 
     def run(self, drives: bool = True) -> None:
         """Find what there is to find.
@@ -72,14 +71,17 @@ class Check:
         """
         world = self.world
         departure_limit(world.route.lane_width_m, world.scenario.vehicle.width_m)
-        with ExitStack() as stack:
-            for label in world.labels:
-                self._told(lambda label=label: self._begin(label, stack))
-            if drives and not self.refused:
+        try:
+            if drives:
                 self._told(self._drive)
             else:
                 self._take(route_findings(world))
                 self._take(place_findings(world))
+            for label in world.labels:
+                if label not in self.frames:
+                    self._told(lambda label=label: self._environment(label))
+        finally:
+            self._close()
         base = self.frames.get(SURROGATE)
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
@@ -87,21 +89,25 @@ class Check:
                 found = likeness_findings(camera, base, frame, label)
                 self.doubts += found
 
-    def _begin(self, label: str, stack: ExitStack) -> None:
-        """Open an environment and look once."""
-        environment = self.world.open(label)
-        stack.callback(environment.close)
-        world = self.world
-        seed = world.scenario.seed
-        self.frames[label] = environment.reset(world.route, world.initial[0], seed)
-        self._open[label] = environment
+    def _environment(self, label: str) -> AbstractEnvironment:
+        """Open an environment, one at a time, and look once."""
+        if self._open is None or self._open[0] != label:
+            self._close()
+            world = self.world
+            self._open = label, world.open(label)
+            start, seed = world.initial[0], world.scenario.seed
+            self.frames[label] = self._open[1].reset(world.route, start, seed)
+        return self._open[1]
+
+    def _close(self) -> None:
+        if self._open is not None:
+            self._open[1].close()
+        self._open = None
 
     def _drive(self) -> None:
-        found: list[Iterator[str]] = [first_findings(self.world, self._one)]
-        found.append(further_findings(self.world, self._one))
         try:
-            for findings in found:
-                self._take(findings)
+            for check in (first_findings, further_findings):
+                self._take(check(self.world, self._one))
         except (InputError, SetupError):
             self._take(place_findings(self.world))
             raise
@@ -129,21 +135,24 @@ class Check:
 
         start, seed = world.initial[run], world.scenario.seed + run
         how = world.policy, world.route, start, seed, horizon, on_step, case, run, label
-        found = drive(self._open[label], *how)
+        found = drive(self._environment(label), *how)
         self._period_s[label] = float(np.median(np.diff(times)))
         self.drives.append(found)
         return found
 
-    def _told(self, work: Callable[[], None]) -> None:
-        """Do something whose error is a reason to refuse."""
+    def _told(self, work: Callable[[], object]) -> bool:
+        """Do something whose error is a reason to refuse; tell whether it is done."""
         try:
             work()
         except (InputError, SetupError) as err:
-            self.refused.append(str(err))
+            self._take(iter([str(err)]))
+            return False
+        return True
 
     def _take(self, findings: Iterator[str]) -> None:
-        for line in findings:
-            self.refused.append(line)  # what was found before an error counts
+        for line in findings:  # what was found before an error counts
+            if line not in self.refused:
+                self.refused.append(line)
 
     def document(self) -> dict[str, Any]:
         """Return all that was found, as JSON takes it."""
@@ -166,8 +175,11 @@ class Check:
             },
         }
 
-    def picture(self, path: Path) -> None:
-        """Write the picture of the scenario."""
+    def picture(self, path: Path) -> bool:
+        """Write the picture of the scenario; tell whether it could be drawn."""
+        return self._told(lambda: self._picture(path))
+
+    def _picture(self, path: Path) -> None:
         world = self.world
         overlay = self._overlay()
         overhead = overlay.overhead(_LONGEST_PX)
@@ -181,7 +193,7 @@ class Check:
         if (scene := mesh_scene(world)) is not None:
             objects = world.surrogate.objects
             near = world.route.pose_at(np.array(overlay.driven))[:, :2]
-            name = f"{world.scenario.scene.deployment}, from above"
+            name = f"{world.scenario.scene.deployment.file.name}, from above"
             bare = scene_above(scene, overhead, near, _SPP)
             grounds[name] = Paster(overhead.camera, objects).paste(bare).image
             camera, mount = from_fov(*_CHASE), chase_mount(overlay.car_width_m)

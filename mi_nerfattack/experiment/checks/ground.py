@@ -90,8 +90,9 @@ def box_findings(world: World) -> Iterator[str]:
     out = np.any((local < field.lower) | (local > field.upper), axis=1)
     if out.any():
         size = pose.scale * (field.upper - field.lower)
+        place = world.scenario.scene
         yield (
-            f"the camera leaves the box of {world.scenario.scene.field}, of "
+            f"the camera leaves the box of {place.field or place.surrogate}, of "
             f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} m, "
             f"{_stretches(arc, out)} of route {world.route.name!r}: nothing is shown "
             "there; give a field of this place, or its scene.to_world"

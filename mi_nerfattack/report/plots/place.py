@@ -33,6 +33,7 @@ BORDER, CENTRE, START, END = "white", "#00E5FF", "#00C853", "#FF1744"
 OBJECT, CAMERA = "#FFEA00", "#FF6D00"
 _PARTS, _ARROWS = 240, 7  # of a route
 _REAR, _FRONT = 0.5, 1.9  # of a car's middle rear axle, in widths
+_TOLD = {"REFUSED": "#B00020", "LOOK AT": "#9A5B00"}
 _EDGE: Any = {"color": "black", "alpha": 0.6}
 
 
@@ -108,7 +109,7 @@ def place_picture(
     looks = looks or {}
     left, right, bottom, top = overhead.extent
     width_in = WIDTH_PX / DPI
-    lines = [line for text in told for line in _wrapped(text)]
+    lines = [(line, text) for text in told for line in _wrapped(text)]
     aspect = (top - bottom) / (right - left)
     map_in = min((width_in / len(grounds) - 0.6) * aspect, 7.0) + 0.85
     view_in, shapes = 0.0, []
@@ -135,8 +136,10 @@ def place_picture(
             for axis, (name, look) in zip(axes[0], looks.items(), strict=True):
                 _draw_look(axis, overlay, name, look)
         if lines:
-            for k, line in enumerate(lines):
-                rows[-1, 0].text(0.01, 1 - (k + 0.5) / len(lines), line, va="center")
+            for k, (line, text) in enumerate(lines):
+                colour = _TOLD.get(text.partition(":")[0], "black")
+                at = 0.01, 1 - (k + 0.5) / len(lines)
+                rows[-1, 0].text(*at, line, va="center", color=colour)
         save(path, figure)
 
 
