@@ -14,7 +14,9 @@ from helpers.kernels import nothing_compiled
 
 from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.deploy.views.above import surrogate_above
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
@@ -191,3 +193,25 @@ def test_what_is_refused(folder, change, message):
             inner["filename"] = str(folder / "sky.safetensors")
     with pytest.raises(InputError, match=message):
         sensor_of(description)
+
+
+def test_from_above_an_object_is_where_it_stands(folder):
+    """Another texture changes the pixels over its box alone, walls around or not."""
+    sensor = sensor_of(walled.scene_dict(folder))
+    posed = sensor.objects[1]
+    middle = posed.placed.translation[:2]
+    overhead = Overhead.covering(middle + [[-4.0, -3.0], [4.0, 3.0]], 0.0, 80)
+    seen = []
+    for colour in (-4.0, 4.0):
+        texture = np.full((sensor.fields[1].n_vertices, 3), colour, np.float32)
+        sensor.fields[1].set_parameter("texture", texture)
+        seen.append(surrogate_above(sensor, overhead).astype(int))
+    changed = np.argwhere(abs(seen[1] - seen[0]).max(-1) > 20)[:, ::-1] + 0.5
+    low, high = posed.field.lower, posed.field.upper
+    corners = np.array([[x[0], y[1], 0] for x in (low, high) for y in (low, high)])
+    world = posed.placed.scale * corners @ posed.placed.rotation.T
+    at = overhead.to_px(world[:, :2] + middle)
+    assert len(changed) > 20
+    assert (changed >= at.min(0) - 1).all() and (changed <= at.max(0) + 1).all()
+    size = at.max(0) - at.min(0)
+    assert (np.ptp(changed, axis=0) > 0.5 * size).all()
