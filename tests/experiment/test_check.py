@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers.camera_scenes import block
 
 from mi_nerfattack import cli
 from mi_nerfattack.deploy.environment import CameraFrame
@@ -86,11 +87,6 @@ def world(points, length_m=20.0) -> Any:
 def street():
     """Ground 40 m long, half of it 0.5 m higher, with a house at x = 15."""
     mi.set_variant("llvm_ad_rgb")
-    place = mi.ScalarTransform4f()
-
-    def block(at, half):
-        return {"type": "cube", "to_world": place.translate(at).scale(half)}
-
     return mi.load_dict(
         {
             "type": "scene",

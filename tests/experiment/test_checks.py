@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers.attack_jobs import checkpoint_of, contents, job, stop_at
+from helpers.camera_scenes import block
 from helpers.small_fields import homogeneous
 
 from mi_nerfattack import cli
@@ -102,10 +103,6 @@ def street():
     """Ground, a building 10 m high, a sign-board and a bridge."""
     mi.set_variant("llvm_ad_rgb")
     place = mi.ScalarTransform4f()
-
-    def block(at, half):
-        return {"type": "cube", "to_world": place.translate(at).scale(half)}
-
     return mi.load_dict(
         {
             "type": "scene",

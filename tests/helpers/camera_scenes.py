@@ -40,6 +40,12 @@ INTEGRATORS = {
 }
 
 
+def block(centre: list[float], half: list[float]) -> dict[str, Any]:
+    """Describe a box by its middle and half its sides, metres."""
+    place = mi.ScalarTransform4f().translate(centre).scale(half)
+    return {"type": "cube", "to_world": place}
+
+
 def film(**more: Any) -> dict[str, Any]:
     pixels = "luminance" if mi.is_monochromatic else "rgb"
     base = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}

@@ -111,8 +111,7 @@ class Stands:
             margin: metres.
         """
         half = self.half + margin
-        counts = np.clip(np.ceil(2 * half.max(0) / step), 2, 64).astype(int) + 1
-        sides = [np.linspace(-1, 1, count) for count in counts]
+        sides = [np.linspace(-1, 1, count) for count in points_along(half, step)]
         unit = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(1, -1, 2)
         return self.to_world(unit * half[:, None])
 
@@ -164,3 +163,13 @@ class Stands:
         safe = np.where(np.abs(way) < 1e-12, 1e-12, way)
         ends = np.sort([(-half - begin) / safe, (half - begin) / safe], axis=0)
         return ends[0].max(1).clip(0) < ends[1].min(1).clip(max=1)
+
+
+def points_along(half: np.ndarray, step: float) -> np.ndarray:
+    """Return how many points (2,) cover the longest of each side of boxes.
+
+    Args:
+        half: (n, 2), half the sides, metres.
+        step: metres between points, at most, unless a side had more than 64.
+    """
+    return np.clip(np.ceil(2 * half.max(0) / step), 2, 64).astype(int) + 1

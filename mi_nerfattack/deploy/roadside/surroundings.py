@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.upload import upload_rows
-from mi_nerfattack.deploy.roadside.footprint import Stands
+from mi_nerfattack.deploy.roadside.footprint import Stands, points_along
+from mi_nerfattack.deploy.views.rays import vertical_reach
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -49,7 +50,7 @@ class Surroundings:
         Args:
             points: (n, 2), metres.
         """
-        z = self._first_below(points, self._top)
+        z = self._top - vertical_reach(self.scene, points, self._top)
         return np.where(np.isfinite(z) & (z < HIGHEST_M), z, np.nan)
 
     def kerb(self, route: Route, arc: np.ndarray, side: np.ndarray) -> np.ndarray:
@@ -122,7 +123,7 @@ class Surroundings:
         box = self.scene.bbox()
         sides = [np.linspace(box.min[i], box.max[i], 18)[1:-1] for i in range(2)]
         points = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
-        seen = self._first_below(points, 100.0)
+        seen = 100.0 - vertical_reach(self.scene, points, 100.0)
         return float(seen.min()) - 0.1 if seen.min() > HIGHEST_M else 100.0
 
     @cached_property
@@ -144,7 +145,7 @@ class Surroundings:
         if not len(stands):
             return np.zeros(0, bool)
         half = stands.half + clearance
-        counts = np.clip(np.ceil(2 * half.max(0) / step), 2, 64).astype(int) + 1
+        counts = points_along(half, step)
         lines = []
         for axis in (0, 1):
             across = np.linspace(-1, 1, counts[1 - axis])
@@ -172,10 +173,3 @@ class Surroundings:
         )
         ray.maxt = mi.Float((share * length).tolist())
         return self.scene.ray_test(ray, coherent=False).numpy()
-
-    def _first_below(self, points: np.ndarray, top: float) -> np.ndarray:
-        """Return the first surface (n,) below a height at points; -inf for none."""
-        x, y = upload_rows(mi.Point2f, points[:, :2])
-        ray = mi.Ray3f(mi.Point3f(x, y, top), mi.Vector3f(0, 0, -1))
-        found = self.scene.ray_intersect_preliminary(ray, coherent=False)
-        return top - found.t.numpy()

@@ -9,9 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
-from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.deploy.environment import CameraFrame
-from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.deploy.views.rays import PixelRays, vertical_reach
 from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
 from mi_nerfattack.render.camera.intrinsics import ray_lengths
 from mi_nerfattack.render.camera.outside import Overhead
@@ -89,7 +88,5 @@ def scene_above(
 def _lid(scene: Any, points: np.ndarray, from_m: float = 2.0) -> float:
     """Return the height below which points (n, 2) are seen from above, metres."""
     top = float(scene.bbox().max[2]) + 1.0
-    start = np.column_stack([points, np.full(len(points), from_m)])
-    ray = mi.Ray3f(upload_rows(mi.Point3f, start), mi.Vector3f(0, 0, 1))
-    free = scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
+    free = vertical_reach(scene, points, from_m, up=True)
     return min(top, from_m + float(free.min()) - 0.05)

@@ -1,4 +1,4 @@
-"""One ray through the centre of every pixel of a camera at any pose."""
+"""Rays through the pixels of a camera at any pose, and straight up or down."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
 from mi_nerfattack.render.rays import Rays
 
@@ -43,3 +44,19 @@ class PixelRays:
     def _state(self, origin: mi.Point3f, columns: Any) -> list[Any]:
         del origin, columns
         return [self, self.camera]
+
+
+def vertical_reach(
+    scene: Any, points: np.ndarray, from_m: float, up: bool = False
+) -> np.ndarray:
+    """Return how far (n,) the first surface is below points or above; inf for none.
+
+    Args:
+        scene: `mi.Scene`.
+        points: (n, 2), metres.
+        from_m: height of the points, metres.
+        up: look upwards.
+    """
+    x, y = upload_rows(mi.Point2f, points)
+    ray = mi.Ray3f(mi.Point3f(x, y, from_m), mi.Vector3f(0, 0, 1 if up else -1))
+    return scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()

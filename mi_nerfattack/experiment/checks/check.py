@@ -25,7 +25,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
     route_findings,
 )
 from mi_nerfattack.experiment.checks.cost import Cost, estimate
-from mi_nerfattack.experiment.checks.ground import likeness_findings
+from mi_nerfattack.experiment.checks.ground import driven_points, likeness_findings
 from mi_nerfattack.render.camera.intrinsics import from_fov, mount_matrix
 from mi_nerfattack.render.camera.outside import chase_mount
 from mi_nerfattack.report.plots.place import Look, Overlay, place_picture
@@ -209,9 +209,7 @@ class Check:
 
     def _overlay(self) -> Overlay:
         world = self.world
-        route, scenario = world.route, world.scenario
-        start = scenario.drive.start_m
-        end = start + world.horizon * scenario.vehicle.dt_s * route.speed_ms
+        scenario, (arc, _) = world.scenario, driven_points(world)
         names = [item.id for item in scenario.objects]
         posed = world.surrogate.objects
         paths = {
@@ -220,8 +218,8 @@ class Check:
             if d.run == 0 and d.case == OWN
         }
         return Overlay(
-            [route],
-            (start, end if route.closed else min(end, route.length)),
+            [world.route],
+            (float(arc[0]), float(arc[-1])),
             dict(zip(names, object_footprints(world), strict=True)),
             {n: _top(item) for n, item in zip(names, posed, strict=True)},
             world.initial,

@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.views.rays import PixelRays, vertical_reach
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.world import World
@@ -111,14 +112,11 @@ def likeness_findings(
         label: of the deployment.
     """
     pose = deployment.camera_to_world
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1
-    )
-    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ pose[:3, :3].T
+    upwards = PixelRays(camera).at(pose).direction.z.numpy()
     ours, theirs = surrogate.depth, deployment.depth
     with np.errstate(invalid="ignore"):
-        standing = pose[2, 3] + theirs * rays[..., 2] > _STANDING_M
+        height = pose[2, 3] + theirs * upwards.reshape(theirs.shape)
+        standing = height > _STANDING_M
     seen = standing & np.isfinite(ours) & (theirs < _FARTHEST_M)
     if seen.sum() < _FEWEST:
         return
@@ -135,13 +133,8 @@ def likeness_findings(
 
 def _ground(scene: Any, points: np.ndarray) -> np.ndarray:
     """Return the height (n,) of what cars stand on at points (n, 2); NaN for none."""
-    heights = []
-    for sign in (-1.0, 1.0):  # down, else up
-        start = np.column_stack([points, np.full(len(points), _BONNET_M)])
-        ray = mi.Ray3f(upload_rows(mi.Point3f, start), mi.Vector3f(0, 0, sign))
-        t = scene.ray_intersect_preliminary(ray, coherent=False).t.numpy()
-        heights.append(_BONNET_M + sign * t)
-    below, above = heights
+    below = _BONNET_M - vertical_reach(scene, points, _BONNET_M)
+    above = _BONNET_M + vertical_reach(scene, points, _BONNET_M, up=True)
     found = np.where(np.isfinite(below), below, above)
     return np.where(np.isfinite(found), found, np.nan)
 
