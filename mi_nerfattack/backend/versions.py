@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 
 import drjit as dr
@@ -17,8 +18,13 @@ def versions() -> dict[str, str]:
         "mi_nerfattack": mi_nerfattack.__version__,
         "mitsuba": str(mi.__version__),
         "drjit": str(dr.__version__),
-        "numpy": importlib.metadata.version("numpy"),
-        "torch": importlib.metadata.version("torch"),
+        "numpy": _installed("numpy"),
+        "torch": _installed("torch"),
         "llvm": ".".join(map(str, llvm.version() or ())),
         "variant": str(mi.variant()),
     }
+
+
+@functools.cache
+def _installed(package: str) -> str:
+    return importlib.metadata.version(package)

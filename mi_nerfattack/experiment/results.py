@@ -19,7 +19,7 @@ from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.attribution import attribute, write_attribution
 from mi_nerfattack.experiment.checks.before_attack import mesh_scene
 from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.experiment.pictures import write_pictures
+from mi_nerfattack.experiment.pictures.frames import write_pictures
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files

@@ -143,6 +143,13 @@ class Deployment:
         """Whether controls have no effect."""
         return self.environment == "replay"
 
+    @property
+    def spp(self) -> int | None:
+        """Samples per pixel; None where images are not made of samples."""
+        return (
+            self.conditions.spp if self.environment in ("mitsuba", "mujoco") else None
+        )
+
     def open(self, objects: Sequence[PosedField]) -> AbstractEnvironment:
         """Make the environment, objects as they look and stand at present."""
         if self.builds_in:

@@ -260,12 +260,22 @@ class Scenario(Section):
             16 hexadecimal digits; equal where the results are, wherever the files lie
             and whatever they are called.
         """
+        return self.digests()["scenario"]
+
+    def digests(self) -> dict[str, str]:
+        """Return :meth:`digest` as ``scenario``, and the files' SHA-256 by their keys.
+
+        Raises:
+            InputError: a file cannot be read.
+        """
         values = {key: json.loads(value) for key, value in self.identity().items()}
-        for value in values.values():
-            if isinstance(value, dict):
-                value.pop("file")
+        named = {key: value for key, value in values.items() if isinstance(value, dict)}
+        for value in named.values():
+            value.pop("file")
         text = json.dumps(values, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        own = hashlib.sha256(text.encode()).hexdigest()[:16]
+        found = {key[len("scenario.") :]: v["sha256"] for key, v in named.items()}
+        return {"scenario": own, **found}
 
 
 def load_scenario(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-import mi_nerfattack
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.errors import InputError, NerfAttackError
 from mi_nerfattack.io import exr, files
@@ -23,11 +21,9 @@ from mi_nerfattack.render.camera.conventions import (
     opencv_to_mitsuba,
 )
 from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
 
 SUFFIXES = (".exr", ".png")
-POSE_CONVENTION = (
-    "4x4, row by row; columns right, down, forward, position (OpenCV); world of scene"
-)
 Precision = Literal["half", "float"]
 
 _MAX_RAYS = 1 << 24  # of one pass: bounds the memory for samplers and wavefronts
@@ -102,16 +98,12 @@ class FrameRenderer:
         self._spp, self._passes = self._plan(spp)
         self._params: Any = mi.traverse(self.sensor)
         self._names: list[str] | None = None
-        self._fixed_metadata = {
-            "software": f"mi-nerfattack {mi_nerfattack.__version__}",
-            "variant": mi.variant(),
+        self._lens = _describe_camera(self.sensor)
+        self._digests = {"scene": files.sha256(self.path)}
+        self._origin = {
             "scene": self.path.name,
-            "scene_sha256": files.sha256(self.path),
-            "scene_parameters": json.dumps(dict(sorted((parameters or {}).items()))),
+            "scene_parameters": dict(sorted((parameters or {}).items())),
             "sensor": f"{sensor} {self.sensor.id()}".strip(),
-            "camera": _describe_camera(self.sensor),
-            "camera_to_world_convention": POSE_CONVENTION,
-            "spp": str(self._spp * self._passes),
         }
 
     @property
@@ -125,8 +117,8 @@ class FrameRenderer:
         if not 0 <= seed < _MAX_SEED:
             raise InputError(f"seed: {seed}; must be in [0, 2^32)")
         pose = self._own_pose() if camera_to_world is None else camera_to_world
-        text = " ".join(f"{value + 0:.9g}" for value in np.ravel(pose))
-        return {**self._fixed_metadata, "camera_to_world": text, "seed": str(seed)}
+        about = self._lens, pose, seed, self._spp * self._passes, self._digests
+        return frame_metadata(*about, **self._origin)
 
     def render(self, camera_to_world: np.ndarray | None = None, seed: int = 0) -> Frame:
         """Render one frame.
@@ -277,18 +269,18 @@ def _pick_sensor(path: str | Path, scene: Any, index: int) -> Any:
     return sensors[index]
 
 
-def _describe_camera(sensor: Any) -> str:
+def _describe_camera(sensor: Any) -> dict[str, Any]:
     try:
         camera, _ = from_mitsuba(sensor)
     except InputError:
         width, height = sensor.film().size()
         values = {"type": sensor.class_name(), "width": width, "height": height}
     else:
-        values = {"type": "OPENCV", **asdict(camera)}
+        values = describe_lens(camera)
     film = sensor.film()
     if list(film.crop_size()) != list(film.size()):
         values["crop"] = [*film.crop_offset(), *film.crop_size()]
-    return json.dumps(values)
+    return values
 
 
 def _mean(passes: list[np.ndarray], names: list[str]) -> np.ndarray:

@@ -20,8 +20,15 @@ from mi_nerfattack.render.pathtrace.frames import (
 )
 
 # What must agree for a frame to be continued from; the program's version need not.
-_COMPARED = ("scene_sha256", "scene_parameters", "sensor", "camera", "camera_to_world")
-_COMPARED += ("spp", "seed", "variant")
+_COMPARED = (
+    "digests",
+    "scene_parameters",
+    "sensor",
+    "camera",
+    "spp",
+    "seed",
+    "variant",
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from helpers import film_scenes as scenes
 from helpers.kernels import nothing_compiled
 
 import mi_nerfattack
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.capture.camera_path import read_path, route_path
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
@@ -155,17 +156,24 @@ def test_metadata_tell_camera_pose_and_origin(tmp_path):
     pixels, header = stored(tmp_path / "a.exr")
     assert {values.dtype for values in pixels.values()} == {np.dtype(np.float32)}
     assert header["scene"] == "scene.xml"
-    assert header["scene_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert json.loads(header["digests"]) == {"scene": digest}
     assert json.loads(header["scene_parameters"]) == {"spp": "2"}
     assert (header["spp"], header["seed"]) == ("5", "3")
     assert header["variant"] == "llvm_ad_rgb"
-    assert header["software"] == f"mi-nerfattack {mi_nerfattack.__version__}"
+    assert json.loads(header["versions"]) == versions()
+    assert versions()["mi_nerfattack"] == mi_nerfattack.__version__
+    assert "OpenCV" in header["pose_convention"]
+    read = mi.Bitmap(str(tmp_path / "a.exr")).metadata()
+    assert {name: read[name] for name in renderer.metadata(None, 3)} == {
+        name: header[name] for name in renderer.metadata(None, 3)
+    }
     assert header["colorSpace"] == "linear Rec.709"
     camera = json.loads(header["camera"])
     focal = 0.5 * scenes.WIDTH / np.tan(np.radians(20))
     assert camera["fx"] == pytest.approx(focal) == camera["fy"]
     assert (camera["cx"], camera["cy"]) == (scenes.WIDTH / 2, scenes.HEIGHT / 2)
-    pose = np.array(header["camera_to_world"].split(), float).reshape(4, 4)
+    pose = np.array(camera["to_world"])
     expected = scenes.opengl_pose(scenes.EYE) * [1, -1, -1, 1]
     np.testing.assert_allclose(pose, expected, atol=1e-6)
 
@@ -211,8 +219,8 @@ def test_a_pose_of_a_path_is_that_of_a_sensor(tmp_path):
     again = renderer.render(poses[0], 1)
     for name in "RGB":
         np.testing.assert_allclose(again.channels[name], own[name], atol=1e-5)
-    pose = np.array(again.metadata["camera_to_world"].split(), float)
-    np.testing.assert_allclose(pose.reshape(4, 4), poses[0], atol=1e-8)
+    pose = json.loads(again.metadata["camera"])["to_world"]
+    np.testing.assert_allclose(pose, poses[0], atol=1e-8)
     # from the other side red is up and to the right
     red = np.argwhere(moved["R"] > 0.9).mean(axis=0)
     assert red[0] < scenes.HEIGHT / 2 and red[1] > scenes.WIDTH / 2

@@ -6,7 +6,8 @@ driven again by its recorded controls, which gives the frames that the policy sa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ import numpy as np
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.io import exr, files
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
 from mi_nerfattack.report.plots.strip import aligned_steps, first_person_strip
-from mi_nerfattack.rollout.drive import CASES, NO_OBJECT, Drive
+from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
 
@@ -45,6 +48,10 @@ def write_pictures(
     for drive, columns in zip(nominal, passed, strict=True):
         if look := looks[drive.case]:
             world.show(look)
+        digests = _digests(world, look)
+        names = [item.id for item in world.scenario.objects] if look else []
+        # path-traced light sources may exceed the range of half precision
+        half = drive.environment == SURROGATE
         environment = world.open(drive.environment, empty=look is None)
         try:
             row = rows[f"{drive.environment}\n{drive.case.replace('_', ' ')}"] = []
@@ -53,7 +60,10 @@ def write_pictures(
             for step, frame in _again(environment, world, drive, wanted):
                 row += [frame.image] * columns.count(step)
                 if step in written:
-                    _write_frame(output / "frames", world, drive, step, frame)
+                    about = drive, step, frame, environment.camera, digests
+                    name = f"{drive.environment}_{drive.case}_{step:04d}.exr"
+                    path = output / "frames" / name
+                    _write_frame(path, frame, names, _describe(world, *about), half)
         finally:
             environment.close()
     titles = [f"{place:.1f} m" for place in places]
@@ -80,20 +90,51 @@ def _again(
 
 
 def _write_frame(
-    folder: Path, world: World, drive: Drive, step: int, frame: CameraFrame
+    path: Path,
+    frame: CameraFrame,
+    objects: Sequence[str],
+    metadata: Mapping[str, str],
+    half: bool,
 ) -> None:
-    shown = () if drive.case == NO_OBJECT else world.scenario.objects
-    names = [item.id for item in shown]
-    metadata = {
-        "scenario": world.scenario.name,
-        "environment": drive.environment,
-        "case": drive.case,
-        "step": str(step),
-        "camera_to_world": " ".join(f"{v:.9g}" for v in frame.camera_to_world.ravel()),
-        "camera": str(world.surrogate.camera),
-    }
-    # path-traced light sources may exceed the range of half precision
-    half = drive.environment == SURROGATE
-    layers = frame.layers(["object"] if len(names) == 1 else names)
-    name = f"{drive.environment}_{drive.case}_{step:04d}.exr"
-    exr.write_layers(folder / name, layers, metadata, half)
+    names = ["object"] if len(objects) == 1 else objects
+    exr.write_layers(path, frame.layers(names), metadata, half)
+
+
+def _digests(world: World, look: Appearance | None) -> dict[str, str]:
+    """Hash the scenario's files, and the textures as files of fields hold them."""
+    found = world.scenario.digests()
+    if look is None:
+        return found
+    for item, texture in zip(world.scenario.objects, look.textures, strict=True):
+        raw = texture.astype(np.float16).tobytes()
+        found[f"texture.{item.id}"] = hashlib.sha256(raw).hexdigest()
+    return found
+
+
+def _describe(
+    world: World,
+    drive: Drive,
+    step: int,
+    frame: CameraFrame,
+    camera: Camera,
+    digests: Mapping[str, str],
+) -> dict[str, str]:
+    """Say what a frame of a drive shows; see :func:`frame_metadata`."""
+    state, label = drive.states[step], drive.environment
+    driven = step < len(drive.controls)
+    return frame_metadata(
+        describe_lens(camera),
+        frame.camera_to_world,
+        drive.seed,
+        1 if label == SURROGATE else world.deployments[label].spp,
+        digests,
+        scenario=world.scenario.name,
+        environment=label,
+        case=drive.case,
+        run=drive.run,
+        step=step,
+        time_s=step * world.scenario.vehicle.dt_s,
+        state=state.tolist(),
+        control=float(drive.controls[step]) if driven else None,
+        cross_track_m=float(world.route.cross_track_numpy(state[None])[0]),
+    )

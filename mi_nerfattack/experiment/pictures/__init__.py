@@ -1,0 +1,1 @@
+"""What a run shows: frames of drives, strips, trajectories, videos."""
