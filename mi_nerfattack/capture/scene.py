@@ -20,7 +20,9 @@ from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.pathtrace.views import iterate_views, require_colour
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 
-_LATERAL_SD, _LATERAL_MAX = 0.8, 2.0  # metres
+#: In widths of a lane: 0.9 m, and 1.5 m beside the lane or beyond its ends, of 3.5 m.
+_LATERAL_SD, _BEYOND = 0.25, 3 / 7
+_BESIDE_SHARE = 0.4
 _HEADING_SD_DEG, _ANY_HEADING_SHARE = 15.0, 0.3
 _OTHER_HEIGHT_SHARE, _HEIGHT_RANGE, _PITCH_SD_DEG = 0.3, (0.8, 3.0), 6.0
 
@@ -30,9 +32,11 @@ def drive_poses(
 ) -> np.ndarray:
     """Scatter camera poses along routes, for fitting what a drive may see.
 
-    The routes take turns. Arc length is uniform; lateral offset normal with standard
-    deviation 0.8 m, cut at 2 m; heading normal around the route's with 15 degrees, or
-    for 30 % of the poses uniform over all headings. Another 30 % sit at a height
+    The routes take turns. A lane 3.5 m wide is surrounded by 1.5 m, others in
+    proportion. Arc length is uniform, 1.5 m beyond the ends of open routes too; lateral
+    offset normal with standard deviation 0.9 m, cut at the lane's edges, or for 40 % of
+    the poses uniform up to 1.5 m beside the lane; heading normal around the route's
+    with 15 degrees, or for 30 % uniform over all headings. Another 30 % sit at a height
     uniform in 0.8 to 3 m with the pitch scattered by 6 degrees, the rest as mounted.
 
     Args:
@@ -55,10 +59,13 @@ def drive_poses(
     mount = CameraMount() if mount is None else mount
     rng = np.random.default_rng(seed)
     along = rng.uniform(0, 1, n)
-    cut = _LATERAL_MAX / _LATERAL_SD
+    cut = 0.5 / _LATERAL_SD
     lateral = _LATERAL_SD * np.asarray(
         truncnorm.rvs(-cut, cut, size=n, random_state=rng)
     )
+    beside = rng.uniform(size=n) < _BESIDE_SHARE
+    reach = 0.5 + _BEYOND
+    lateral = np.where(beside, rng.uniform(-reach, reach, n), lateral)
     any_heading = rng.uniform(size=n) < _ANY_HEADING_SHARE
     heading = np.where(
         any_heading,
@@ -71,7 +78,10 @@ def drive_poses(
     poses = []
     for i in range(n):
         route = routes[i % len(routes)]
-        state = route.pose_at(along[i] * route.length, lateral[i], heading[i])
+        width = route.lane_width_m
+        margin = 0.0 if route.closed else _BEYOND * width
+        arc = along[i] * (route.length + 2 * margin) - margin
+        state = route.pose_at(arc, lateral[i] * width, heading[i])
         here = CameraMount(float(height[i]), mount.forward_m, float(pitch[i]))
         poses.append(mount_matrix(state, here)[0])
     return np.stack(poses)

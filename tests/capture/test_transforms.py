@@ -16,7 +16,12 @@ from mi_nerfattack.capture.scene import capture_scene, drive_poses
 from mi_nerfattack.capture.transforms import read_transforms
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    from_fov,
+    look_at,
+)
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -258,12 +263,23 @@ class TestDrivePoses:
         eyes = poses[:, :3, 3]
         heading = np.arctan2(forward[:, 1], forward[:, 0])
         lateral = eyes[:, 1] - 0.5 * np.sin(heading)  # the mount is 0.5 m ahead
-        assert np.abs(lateral).max() <= 2
-        assert lateral.std() == pytest.approx(0.8, rel=0.15)
+        along = eyes[:, 0] - 0.5 * np.cos(heading)
+        assert 3.1 < np.abs(lateral).max() <= 3.25  # 1.5 m beside a lane of 3.5 m
+        assert np.mean(np.abs(lateral) <= 1.75) == pytest.approx(0.82, abs=0.06)
+        assert -1.5 <= along.min() < -1 and 21 < along.max() <= 21.5
         assert (np.abs(heading) > np.pi / 2).mean() == pytest.approx(0.15, abs=0.06)
         as_mounted = np.isclose(eyes[:, 2], 1.4)
         assert as_mounted.mean() == pytest.approx(0.7, abs=0.08)
         assert eyes[:, 2].min() >= 0.8 and eyes[:, 2].max() <= 3
+
+    def test_narrow_lanes_and_loops(self):
+        """What surrounds a lane is in proportion, and a loop has no ends."""
+        corners = np.array([[0, 0], [2, 0], [2, 2], [0, 2]], float)
+        loop = Route("loop", 0, corners, lane_width_m=0.6, closed=True)
+        mount = CameraMount(0.2, 0.0, 0.0)
+        eyes = drive_poses([loop], 400, seed=1, mount=mount)[:, :3, 3]
+        away = np.abs(eyes[:, :2] - 1).max(1) - 1
+        assert 0.5 < np.abs(away).max() <= 0.3 + 0.6 * 3 / 7 + 1e-9
 
     def test_reproducible(self):
         route = straight_route()
