@@ -1,4 +1,4 @@
-"""``mi-nerfattack export``: an object as a coloured mesh or as cube-face pictures."""
+"""``mi-nerfattack export``: an object as a mesh, as pictures or as a smaller field."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 class Export:
     """Write an object's field as a coloured mesh (glTF) or as six pictures (PNG).
 
+    Or write the field anew: files of earlier versions become smaller and show the same.
     A run folder of attack holds its attacked objects as fields, objects/ID.safetensors.
     Colours are radiance: reflectance times the light that the object was captured in.
     """
@@ -23,7 +24,8 @@ class Export:
     field: tyro.conf.Positional[Path]
     """Field of an object (.safetensors), as asset and attack write them."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json."""
+    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json;
+    FILE.safetensors for a field, which may be the same file."""
     mesh: Path | None = None
     """Colour the triangles of this mesh, which the field was fitted to, in place of
     the surface of the field; give the size and axes that were given to asset."""
@@ -46,15 +48,30 @@ class Export:
         from mi_nerfattack.io import files
 
         suffix = self.output.suffix.lower()
-        if suffix not in (".glb", ""):
-            raise InputError(f"{self.output}: give FILE.glb or a folder's name")
+        if suffix not in (".glb", ".safetensors", ""):
+            raise InputError(
+                f"{self.output}: give FILE.glb, FILE.safetensors or a folder's name"
+            )
         self._refuse_unused(is_mesh=suffix == ".glb")
         variant.ensure()
         grid = load_grid(self.field)
         if suffix == "":
             return self._write_faces(grid)
         files.check_writable(self.output)
+        if suffix == ".safetensors":
+            return self._write_field(grid)
         return self._write_mesh(grid)
+
+    def _write_field(self, grid: GridField) -> int:
+        from mi_nerfattack.fields.io import save_field
+
+        before = self.field.stat().st_size
+        save_field(self.output, grid)
+        print(
+            f"Wrote {self.output}: {grid.held_vertices().sum()} of {grid.n_vertices} "
+            f"vertices, {self.output.stat().st_size} bytes; {self.field} had {before}"
+        )
+        return 0
 
     def _write_mesh(self, grid: GridField) -> int:
         from mi_nerfattack.capture.mesh.gltf_writer import write_glb
@@ -93,9 +110,9 @@ class Export:
         from mi_nerfattack.errors import InputError
 
         if not is_mesh and self.mesh is not None:
-            raise InputError("--mesh: is for FILE.glb, not for pictures")
-        if is_mesh and self.pixels_per_m is not None:
-            raise InputError("--pixels-per-m: is for pictures, not for FILE.glb")
+            raise InputError(f"--mesh: is for FILE.glb, not for {self.output}")
+        if self.output.suffix and self.pixels_per_m is not None:
+            raise InputError(f"--pixels-per-m: is for pictures, not for {self.output}")
         for name, value in (
             ("height-m", self.height_m),
             ("longest-m", self.longest_m),

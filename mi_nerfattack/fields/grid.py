@@ -15,6 +15,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
 
+_ROUNDING = 1e-3  # cells of a level, more than single precision errs by
+
 
 @dataclass(frozen=True)
 class GridLayout:
@@ -246,11 +248,28 @@ class GridField(AbstractField):
             raise KeyError(f"{name}: a grid field has 'texture' and 'density'")
         self._pack()
 
+    def held_vertices(self) -> np.ndarray:
+        """Tell which vertices are read anywhere in an occupied cell, (n_vertices,)."""
+        cells = self.window.cells
+        held = np.zeros(self.n_vertices, bool)
+        for level in self.levels():
+            found = cells.astype(np.float32)
+            for count in cells.shape:  # takes the first axis, puts vertices last
+                found = np.tensordot(found, _reads(level, count), axes=(0, 0))
+            held[level.vertices] = found.T.ravel() > 0
+        return held
+
     def tensors(self) -> dict[str, np.ndarray]:
-        """Return density, texture (half precision) and occupancy bits."""
+        """Return occupancy bits, and what files keep of the vertices.
+
+        These are the values of :meth:`held_vertices` alone, in half precision, and
+        ``held``, a bit a vertex.
+        """
+        held = self.held_vertices()
         return {
-            "density": self._density.numpy().astype(np.float16),
-            "texture": self.texture.numpy().astype(np.float16),
+            "density": self._density.numpy()[held].astype(np.float16),
+            "texture": self.texture.numpy()[held].astype(np.float16),
+            "held": np.packbits(held),
             **self.occupancy_tensors(),
         }
 
@@ -259,9 +278,18 @@ class GridField(AbstractField):
         return {
             **self.info,
             **{k: str(v) for k, v in asdict(self.layout).items()},
+            "vertices": str(self.n_vertices),
             **box_metadata(self, self.info),
             "density_scale": repr(self.density_scale),
         }
+
+
+def _reads(level: GridLevel, count: int) -> np.ndarray:
+    """Tell which vertices along an axis each of `count` cells reads, (count, n)."""
+    edges = np.arange(count + 1)[:, None] / count * level.scale
+    vertex = np.arange(level.resolution)
+    low, high = np.floor(edges[:-1] - _ROUNDING), np.floor(edges[1:] + _ROUNDING) + 1
+    return ((low <= vertex) & (vertex <= high)).astype(np.float32)
 
 
 def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:

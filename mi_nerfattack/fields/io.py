@@ -91,13 +91,37 @@ def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridFie
         layout,
         _vector(meta, "lower"),
         _vector(meta, "upper"),
-        density=tensors["density"],
-        texture=tensors["texture"],
+        **_vertex_values(tensors, meta),
         occupancy=_occupancy(tensors, meta),
         density_scale=_number(meta, "density_scale", float),
         step_m=_number(meta, "step_m", float),
         info=_info(meta),
     )
+
+
+def _vertex_values(
+    tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]
+) -> dict[str, np.ndarray]:
+    """Return density and texture of all vertices, zero where the file has none."""
+    values = {name: tensors[name] for name in ("density", "texture")}
+    if "held" not in tensors:  # files of earlier versions have all
+        return values
+    bits, count = tensors["held"], _number(meta, "vertices", int)
+    if bits.dtype != np.uint8 or bits.shape != ((count + 7) // 8,):
+        raise ValueError(
+            f"held: {bits.dtype} {bits.shape} for {count} vertices; expected a bit "
+            "each, the file is damaged, make or copy it again"
+        )
+    held = np.unpackbits(bits, count=count).astype(bool)
+    for name, given in values.items():
+        if given.shape[:1] != (held.sum(),):
+            raise ValueError(
+                f"{name}: shape {given.shape} for {held.sum()} held vertices; the "
+                "file is damaged, make or copy it again"
+            )
+        values[name] = np.zeros((count, *given.shape[1:]), given.dtype)
+        values[name][held] = given
+    return values
 
 
 def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField:

@@ -39,7 +39,7 @@ def test_a_reader_written_from_the_page_sees_the_same_field(name, rng, tmp_path)
     limit = 1e-6 * expected.max()  # where it is about to vanish
     np.testing.assert_allclose(density, expected, rtol=2e-3, atol=limit)
     expected = reader.radiance(points.astype(float), directions.astype(float))
-    if name == "bricks":  # without a brick there is no colour
+    if name != "intersection":  # where nothing can be there is no colour
         radiance, expected = np.array(radiance)[:, there], expected[there]
     np.testing.assert_allclose(np.array(radiance).T, expected, atol=5e-4)
     assert expected.std() > 0.05

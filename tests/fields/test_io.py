@@ -40,9 +40,10 @@ def test_grid_file_keeps_all_within_half_precision(tmp_path, rng) -> None:
     )
     save_field(tmp_path / "a.safetensors", field)
     found = load_grid(tmp_path / "a.safetensors")
-    half = field.texture.numpy().astype(np.float16).astype(np.float32)
+    held = field.held_vertices()
+    half = np.where(held[:, None], field.texture.numpy(), 0).astype(np.float16)
     np.testing.assert_array_equal(found.texture, half)
-    raw = field.parameters()["density"].numpy().astype(np.float16)
+    raw = np.where(held, field.parameters()["density"].numpy(), 0).astype(np.float16)
     np.testing.assert_array_equal(found.parameters()["density"].numpy(), raw)
     np.testing.assert_array_equal(found.occupancy.cells, cells)
     assert found.metadata() == field.metadata()
@@ -51,6 +52,52 @@ def test_grid_file_keeps_all_within_half_precision(tmp_path, rng) -> None:
     save_field(tmp_path / "b.safetensors", found)
     first, second = [(tmp_path / f"{x}.safetensors").read_bytes() for x in "ab"]
     assert first == second
+
+
+def write_all_vertices(path: Path, field: GridField) -> None:
+    """Write a file as earlier versions did."""
+    header = {"format": "mi_nerfattack field 1", **field.metadata()}
+    del header["vertices"]
+    tensors = {
+        "density": field.parameters()["density"].numpy().astype(np.float16),
+        "texture": field.texture.numpy().astype(np.float16),
+        **field.occupancy_tensors(),
+    }
+    files.write_safetensors(path, tensors, header)
+
+
+def test_a_file_shows_what_one_of_all_vertices_does(tmp_path, rng) -> None:
+    """To the bit, up to the faces of occupied cells."""
+    field, cells = small.blob(rng), rng.random((3, 7, 5)) < 0.2
+    field.occupy(Occupancy(cells))
+    write_all_vertices(tmp_path / "all.safetensors", field)
+    old = load_grid(tmp_path / "all.safetensors")
+    half = field.texture.numpy().astype(np.float16)
+    np.testing.assert_array_equal(old.texture, half)
+    save_field(tmp_path / "held.safetensors", old)
+    found = load_grid(tmp_path / "held.safetensors")
+    assert (np.array(found.texture) != half).any()
+    inside = np.argwhere(cells)[rng.integers(cells.sum(), size=2000)]
+    at = rng.uniform(0, 1, (2000, 3))
+    at = np.where(
+        rng.random((2000, 3)) < 0.3, rng.choice([1e-7, 1 - 1e-7], at.shape), at
+    )
+    points = 2 * (inside + at) / cells.shape - 1
+    expected = small.evaluate(old, points)
+    assert expected[0].max() > 0.01
+    for value, other in zip(small.evaluate(found, points), expected, strict=True):
+        np.testing.assert_array_equal(value, other)
+
+
+def test_held_are_the_vertices_that_a_cell_reads() -> None:
+    """The middle one of three lies from 2.67 to 5.33 of 8."""
+    field, cells = GridField(GridLayout(1, 9, 9), -small.ONES, small.ONES), (3, 3, 3)
+    occupied = np.zeros(cells, bool)
+    occupied[1, 1, 1] = True
+    field.occupy(Occupancy(occupied))
+    expected = np.zeros((9, 9, 9), bool)
+    expected[2:7, 2:7, 2:7] = True
+    np.testing.assert_array_equal(field.held_vertices()[:729], expected.ravel())
 
 
 def test_ngp_file_evaluates_the_same(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -134,7 +181,10 @@ def test_wrong_header_entries(stored, entry: str, value: str, message: str) -> N
 
 @pytest.mark.parametrize(
     "entry",
-    ["levels", "upper", "step_m", "occupancy_shape", "density", "texture", "occupancy"],
+    [
+        *("levels", "upper", "step_m", "occupancy_shape", "vertices"),
+        *("density", "texture", "occupancy"),
+    ],
 )
 def test_missing_entries(stored, entry: str) -> None:
     path, tensors, header = stored
@@ -143,6 +193,30 @@ def test_missing_entries(stored, entry: str) -> None:
     with pytest.raises(InputError, match=f"entry '{entry}' is missing") as caught:
         load_field(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("held", lambda held: held[1:], "held: uint8 .* for 28 vertices; .* a bit"),
+        ("held", lambda held: held.astype(np.uint16), "held: uint16 .* a bit each"),
+        (
+            "held",
+            lambda held: held - np.eye(1, 4, dtype="u1")[0],
+            r"density: shape \(27,\) for 26 held",
+        ),
+        ("density", lambda raw: raw[1:], r"density: shape \(26,\) for 27 held"),
+        ("density", lambda raw: raw[0], r"density: shape \(\) for 27 held"),
+        ("texture", lambda raw: raw[1:], r"texture: shape \(26, 3\) for 27 held"),
+        ("texture", lambda raw: raw[:, 1:], r"texture: shape \(28, 2\); expected"),
+    ],
+)
+def test_damaged_vertices(stored, name: str, change, message: str) -> None:
+    path, tensors, header = stored
+    changed = np.array(change(tensors[name]))
+    files.write_safetensors(path, {**tensors, name: changed}, header)
+    with pytest.raises(InputError, match=f"{path}: {message}"):
+        load_field(path)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -34,6 +34,13 @@ class FileReader:
                 raw[start + first : start + last], TYPES[entry["dtype"]]
             )
             self.tensors[name] = values.reshape(entry["shape"])
+        if "held" in self.tensors:
+            count = int(self.header["vertices"])
+            held = np.unpackbits(self.tensors["held"], count=count).astype(bool)
+            for name in ("density", "texture"):
+                kept = self.tensors[name]
+                self.tensors[name] = np.full((count, *kept.shape[1:]), np.nan)
+                self.tensors[name][held] = kept
         self.lower, self.upper = (self._numbers(key) for key in ("lower", "upper"))
         shape = self._numbers("occupancy_shape").astype(int)
         bits = np.unpackbits(self.tensors["occupancy"], count=shape.prod())
