@@ -13,31 +13,20 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from ..solids import Part, cylinder, merged, write_glb
+
 HEIGHT = 0.75
 _RED, _WHITE = (190, 30, 28, 255), (232, 230, 222, 255)
 _YELLOW, _GREY = (236, 186, 30, 255), (95, 98, 102, 255)
-_Z_UP_TO_Y_UP = np.array(
-    [[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]]
-)
-
-
-Part = tuple[trimesh.Trimesh, tuple[int, int, int, int]]
-
-
-def _cylinder(radius: float, low: float, high: float, colour, sides: int = 32) -> Part:
-    """Return an upright cylinder between two heights, metres."""
-    mesh = trimesh.creation.cylinder(radius, high - low, sections=sides)
-    mesh.apply_translation([0, 0, 0.5 * (low + high)])
-    return mesh, colour
 
 
 def _nozzle(angle: float, height: float, radius: float, reach: float) -> list[Part]:
     """Return a side outlet with flange, cap and nut along a horizontal direction."""
     rings = [
-        _cylinder(radius, 0.06, reach - 0.035, _RED, 24),
-        _cylinder(1.25 * radius, reach - 0.035, reach - 0.015, _RED, 24),
-        _cylinder(1.12 * radius, reach - 0.018, reach + 0.02, _YELLOW, 24),
-        _cylinder(0.4 * radius, reach + 0.015, reach + 0.045, _YELLOW, 5),
+        cylinder(radius, 0.06, reach - 0.035, _RED, 24),
+        cylinder(1.25 * radius, reach - 0.035, reach - 0.015, _RED, 24),
+        cylinder(1.12 * radius, reach - 0.018, reach + 0.02, _YELLOW, 24),
+        cylinder(0.4 * radius, reach + 0.015, reach + 0.045, _YELLOW, 5),
     ]
     turn = trimesh.transformations.rotation_matrix(0.5 * np.pi, [0, 1, 0])
     spin = trimesh.transformations.rotation_matrix(angle, [0, 0, 1])
@@ -60,17 +49,17 @@ def _bonnet(low: float, radius: float, rise: float) -> Part:
 def parts() -> list[Part]:
     """Return closed meshes with their colours, metres, z up, foot at the origin."""
     result = [
-        _cylinder(0.165, 0.0, 0.035, _GREY),
-        _cylinder(0.12, 0.03, 0.075, _RED),
-        _cylinder(0.105, 0.07, 0.50, _RED),
-        _cylinder(0.118, 0.24, 0.265, _WHITE),
-        _cylinder(0.145, 0.49, 0.535, _RED),
+        cylinder(0.165, 0.0, 0.035, _GREY),
+        cylinder(0.12, 0.03, 0.075, _RED),
+        cylinder(0.105, 0.07, 0.50, _RED),
+        cylinder(0.118, 0.24, 0.265, _WHITE),
+        cylinder(0.145, 0.49, 0.535, _RED),
         _bonnet(0.53, 0.125, 0.14),
-        _cylinder(0.05, 0.65, 0.69, _WHITE),
-        _cylinder(0.035, 0.68, HEIGHT, _YELLOW, 5),
+        cylinder(0.05, 0.65, 0.69, _WHITE),
+        cylinder(0.035, 0.68, HEIGHT, _YELLOW, 5),
     ]
     for k in range(8):
-        bolt, colour = _cylinder(0.014, 0.03, 0.055, _YELLOW, 6)
+        bolt, colour = cylinder(0.014, 0.03, 0.055, _YELLOW, 6)
         angle = 2 * np.pi * (k + 0.5) / 8
         bolt.apply_translation([0.143 * np.cos(angle), 0.143 * np.sin(angle), 0])
         result.append((bolt, colour))
@@ -81,31 +70,13 @@ def parts() -> list[Part]:
 
 
 def world_mesh() -> trimesh.Trimesh:
-    """Return all parts as one mesh with colours per vertex, metres, z up.
-
-    Every face has vertices of its own, therefore it is shaded flat.
-    """
-    corners = [np.asarray(mesh.triangles).reshape(-1, 3) for mesh, _ in parts()]
-    colours = [
-        np.tile(np.array(colour, np.uint8), (len(corner), 1))
-        for corner, (_, colour) in zip(corners, parts(), strict=True)
-    ]
-    vertices = np.concatenate(corners)
-    return trimesh.Trimesh(
-        vertices=vertices,
-        faces=np.arange(len(vertices)).reshape(-1, 3),
-        vertex_colors=np.concatenate(colours),
-        process=False,
-    )
+    """Return all parts as one mesh with colours per vertex, metres, z up."""
+    return merged(parts())
 
 
 def build(path: Path) -> None:
     """Write the hydrant as binary glTF."""
-    mesh = world_mesh()
-    mesh.apply_transform(_Z_UP_TO_Y_UP)
-    data = trimesh.Scene({"hydrant": mesh}).export(file_type="glb")
-    assert isinstance(data, bytes)
-    path.write_bytes(data)
+    write_glb(path, "hydrant", world_mesh())
 
 
 def main() -> None:

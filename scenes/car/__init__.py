@@ -1,0 +1,1 @@
+"""A car built by a script."""
