@@ -11,6 +11,7 @@ import trimesh
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenes import bundled, manifest
+from mi_nerfattack.scenes.car import build as car
 from mi_nerfattack.scenes.hydrant import build as hydrant
 from mi_nerfattack.scenes.intersection import build as intersection
 from mi_nerfattack.scenes.intersection import layout, paint
@@ -66,9 +67,10 @@ def test_seed_changes_the_road() -> None:
     np.testing.assert_array_equal(one, paint.road_colour(x, y, 3))
 
 
-def test_hydrant_builds_to_identical_bytes(tmp_path) -> None:
-    hydrant.build(tmp_path / "a.glb")
-    hydrant.build(tmp_path / "b.glb")
+@pytest.mark.parametrize("build", [hydrant.build, car.build])
+def test_objects_build_to_identical_bytes(build, tmp_path) -> None:
+    build(tmp_path / "a.glb")
+    build(tmp_path / "b.glb")
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
 
 
@@ -165,18 +167,37 @@ def test_markings_are_where_the_lanes_are(variant: str) -> None:
         assert colour(*line) > 2.5 * colour(*asphalt)
 
 
-def test_hydrant_is_metric_closed_and_upright() -> None:
-    world = hydrant.world_mesh()
-    np.testing.assert_allclose(world.bounds[:, 2], [0.0, 0.75], atol=1e-9)
-    for part, _ in hydrant.parts():
+@pytest.mark.parametrize(
+    ("name", "script", "extent"),
+    [("hydrant", hydrant, (0.38, 0.42, 0.75)), ("car", car, (4.2, 1.8, 1.45))],
+)
+def test_objects_are_metric_closed_and_as_their_scripts(name, script, extent) -> None:
+    world = script.world_mesh()
+    np.testing.assert_allclose(world.extents, extent, atol=0.01)
+    assert world.bounds[0, 2] == pytest.approx(0, abs=1e-9)
+    for part, _ in script.parts():
         assert part.is_watertight and part.volume > 0
-    loaded = trimesh.load(bundled("hydrant/hydrant.glb"), force="mesh")
+    file = bundled(f"{name}/{name}.glb")
+    loaded = trimesh.load(file, force="mesh")
     x, y, z = np.asarray(loaded.vertices).T
     back = np.stack([x, -z, y], axis=1)  # glTF's y up to z up
-    np.testing.assert_allclose(
-        [back.min(axis=0), back.max(axis=0)], world.bounds, atol=1e-6
-    )
-    # Upright: the flange at the foot is wider than the nut at the top.
-    foot, top = back[back[:, 2] < 0.03], back[back[:, 2] > 0.74]
+    np.testing.assert_allclose(back, world.vertices, atol=1e-6)
+    assert file.stat().st_size < 300_000
+
+
+def test_hydrant_is_upright() -> None:
+    """The flange at the foot is wider than the nut at the top."""
+    place = np.asarray(hydrant.world_mesh().vertices)
+    foot, top = place[place[:, 2] < 0.03], place[place[:, 2] > 0.74]
     assert np.hypot(*foot.T[:2]).max() > 3 * np.hypot(*top.T[:2]).max()
-    assert bundled("hydrant/hydrant.glb").stat().st_size < 300_000
+
+
+def test_car_stands_on_four_wheels_and_looks_along_x() -> None:
+    world = car.world_mesh()
+    place, colour = np.asarray(world.vertices), world.visual.vertex_colors
+    feet = np.sign(place[place[:, 2] < 0.02][:, :2])
+    assert len(np.unique(feet, axis=0)) == 4
+    red = (colour[:, 0] > 100) & (colour[:, 1] < 10)
+    white = colour[:, :3].min(axis=1) > 190
+    assert place[red, 0].max() < -1.9
+    assert place[white & (np.abs(place[:, 1]) > 0.4), 0].min() > 1.9
