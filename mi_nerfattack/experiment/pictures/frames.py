@@ -105,8 +105,9 @@ def _digests(world: World, look: Appearance | None) -> dict[str, str]:
     found = world.scenario.digests()
     if look is None:
         return found
-    for item, texture in zip(world.scenario.objects, look.textures, strict=True):
-        raw = texture.astype(np.float16).tobytes()
+    objects = zip(world.scenario.objects, world.fields, look.textures, strict=True)
+    for item, field, texture in objects:
+        raw = texture[field.held_vertices()].astype(np.float16).tobytes()
         found[f"texture.{item.id}"] = hashlib.sha256(raw).hexdigest()
     return found
 
