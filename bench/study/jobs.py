@@ -38,7 +38,7 @@ def run(write: Callable[[Path], Path]) -> Row:
         folder = Path(name)
         scenario, text = load_scenario(write(folder))
         policy = build_differentiable(scenario.policy)
-        job = Job(scenario, text, policy, folder / "run", pictures=False)
+        job = Job(scenario, text, policy, folder / "run", frames=None)
         document = job.run(anyway=True)
     return {
         "objects": document["scenario"]["objects"],

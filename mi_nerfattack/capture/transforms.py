@@ -190,6 +190,7 @@ def write_poses(
     camera: Camera,
     camera_to_world: np.ndarray,
     extra: Mapping[str, Any] | None = None,
+    times_s: Sequence[float] | None = None,
 ) -> None:
     """Write a `transforms.json` for images that exist.
 
@@ -199,6 +200,7 @@ def write_poses(
         camera: shared intrinsics.
         camera_to_world: (n, 4, 4), OpenCV axes.
         extra: more keys for the top level.
+        times_s: of the images, seconds: `time_s`, which recorded drives have.
     """
     table: dict[str, Any] = {
         "camera_model": "OPENCV",
@@ -219,6 +221,9 @@ def write_poses(
         {"file_path": name, "transform_matrix": matrix.tolist()}
         for name, matrix in zip(names, opencv_to_opengl(camera_to_world), strict=True)
     ]
+    if times_s is not None:
+        for frame, time_s in zip(table["frames"], times_s, strict=True):
+            frame["time_s"] = time_s
     files.write_json(path, table)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -36,6 +36,9 @@ class Attack:
     pictures: bool = True
     """Write frames, plots, attribution and page beside the numbers, which takes about
     as long as five drives in each environment."""
+    frames: Literal["all", "worst"] | int = 3
+    """Frames of each case that are written: all, worst (of the second that ends where
+    the drive is farthest from the lane's centre), or so many, equally spaced."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
@@ -46,6 +49,12 @@ class Attack:
 
         if self.force and not self.resume:
             raise InputError("--force: says how to resume; give it with --resume")
+        if isinstance(self.frames, int) and self.frames < 1:
+            raise InputError(f"--frames: {self.frames}; all, worst, or at least 1")
+        if not self.pictures and self.frames != Attack.frames:
+            raise InputError(
+                "--frames: --no-pictures leaves them out; give one of both"
+            )
         return run_scenario(
             self.scenario,
             self.output,
@@ -53,5 +62,5 @@ class Attack:
             self.json,
             force=self.force,
             anyway=self.anyway,
-            pictures=self.pictures,
+            frames=self.frames if self.pictures else None,
         )

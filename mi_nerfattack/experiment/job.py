@@ -23,8 +23,9 @@ from mi_nerfattack.experiment.checks.before_attack import (
 )
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
+from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.run_folder import RunFolder
-from mi_nerfattack.experiment.stages import OnProgress, Stages
+from mi_nerfattack.experiment.stages import OnProgress, Stages, step_counter
 from mi_nerfattack.rollout.drive import (
     ATTACK,
     BEST_RANDOM,
@@ -63,7 +64,8 @@ class Job:
         on_progress: told about every time step.
         on_notice: told what a resumed run ignores, or that there is none.
         started: `time.perf_counter()` from which the wall time counts.
-        pictures: write frames, plots, attribution and page, too.
+        frames: of each case, see :func:`pictures.frames.frame_steps`; None writes no
+            pictures at all: no frames, plots, attribution and page.
     """
 
     scenario: Scenario
@@ -73,7 +75,7 @@ class Job:
     on_progress: OnProgress = _quiet
     on_notice: OnNotice = _quiet
     started: float = field(default_factory=time.perf_counter)
-    pictures: bool = True
+    frames: Frames | None = 3
 
     def run(
         self, resume: bool = False, force: bool = False, anyway: bool = False
@@ -155,7 +157,7 @@ class Job:
                     stages.drive_all(label, case)
         from mi_nerfattack.experiment import results  # it loads the plots
 
-        done = results.Finished(
+        done = Finished(
             world,
             stages.drives,
             attack,
@@ -164,10 +166,8 @@ class Job:
             baseline.figures(),
             flags,
         )
-        on_step = self._counter(world, "surrogate: attribution", 3)
-        return results.write_results(
-            self.output, done, self.text, effort, on_step, self.pictures
-        )
+        how = self.on_progress, self.on_notice, self.frames
+        return results.write_results(self.output, done, self.text, effort, *how)
 
     def _check(
         self, world: World, folder: RunFolder, stages: Stages, anyway: bool
@@ -189,18 +189,6 @@ class Job:
         folder.checkpoint.flags = flags
         return flags
 
-    def _counter(self, world: World, stage: str, sweeps: int) -> Callable[[int], None]:
-        """Report the progress of some sweeps through a drive, step by step."""
-        done, total = 0, sweeps * world.horizon
-
-        def on_step(step: int) -> None:
-            nonlocal done
-            del step
-            done += 1
-            self.on_progress(stage, done, total, "")
-
-        return on_step
-
     def _attack(
         self,
         world: World,
@@ -214,7 +202,8 @@ class Job:
         if checkpoint.found:
             checkpoint.restore(attack)
         if not attack.best_is_judged:
-            attack.judge_best(self._counter(world, "surrogate: best so far", 1))
+            stage = "surrogate: best so far"
+            attack.judge_best(step_counter(self.on_progress, stage, world.horizon))
             checkpoint.save(attack, effort())
         try:
             with held_interrupts() as check:

@@ -61,22 +61,16 @@ def control_changes(drives: Sequence[Drive], unit: str, seed: int) -> dict[str, 
     return found
 
 
-def write_control_changes(
-    output: Path, drives: Sequence[Drive], unit: str
-) -> dict[str, Path]:
-    """Write ``controls.csv`` and a plot of each environment, if there is any.
+def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
+    """Write ``controls.csv``, if there are any.
 
     Args:
         output: the run folder.
         drives: as of :func:`control_changes`.
-        unit: of the control.
-
-    Returns:
-        the plots by title.
     """
     if not drives:
-        return {}
-    buffer, images = io.StringIO(), {}
+        return
+    buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     for environment, group in _environments(drives).items():
@@ -87,10 +81,27 @@ def write_control_changes(
             rows = zip(*columns, strict=True)
             about = environment, drive.case, drive.run
             writer.writerows([*about, k, *row] for k, row in enumerate(rows, start=1))
-        path = output / f"controls_{environment}.png"
-        control_change(path, group, base, unit)
-        images[f"Change of control in the recording, {environment}"] = path
     files.write_text(output / "controls.csv", buffer.getvalue())
+
+
+def plot_control_changes(
+    output: Path, drives: Sequence[Drive], unit: str
+) -> dict[str, Path]:
+    """Write a plot of each environment.
+
+    Args:
+        output: the run folder.
+        drives: as of :func:`control_changes`.
+        unit: of the control.
+
+    Returns:
+        the plots by title.
+    """
+    images = {}
+    for environment, group in _environments(drives).items():
+        path = output / f"controls_{environment}.png"
+        control_change(path, group, _own(group), unit)
+        images[f"Change of control in the recording, {environment}"] = path
     return images
 
 

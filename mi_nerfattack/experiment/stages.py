@@ -20,6 +20,25 @@ OnProgress = Callable[[str, int, int, str], None]
 Judge = Callable[[OnStep], float]
 
 
+def step_counter(on_progress: OnProgress, stage: str, total: int) -> OnStep:
+    """Return what reports the progress of sweeps through a drive, step by step.
+
+    Args:
+        on_progress: told.
+        stage: what it is told.
+        total: steps of all sweeps.
+    """
+    done = 0
+
+    def on_step(step: int) -> None:
+        nonlocal done
+        del step
+        done += 1
+        on_progress(stage, done, total, "")
+
+    return on_step
+
+
 @dataclass
 class Stages:
     """Drives through a world, keeping each on disk as it ends.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+import numpy as np
+
 from mi_nerfattack.errors import InputError
 
 #: What a policy carries from one control period to the next: arrays of its own kind.
@@ -84,6 +86,21 @@ class AbstractPolicy(ABC):
         raise InputError(
             f"{type(self).__name__}: has no forward derivative; implement step_jvp"
         )
+
+    def planes(self, image: Any, memory: Memory) -> np.ndarray:
+        """Return what `step` makes of images before it looks at them.
+
+        The images themselves, unless a policy tells more.
+
+        Args:
+            image: as for `control`.
+            memory: as for `step`.
+
+        Returns:
+            (n, k, h, w), of the oldest frame first.
+        """
+        del memory
+        return image.numpy().transpose(0, 3, 1, 2)
 
     @abstractmethod
     def control(self, image: Any, goal: Any) -> Any:

@@ -306,6 +306,25 @@ class Preprocess:
         Returns:
             The network's input, and `past` for the next frame.
         """
+        frames, known = self.select(planes, past)
+        kept = known[:, max(0, known.shape[1] - self.history) :]
+        # a view would keep the frame that has dropped out
+        return self.layout(frames), kept if len(kept[0]) == len(
+            known[0]
+        ) else kept.clone()
+
+    def select(
+        self, planes: torch.Tensor, past: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Select the frames of the stack.
+
+        Args:
+            planes: as for `stack`.
+            past: likewise.
+
+        Returns:
+            Those of the stack, and all that are known: (n, t, c, h, w), oldest first.
+        """
         known = planes[:, None]
         if past.shape[1]:
             known = torch.cat([past, known], dim=1)
@@ -315,11 +334,7 @@ class Preprocess:
         if self.frames > 1:
             earlier = [known[:, max(0, last - age), None] for age in ages[:-1]]
             frames = torch.cat([*earlier, frames], dim=1)
-        kept = known[:, max(0, last + 1 - self.history) :]
-        # a view would keep the frame that has dropped out
-        return self.layout(frames), kept if len(kept[0]) == len(
-            known[0]
-        ) else kept.clone()
+        return frames, known
 
 
 def _cut(planes: torch.Tensor, margins: Sequence[int]) -> torch.Tensor:

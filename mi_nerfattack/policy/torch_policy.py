@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from torch.autograd import forward_ad
 
@@ -95,6 +96,14 @@ class TorchPolicy(AbstractPolicy):
             control, after = self._evaluate(to_torch(image), goal, memory)
         return to_row(control, image), after
 
+    def planes(self, image: Any, memory: Memory) -> np.ndarray:
+        """Return the stack of pre-processed frames, whatever their layout."""
+        with torch.no_grad():
+            images = to_torch(image)
+            images = images.to(self._precision() or images.dtype)
+            frames, _ = self.preprocess.select(*self._transform(images, memory))
+            return frames.flatten(1, 2).numpy(force=True)
+
     def step_vjp(
         self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
     ) -> tuple[Any, Memory]:
@@ -168,8 +177,7 @@ class TorchPolicy(AbstractPolicy):
         self.module.to(image.device)
         image = image.to(self._precision() or image.dtype)
         memory = tuple(part.to(image) for part in memory)
-        planes = self.preprocess.transform(image)
-        past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
+        planes, past = self._transform(image, memory)
         network_image, past = self.preprocess.stack(planes, past)
         hidden = memory[1:] if self.preprocess.history else memory
         goals = self.goal.arguments(expand_goals(goal, image), image)
@@ -186,6 +194,14 @@ class TorchPolicy(AbstractPolicy):
             )
         stack = (past,) if self.preprocess.history else ()
         return self.control_scale * control, (*stack, *after)
+
+    def _transform(
+        self, image: torch.Tensor, memory: Memory
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the planes of images, and past ones."""
+        planes = self.preprocess.transform(image)
+        past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
+        return planes, past
 
     def _plain_layers(self) -> AbstractContextManager[None]:
         """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from mi_nerfattack.rollout.sweep import (
     Gradient,
     Options,
     StepRecorder,
+    backward_to_images,
     differentiable,
     forward,
 )
@@ -113,6 +114,19 @@ class Rollout:
         options = Options(self.attached, offsets, recorder, on_step)
         drive = evaluation.trajectory
         return self.adjoint.gradient(self.loop, drive, cost, options)
+
+    def by_images(
+        self, drive: Trajectory, steps: Collection[int]
+    ) -> dict[int, np.ndarray]:
+        """Differentiate by what the sensor gave; see :func:`backward_to_images`.
+
+        Args:
+            drive: through the loop; `kept` is the policy's memory before each period,
+                as :class:`Replay` keeps it.
+            steps: control periods.
+        """
+        d_states = Cost(self.objective, self.reduction).by_states(drive)
+        return backward_to_images(self.loop, drive, d_states, steps, self.attached)
 
     def tangent(
         self, evaluation: Evaluation, textures: Sequence[Any], initial: Any

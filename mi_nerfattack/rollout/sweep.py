@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -121,6 +121,8 @@ class Sweep:
         together: control periods whose images go through the policy at once, and whose
             observations are held until then; 1 where images follow the state, or the
             gradient is taken apart. With memory, a policy takes them one by one.
+        on_image: called with the index of a period and the derivative by what the
+            sensor gave there, a tensor (n, height, width, 3).
         pending: derivatives by controls that act in periods already visited.
         d_memory: derivative by the policy's memory after the period.
     """
@@ -129,6 +131,7 @@ class Sweep:
     drive: Trajectory
     attached: bool
     together: int = 1
+    on_image: Callable[[int, Any], None] | None = None
     pending: dict[int, Any] = field(default_factory=dict)
     d_memory: tuple[Any, ...] = ()
     _waiting: list[tuple[Step, Any, Any]] = field(default_factory=list)
@@ -141,11 +144,7 @@ class Sweep:
             d_after: (m, n), by the state after it.
         """
         loop, index = self.loop, step.index
-        controls = self.drive.controls[: index + 1]
-        older, newer = loop.transition.controls(controls, index, step.state)
-        d_state, *d_pair = loop.transition.vjp(step.state, older, newer, d_after)
-        for source, value in zip(loop.transition.sources(index), d_pair, strict=True):
-            self.pending[source] = self.pending.get(source, 0) + value
+        d_state = self.back_blindly(index, step.state, d_after)
         image = loop.shown(step.observation, index)
         none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
@@ -158,6 +157,22 @@ class Sweep:
             for axis in range(3):
                 d_state[axis] += by_pose[axis]
         dr.eval(d_state, self.pending)
+        return d_state
+
+    def back_blindly(self, index: int, state: Any, d_after: Any) -> Any:
+        """Do as :meth:`back`, but leave out what the image does, and do not evaluate.
+
+        Args:
+            index: of the period.
+            state: (m, n), before it.
+            d_after: (m, n), by the state after it.
+        """
+        transition = self.loop.transition
+        controls = self.drive.controls[: index + 1]
+        older, newer = transition.controls(controls, index, state)
+        d_state, *d_pair = transition.vjp(state, older, newer, d_after)
+        for source, value in zip(transition.sources(index), d_pair, strict=True):
+            self.pending[source] = self.pending.get(source, 0) + value
         return d_state
 
     def finish(self) -> Any:
@@ -181,6 +196,8 @@ class Sweep:
         release_heap()
         for step, d_image in zip(steps, _unbatch(d_images, len(steps)), strict=True):
             d_seen = loop.shown_vjp(step.observation, step.index, d_image)
+            if self.on_image is not None:
+                self.on_image(step.index, d_seen)
             by_pose = differentiable(loop).vjp(
                 step.observation, step.state, d_seen, self.attached
             )
@@ -230,6 +247,54 @@ def backward(
         np.stack(costates[::-1]),
         options.recorder.result() if options.recorder else None,
     )
+
+
+def backward_to_images(
+    loop: ClosedLoop,
+    drive: Trajectory,
+    d_states: np.ndarray,
+    steps: Collection[int],
+    attached: bool,
+) -> dict[int, np.ndarray]:
+    """Pull derivatives by the states back to what the sensor gave.
+
+    Renders the frames of these periods; all from the first of them on where images
+    follow the state, or the policy has a memory.
+
+    Args:
+        loop: as it was when it drove.
+        drive: what it did; `kept` is the policy's memory before each period.
+        d_states: (T, n, m), derivatives of J by x_1 to x_T.
+        steps: control periods.
+        attached: keep the derivative of the image by the state.
+
+    Returns:
+        by period (n, height, width, 3): derivatives by sRGB values in [0, 1], through
+        all that follows.
+
+    Raises:
+        TypeError: sensor or policy have no such derivatives.
+    """
+    sensor, found = differentiable(loop), {}
+
+    def keep(index: int, d_image: Any) -> None:
+        if index in steps:
+            found[index] = d_image.numpy().copy()
+
+    sweep = Sweep(loop, drive, attached, on_image=keep)
+    sensor.start_gradient()
+    linked = attached or bool(loop.policy.initial_memory(drive.count))
+    d_before, start = to_state(np.zeros_like(d_states[0])), min(steps, default=0)
+    for index in reversed(range(start, drive.horizon if steps else 0)):
+        state = drive.states[index]
+        d_after = d_before + to_state(d_states[index])
+        if linked or index in steps:
+            seen = sensor.observe(state, index)
+            d_before = sweep.back(Step(index, state, seen, drive.kept[index]), d_after)
+        else:
+            d_before = sweep.back_blindly(index, state, d_after)
+            dr.eval(d_before, sweep.pending)
+    return found
 
 
 def forward(

@@ -67,12 +67,12 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert np.array_equal(density, original.parameters()["density"].numpy())
     for environment in ("surrogate", "deployment"):
         layers, metadata = read_layers(
-            output / "frames" / f"{environment}_attack_0000.exr"
+            output / "frames" / f"{environment}_attack" / "0000.exr"
         )
         assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
         assert metadata["scenario"] == "kill"
-        bare, _ = read_layers(output / "frames" / f"{environment}_no_object_0000.exr")
-        assert "object" not in bare
+        bare = output / "frames" / f"{environment}_no_object" / "0000.exr"
+        assert "object" not in read_layers(bare)[0]
     plots = ("overhead", "triptych", "errors", "convergence", "strip")
     for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000

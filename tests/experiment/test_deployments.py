@@ -129,14 +129,14 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
     for name in ("strip", "overhead", "errors", "controls_tape"):
         assert (output / f"{name}.png").stat().st_size > 5000
     for label, parts in (("mujoco", 6), ("carla", 6), ("tape", 6), ("lit", 2)):
-        layers, _ = read_layers(output / "frames" / f"{label}_attack_0000.exr")
-        assert len(layers) == parts, label
+        layers, _ = read_layers(output / "frames" / f"{label}_attack" / "0000.exr")
+        assert len(layers) == parts + 3, label  # the policy's input
     page = (output / "report.html").read_text()
     assert "Change of control in the recording, tape" in page
     # each environment was driven past the attacked object
     for label in ("mujoco", "lit", "carla", "tape"):
         images = [
-            read_layers(output / "frames" / f"{label}_{case}_0000.exr")[0][""]
+            read_layers(output / "frames" / f"{label}_{case}" / "0000.exr")[0][""]
             for case in ("own", "attack")
         ]
         assert abs(images[0] - images[1]).max() > 0.02, label

@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import shutil
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import toy_loop as toy
 from helpers.attack_jobs import job
+from helpers.derivatives import central_difference
 
+from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.deploy.driving import drive
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.replay.environment import ReplayEnvironment, open_recording
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.pictures.frames import frame_steps
+from mi_nerfattack.experiment.pictures.recording import FrameFolder
 from mi_nerfattack.io import files
-from mi_nerfattack.io.exr import read_metadata
-from mi_nerfattack.rollout.drive import CASES
+from mi_nerfattack.io.exr import read_layers, read_metadata
+from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.rollout.drive import CASES, Drive
+from mi_nerfattack.rollout.objective import StateHistory
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import build_world
+from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 HORIZON = 5
+#: How far a colour in half precision is from what was rounded, relative to 1.
+HALF = 2.0**-11
+LABELS = "surrogate", "deployment"
 
 
 @pytest.fixture(scope="module")
@@ -26,15 +47,23 @@ def run(folder, tmp_path_factory):
     """The folder of a finished run."""
     mi.set_variant("llvm_ad_rgb")
     output = tmp_path_factory.mktemp("pictures") / "run"
-    job(folder, output, ("horizon = 2", f"horizon = {HORIZON}")).run()
+    longer = job(folder, output, ("horizon = 2", f"horizon = {HORIZON}"))
+    longer.frames = "all"
+    longer.run()
     return output
 
 
-@pytest.mark.parametrize("environment", ["surrogate", "deployment"])
+def kept_drive(run, environment, case):
+    """Return the arrays of the first drive."""
+    path = run / "drives" / f"{environment}_{case}_0000.safetensors"
+    return files.read_safetensors(path)[0]
+
+
+@pytest.mark.parametrize("environment", LABELS)
 @pytest.mark.parametrize("case", CASES)
 def test_a_frame_says_where_it_is_from(folder, run, environment, case):
     step = HORIZON - 1
-    path = run / "frames" / f"{environment}_{case}_{step:04d}.exr"
+    path = run / "frames" / f"{environment}_{case}" / f"{step:04d}.exr"
     found, read = read_metadata(path), mi.Bitmap(str(path)).metadata()
     assert {name: read[name] for name in found} == found  # as Mitsuba reads it
     words = {"scenario": "kill", "environment": environment, "case": case}
@@ -42,8 +71,7 @@ def test_a_frame_says_where_it_is_from(folder, run, environment, case):
     told = {name: json.loads(v) for name, v in found.items() if v[0] in "[{-012345"}
     assert told["versions"] == versions() and found["variant"] == mi.variant()
     assert (told["run"], told["step"], told["spp"], told["seed"]) == (0, step, 1, 1)
-    drives = run / "drives"
-    kept, _ = files.read_safetensors(drives / f"{environment}_{case}_0000.safetensors")
+    kept = kept_drive(run, environment, case)
     assert told["time_s"] == pytest.approx(kept["time_s"][step - 1])
     assert told["state"] == pytest.approx(kept["states"][step])
     assert told["control"] == kept["controls"][step]
@@ -64,3 +92,157 @@ def test_a_frame_says_where_it_is_from(folder, run, environment, case):
         tensors, _ = files.read_safetensors(owner.with_suffix(".safetensors"))
         expected = hashlib.sha256(tensors["texture"].tobytes()).hexdigest()
         assert digests["texture.ball"] == expected
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_layers_add_up_in_half_precision(run, case):
+    for environment in LABELS:
+        folder = run / "frames" / f"{environment}_{case}"
+        layers, _ = read_layers(folder / "0002.exr")
+        half = environment == "surrogate"
+        names = {"scene"} | (
+            {"object"} - ({"object"} if case == "no_object" else set())
+        )
+        names |= {"background"} if half else set()
+        if environment == "deployment" and case == "no_object":
+            assert "scene" not in layers  # nothing to take apart
+            continue
+        parts = [layers[name] for name in names]
+        error = np.abs(sum(parts) - layers[""])
+        bound = HALF * (sum(np.abs(part) for part in parts) + np.abs(layers[""]))
+        assert (error <= (bound if half else 1e-6) + 1e-7).all(), environment
+        assert ("object" in layers) == (case != "no_object")
+        seen = files.read_image(folder / "0002.png")
+        shown = linear_to_uint8(layers[""][..., :3])
+        assert np.abs(shown.astype(int) - seen).max() <= 1
+
+
+def test_the_policys_input_is_what_it_answered(run):
+    policy = TorchPolicy(toy.SmoothPolicy())
+    for environment in LABELS:
+        driven = kept_drive(run, environment, "attack")
+        folder = run / "frames" / f"{environment}_attack"
+        for step in range(HORIZON):
+            layers, _ = read_layers(folder / f"{step:04d}.exr")
+            image = np.stack([layers[f"input.{k}"] for k in range(3)], axis=-1)
+            again = policy.control(mi.TensorXf(image[None]), 0)
+            assert float(np.array(again)[0]) == driven["controls"][step]
+            assert ("cost.dR" in layers) == (environment == "surrogate")
+        last, _ = read_layers(folder / f"{HORIZON:04d}.exr")
+        assert not {"cost.dR", "input.0"} & set(last)  # which no policy sees
+
+
+@pytest.mark.parametrize("case", ["no_object", "attack"])
+def test_the_cost_of_each_pixel_is_that_of_a_difference(folder, run, case):
+    """Of the last image, which nothing but the last state follows."""
+    scenario, _ = load_scenario(folder / "changed.toml")
+    policy = TorchPolicy(toy.SmoothPolicy())
+    world, states = build_world(scenario, policy), kept_drive(run, "surrogate", case)
+    transition, states = world.loop(world.surrogate).transition, states["states"]
+    path = run / "frames" / f"surrogate_{case}" / f"{HORIZON - 1:04d}.exr"
+    layers, _ = read_layers(path)
+    image = np.stack([layers[f"input.{k}"] for k in range(3)], axis=-1)
+    by_image = np.stack([layers[f"cost.d{c}"] for c in "RGB"], axis=-1)
+    direction = np.sign(by_image)
+    before = to_state(states[-2:-1])
+
+    def cost(s):
+        changed = mi.TensorXf((image + s * direction)[None].astype(np.float32))
+        control = np.array(policy.control(changed, 0), np.float64)
+        row = to_state(np.repeat(control[None], 3, axis=1))[0]
+        after = np.array(transition.advance(before, row, row)).T
+        rows = to_state(np.concatenate([states[1:-1], after]))
+        history = StateHistory(rows, 1, HORIZON, scenario.vehicle.dt_s)
+        return float(world.objective.evaluate(history)[0])
+
+    expected = central_difference(cost, 0.02)
+    assert abs(by_image).sum() == pytest.approx(abs(expected), rel=1e-3) != 0
+
+
+@pytest.mark.parametrize("environment", LABELS)
+@pytest.mark.parametrize("case", CASES)
+def test_a_replay_of_the_frames_gives_the_controls(folder, run, environment, case):
+    scenario, _ = load_scenario(folder / "changed.toml")
+    mount, period = scenario.camera.build()[1], scenario.vehicle.dt_s
+    path = run / "frames" / f"{environment}_{case}"
+    replay = ReplayEnvironment(open_recording(path, None, mount), mount, period)
+    policy, kept = TorchPolicy(toy.SmoothPolicy()), kept_drive(run, environment, case)
+    routes = scenario.scene.routes.file
+    route = Route.from_file(routes, scenario.scene.route)
+    found = drive(replay, policy, route, kept["states"][0], 0, 100)
+    assert np.array_equal(found.controls, kept["controls"])
+    assert found.states == pytest.approx(kept["states"], abs=1e-6)
+    depth = read_layers(path / "0001.exr")[0]["Z"]
+    assert np.array_equal(replay.recording.depth(1), depth)
+
+
+def made(distances):
+    """Return a drive of 0.1 s a period at some distances from the lane's centre."""
+    count = len(distances)
+    states = np.zeros((count + 1, 3))
+    time_s = 0.1 * np.arange(1, count + 1)
+    about = "surrogate", "line", "own", 0, 0
+    return Drive(*about, states, np.zeros(count), np.array(distances), time_s)
+
+
+def test_frames_are_chosen():
+    rising = made([0.01 * k for k in range(30)])
+    assert frame_steps(rising, "all") == list(range(31))
+    assert frame_steps(rising, "worst") == list(range(20, 31))
+    assert frame_steps(made([0.1, -0.9, 0.2]), "worst") == [0, 1, 2]
+    assert frame_steps(rising, 3) == [0, 14, 29]
+    assert frame_steps(rising, 1) == [0]
+    assert frame_steps(made([0.1]), 3) == [0]
+
+
+def test_an_input_of_another_size_has_a_file_of_its_own(tmp_path):
+    camera, image = from_fov(8, 6, 90.0), np.zeros((6, 8, 3), np.uint8)
+    frame = CameraFrame(image, np.ones((6, 8), np.float32), np.eye(4))
+    plane = np.arange(20, dtype=np.float32).reshape(4, 5)
+    folder = FrameFolder(tmp_path, camera)
+    layers = frame.layers([]) | {"input.0": plane}
+    folder.add(7, 0.7, frame, layers, {"step": "7"}, half=True)
+    folder.finish()
+    assert set(read_layers(tmp_path / "0007.exr")[0]) == {"", "Z"}
+    found, metadata = read_layers(tmp_path / "0007_input.exr")
+    assert np.array_equal(found["input.0"], plane) and metadata["step"] == "7"
+    assert open_recording(tmp_path, None, CameraMount()).track.times == [0.7]
+
+
+def test_frames_of_an_earlier_run_are_removed(run, tmp_path):
+    shutil.copytree(run / "frames" / "surrogate_own", tmp_path / "own")
+    (tmp_path / "own" / "0002_input.exr").write_text("")
+    (tmp_path / "own" / "notes.txt").write_text("mine")
+    FrameFolder(tmp_path / "own", from_fov(8, 6, 90.0))
+    assert [path.name for path in (tmp_path / "own").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
+def test_figures_are_safe_when_pictures_fail(folder, run, tmp_path, monkeypatch, error):
+    """A full disk or Ctrl-C, while frames are written, loses no figure."""
+    output, notices, write = tmp_path / "run", [], os.write
+
+    def fail(descriptor, data):
+        if (output / "frames" / "surrogate_own" / "0001.exr").exists():
+            raise error
+        return write(descriptor, data)
+
+    shutil.copytree(run, output)
+    for name in ("metrics.json", "report.html", "frames"):
+        path = output / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    change = ("horizon = 2", f"horizon = {HORIZON}")
+    again = job(folder, output, change, notices=notices)
+    again.frames = "all"
+    monkeypatch.setattr(os, "write", fail)
+    with pytest.raises((InputError, KeyboardInterrupt)) as failed:
+        again.run(resume=True)
+    monkeypatch.undo()
+    if not isinstance(error, KeyboardInterrupt):
+        assert "no space left" in str(failed.value)
+    assert (
+        "metrics.json: holds all figures" in notices[-1] and "--resume" in notices[-1]
+    )
+    before = json.loads((output / "metrics.json").read_text())
+    assert before["routes"] == json.loads((run / "metrics.json").read_text())["routes"]
+    assert not (output / "report.html").exists()

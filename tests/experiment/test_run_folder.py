@@ -44,7 +44,7 @@ def test_numbers_come_without_pictures(folder, whole, tmp_path):
     shutil.copytree(whole[0], output)
     (output / "metrics.json").unlink()
     late = job(folder, output)
-    late.pictures = False
+    late.frames = None
     document = late.run(resume=True)
     assert document["verdict"] and document["textures"]
     found = {path.name for path in output.iterdir()} - {

@@ -197,6 +197,7 @@ class TorchLoop:
         substeps: integration steps a period.
         delay: integration steps until a control takes effect.
         states: those of the last drive, with their graph.
+        images: likewise.
     """
 
     vehicle: str
@@ -207,6 +208,7 @@ class TorchLoop:
     substeps: int = 1
     delay: int = 0
     states: list[torch.Tensor] = field(default_factory=list)
+    images: list[torch.Tensor] = field(default_factory=list)
 
     def drive(
         self,
@@ -223,10 +225,11 @@ class TorchLoop:
         """
         states, controls, state, steps = [initial], [], initial, 0
         goals = torch.full((len(initial),), self.goal)
-        none = torch.zeros_like(initial[:, 0])
+        none, self.images = torch.zeros_like(initial[:, 0]), []
         for period in range(horizon):
             seen = state if attached else state.detach()
             image = torch_image(seen, period, textures, offsets)
+            self.images.append(image)
             controls.append(self.module(image.permute(0, 3, 1, 2), goals))
             for _ in range(self.substeps):
                 source = (steps - self.delay) // self.substeps

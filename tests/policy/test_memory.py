@@ -12,7 +12,13 @@ from torch import nn
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.goals import IntegerGoal, NoGoal, OneHotGoal
 from mi_nerfattack.policy.pilotnet import PilotNet
-from mi_nerfattack.policy.preprocess import Preprocess, Resize
+from mi_nerfattack.policy.preprocess import (
+    Crop,
+    Preprocess,
+    Resize,
+    channels_last,
+    to_grey,
+)
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -166,6 +172,20 @@ def test_frame_stack_repeats_the_first_image_and_keeps_the_stride(rng):
         [1, 3, 5],
         [2, 4, 6],
     ]
+
+
+def test_planes_are_the_stack_after_its_transforms(rng):
+    stack = Preprocess([Crop(2, 0, 1, 1), to_grey()], frames=3, layout=channels_last)
+    policy = TorchPolicy(nn.Flatten(), NoGoal(), stack, output=0)
+    height, width = 6, 8
+    images = [rng.random((2, height, width, 3), "f4") for _ in range(4)]
+    memory = policy.initial_memory(2)
+    for image in map(mi.TensorXf, images[:3]):
+        _, memory = policy.step(image, 0, memory)
+    found = policy.planes(mi.TensorXf(images[3]), memory)
+    weights = np.array([0.299, 0.587, 0.114])
+    expected = np.stack([image[:, 2:, 1:-1] @ weights for image in images[1:]], 1)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_memory_is_left_alone(rng):

@@ -20,6 +20,8 @@ from helpers.rollouts import (
     wave_in_torch,
 )
 
+from mi_nerfattack.policy.preprocess import Preprocess
+from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import Checkpointed
 from mi_nerfattack.rollout.function import Rollout
@@ -31,9 +33,81 @@ from mi_nerfattack.vehicle.state import to_state
 
 pytestmark = pytest.mark.usefixtures("variant")
 
+GAINS = 0.4, 0.3, 0.5  # of the frames of a stack
 OFFSETS = np.array(
     [[0.1, -0.2, 0.3, 0.05, 0.1, -0.15], [0.0, 0.2, -0.1, 0.3, 0.0, 0.1]]
 )
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_derivatives_by_images_are_autograd(attached):
+    loop, twin = analytic.make_pair("ackermann_rate", "rk4", 3, 4)
+    initial = loop.dynamics.extend(analytic.random_poses(2))
+    rollout = Rollout(loop, Wave(), 6, attached=attached)
+    drive = rollout.run(to_state(initial)).trajectory
+    textures = [
+        torch.tensor(texture.numpy(), requires_grad=True)
+        for texture in loop.sensor.textures()
+    ]
+    states, _ = twin.drive(torch.tensor(initial), textures, 6, attached)
+    value = wave_in_torch(states, twin.dt).mean()
+    for steps in ({1, 3}, set(range(6)), set()):
+        rendered = loop.sensor.renders
+        found = rollout.by_images(drive, steps)
+        assert set(found) == steps
+        first = min(steps, default=6)
+        seen = 6 - first if attached else len(steps)
+        assert loop.sensor.renders - rendered == 2 * seen
+        for step, by_image in found.items():
+            image = twin.images[step]
+            (expected,) = torch.autograd.grad(
+                value, image, retain_graph=True, allow_unused=True
+            )
+            if expected is None:  # its control comes too late
+                assert step > 3 and not by_image.any()
+            else:
+                assert_close([by_image], [expected.numpy()])
+
+
+def test_derivatives_by_images_go_through_a_memory():
+    """Against differences: the image of one period is changed."""
+    loop, _ = analytic.make_pair()
+    policy = TorchPolicy(StackPolicy(), preprocess=Preprocess(frames=3))
+    loop = replace(loop, policy=policy)
+    rollout = Rollout(loop, Wave(), 4, attached=True)
+    initial = to_state(analytic.random_poses(1))
+    drive = rollout.run(initial).trajectory
+    rng, observe = np.random.default_rng(0), loop.sensor.observe
+    for step, by_image in rollout.by_images(drive, {0, 2}).items():
+        direction = rng.normal(0, 1, by_image.shape)
+
+        def value(s, step=step, direction=direction):
+            def nudged(state, index):
+                seen = observe(state, index)
+                change = analytic.tensor(s * direction * (index == step))
+                return replace(seen, image=seen.image + change)
+
+            loop.sensor.observe = nudged
+            found = rollout.run(initial).value
+            loop.sensor.observe = observe
+            return found
+
+        expected = central_difference(value, 1e-5)
+        assert (by_image * direction).sum() == pytest.approx(expected, rel=1e-6)
+
+
+class StackPolicy(torch.nn.Module):
+    """Looks at three frames one after the other."""
+
+    goals = 3
+
+    def __init__(self):
+        super().__init__()
+        self.network = analytic.AnalyticPolicy()
+
+    def forward(self, image, goal):
+        parts = image.split(3, dim=1)
+        return sum(w * self.network(x, goal) for w, x in zip(GAINS, parts, strict=True))
 
 
 @pytest.mark.parametrize("name", ADJOINTS)

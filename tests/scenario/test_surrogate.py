@@ -143,6 +143,6 @@ def test_attack_writes_its_run_folder(load, tmp_path):
     Job(scenario, text, scenario.policy.build(), output).run()
     document = json.loads((output / "metrics.json").read_text())
     validate(document)
-    layers, _ = read_layers(output / "frames/surrogate_attack_0000.exr")
+    layers, _ = read_layers(output / "frames/surrogate_attack/0000.exr")
     assert {"", "Z", "scene", "scene.Z", "object", "object.Z"} <= set(layers)
     assert (output / "objects/ball.safetensors").is_file()

@@ -6,7 +6,10 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mi_nerfattack.experiment.finished import Frames
 
 
 def run_scenario(
@@ -17,7 +20,7 @@ def run_scenario(
     object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
     anyway: bool = False,
-    pictures: bool = True,
+    frames: Frames | None = 3,
 ) -> int:
     """Run a scenario with a progress bar on stderr, and print its table.
 
@@ -30,14 +33,14 @@ def run_scenario(
             object; None leaves them.
         force: resume although something has changed.
         anyway: attack although it would prove nothing.
-        pictures: write frames, plots, attribution and page, too.
+        frames: of each case; None writes no plots, attribution and page, either.
     """
     started = time.perf_counter()
     from mi_nerfattack.experiment.claim import claimed
 
     with claimed(output, resume):
         how = {"resume": resume, "force": force, "anyway": anyway}
-        document = _run(path, output, object_field(), started, pictures, **how)
+        document = _run(path, output, object_field(), started, frames, **how)
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return 0
@@ -49,7 +52,7 @@ def run_scenario(
     for sentence in [*document["verdict"], *document["flags"]]:
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
-    _print_files(console, output, document, pictures)
+    _print_files(console, output, document, frames is not None)
     return 0
 
 
@@ -58,7 +61,7 @@ def _run(
     output: Path,
     object_field: Path | None,
     started: float,
-    pictures: bool,
+    frames: Frames | None,
     **how: bool,
 ) -> dict[str, Any]:
     """Run a scenario in a folder that is claimed, as `Job.run_claimed` is told."""
@@ -77,7 +80,7 @@ def _run(
         def show(stage: str, done: int, total: int, remark: str) -> None:
             bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-        job = Job(scenario, text, policy, output, show, bars.say, started, pictures)
+        job = Job(scenario, text, policy, output, show, bars.say, started, frames)
         return job.run_claimed(**how)
 
 
@@ -96,7 +99,7 @@ def _print_files(
         "triptych.png": "unperturbed, attacked and transferred, over the ground",
         "strip.png": "what the policy sees",
         "attribution*.png": "when and where the failure is made",
-        "frames/": "EXR frames with layers",
+        "frames/": "EXR frames with layers, and as recordings for replay",
     }
     numbers = {
         "metrics.json, *.csv": "the numbers",

@@ -1,4 +1,4 @@
-"""What the policy saw: frames of drives, as a strip and as EXR files with layers.
+"""What the policy saw: frames of drives as files, and as a strip.
 
 The first drive of each environment and case, whose objects look alike in all drives, is
 driven again by its recorded controls, which gives the frames that the policy saw.
@@ -7,135 +7,256 @@ driven again by its recorded controls, which gives the frames that the policy sa
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.simulated import SurrogateEnvironment
 from mi_nerfattack.evaluation.metrics import environment_order
-from mi_nerfattack.io import exr, files
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.experiment.finished import Finished, Frames
+from mi_nerfattack.experiment.pictures.recording import FrameFolder
+from mi_nerfattack.experiment.stages import OnProgress
 from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
 from mi_nerfattack.report.plots.strip import aligned_steps, first_person_strip
 from mi_nerfattack.rollout.drive import CASES, Drive
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import Trajectory
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
+from mi_nerfattack.vehicle.state import to_state
 
 STRIP_FRAMES = 6
-EXR_FRAMES = 3
+WORST_S = 1.0
 
 
-def write_pictures(
-    output: Path,
-    world: World,
-    drives: Iterable[Drive],
-    looks: Mapping[str, Appearance | None],
-) -> None:
+def nominal_drives(done: Finished) -> list[Drive]:
+    """Return the first drive of each environment and case, in the order of plots."""
+    found = [d for d in done.drives if d.run == 0 and d.case in done.looks]
+    return sorted(
+        found, key=lambda d: (environment_order(d.environment), CASES.index(d.case))
+    )
+
+
+def frame_folder(output: Path, drive: Drive) -> Path:
+    """Return the folder of a drive's frames."""
+    return output / "frames" / f"{drive.environment}_{drive.case}"
+
+
+def frame_steps(drive: Drive, frames: Frames) -> list[int]:
+    """Choose frames of a drive of T control periods.
+
+    Args:
+        drive: of which frames are wanted.
+        frames: "all": those of all T periods, and the one at the drive's end, so that
+            a replay of them has T periods, too. "worst": those of the second that
+            ends where the drive is farthest from the lane's centre. A number: so many,
+            equally spaced.
+
+    Returns:
+        the control periods before each.
+    """
+    last = len(drive.controls)
+    if frames == "all":
+        return list(range(last + 1))
+    if frames == "worst":
+        end = 1 + int(drive.distance_m.argmax())
+        count = round(WORST_S / drive.time_s[0])
+        return list(range(max(0, end - count), end + 1))
+    return np.unique(np.linspace(0, last - 1, frames).round().astype(int)).tolist()
+
+
+def write_frames(
+    output: Path, done: Finished, frames: Frames, on_progress: OnProgress
+) -> Path:
     """Write ``strip.png`` and ``frames/``.
 
     Args:
         output: the run folder.
-        world: what was driven in; its textures are changed.
-        drives: all drives.
-        looks: how the objects look and where they stand, per case; None: nowhere.
+        done: what the run came to.
+        frames: which frames become files.
+        on_progress: told about every time step.
+
+    Returns:
+        the strip.
     """
-    files.make_folder(output / "frames")
-    rows: dict[str, list[np.ndarray]] = {}
-    nominal = [d for d in drives if d.run == 0 and d.case in looks]
-    nominal.sort(key=lambda d: (environment_order(d.environment), CASES.index(d.case)))
+    world, nominal = done.world, nominal_drives(done)
     places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)
+    rows: dict[str, list[np.ndarray]] = {}
+    digests, count = world.scenario.digests(), 0
+    total = sum(len(drive.controls) + 1 for drive in nominal)
     for drive, columns in zip(nominal, passed, strict=True):
-        if look := looks[drive.case]:
+        look = done.looks[drive.case]
+        if look is not None:
             world.show(look)
-        digests = _digests(world, look)
-        names = [item.id for item in world.scenario.objects] if look else []
-        # path-traced light sources may exceed the range of half precision
-        half = drive.environment == SURROGATE
+        label = f"{drive.environment}\n{drive.case.replace('_', ' ')}"
+        row, written = rows.setdefault(label, []), frame_steps(drive, frames)
         environment = world.open(drive.environment, empty=look is None)
         try:
-            row = rows[f"{drive.environment}\n{drive.case.replace('_', ' ')}"] = []
-            written = _steps(drive, EXR_FRAMES)
-            wanted = {*columns, *written}
-            for step, frame in _again(environment, world, drive, wanted):
-                row += [frame.image] * columns.count(step)
-                if step in written:
-                    about = drive, step, frame, environment.camera, digests
-                    name = f"{drive.environment}_{drive.case}_{step:04d}.exr"
-                    path = output / "frames" / name
-                    _write_frame(path, frame, names, _describe(world, *about), half)
+            seen = {**digests, **_digests(world, look)}
+            film = Film(world, drive, environment, look is None, seen)
+            folder = FrameFolder(frame_folder(output, drive), environment.camera)
+            costs = film.cost_by_image(written)
+            for moment in film.moments({*columns, *written}):
+                shown = columns.count(moment.step)
+                row += [moment.seen.image] * shown if shown else []
+                if moment.step in written:
+                    film.write(folder, moment, costs.get(moment.step))
+                done_so_far = count + moment.step + 1
+                on_progress("frames", done_so_far, total, label.replace("\n", ": "))
+            folder.finish()
         finally:
             environment.close()
-    titles = [f"{place:.1f} m" for place in places]
-    first_person_strip(output / "strip.png", rows, titles)
+        count += len(drive.controls) + 1
+    path = output / "strip.png"
+    first_person_strip(path, rows, [f"{place:.1f} m" for place in places])
+    return path
 
 
-def _steps(drive: Drive, count: int) -> list[int]:
-    last = len(drive.controls) - 1
-    return np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A drive after some control periods.
+
+    Attributes:
+        step: how many.
+        state: (m,), of the vehicle.
+        memory: of the policy, before it sees the frame.
+        frame: None where nobody asked for it.
+    """
+
+    step: int
+    state: np.ndarray
+    memory: tuple[Any, ...]
+    frame: CameraFrame | None
+
+    @property
+    def seen(self) -> CameraFrame:
+        """The frame, which was asked for."""
+        assert self.frame is not None
+        return self.frame
 
 
-def _again(
-    environment: AbstractEnvironment, world: World, drive: Drive, wanted: set[int]
-) -> Iterator[tuple[int, CameraFrame]]:
-    """Yield some frames of a drive, each with the index of the control it led to."""
-    frame = environment.reset(world.route, drive.states[0], drive.seed)
-    if 0 in wanted:
-        yield 0, frame
-    for step, control in enumerate(drive.controls[:-1], start=1):
-        if step in wanted:
-            yield step, environment.step(float(control))
-        else:
-            environment.advance(float(control))
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A drive that is driven again.
 
+    Attributes:
+        world: what was driven in, with what it showed.
+        drive: as it was.
+        environment: in which it was driven.
+        empty: whether there are no objects.
+        digests: SHA-256 of the scenario's files, and of the textures that are seen.
+    """
 
-def _write_frame(
-    path: Path,
-    frame: CameraFrame,
-    objects: Sequence[str],
-    metadata: Mapping[str, str],
-    half: bool,
-) -> None:
-    names = ["object"] if len(objects) == 1 else objects
-    exr.write_layers(path, frame.layers(names), metadata, half)
+    world: World
+    drive: Drive
+    environment: AbstractEnvironment
+    empty: bool
+    digests: Mapping[str, str]
+
+    def moments(self, wanted: Collection[int]) -> Iterator[Moment]:
+        """Drive by the recorded controls; a policy with a memory sees all frames.
+
+        Args:
+            wanted: control periods before the frames that are to be seen.
+        """
+        policy, route, drive = self.world.policy, self.world.route, self.drive
+        memory = policy.initial_memory(1)
+        watched = bool(memory)
+        frame = self.environment.reset(route, drive.states[0], drive.seed)
+        for step in range(len(drive.controls) + 1):
+            if step:
+                control = float(drive.controls[step - 1])
+                if watched or step in wanted:
+                    frame = self.environment.step(control)
+                else:
+                    self.environment.advance(control)
+            shown = frame if step in wanted else None
+            yield Moment(step, self.environment.state, memory, shown)
+            if watched:
+                _, memory = policy.step(policy_image(frame), route.goal, memory)
+
+    def cost_by_image(self, steps: Sequence[int]) -> dict[int, np.ndarray]:
+        """Differentiate the objective of the drive by its images.
+
+        Args:
+            steps: control periods.
+
+        Returns:
+            by period (height, width, 3): by sRGB values in [0, 1]. Nothing where the
+            environment has no derivatives, and of an image that no policy saw.
+        """
+        environment, world = self.environment, self.world
+        if not isinstance(environment, SurrogateEnvironment):
+            return {}
+        found = list(self.moments(()))
+        rows = [to_state(np.full((1, 3), u))[0] for u in self.drive.controls]
+        states = [to_state(moment.state[None]) for moment in found]
+        loop, kept = world.loop(environment.sensor), [m.memory for m in found]
+        drive = Trajectory(tuple(states), tuple(rows), loop.dt, tuple(kept))
+        attached = world.scenario.attack.attached
+        rollout = Rollout(loop, world.objective, drive.horizon, attached=attached)
+        by_images = rollout.by_images(drive, {k for k in steps if k < drive.horizon})
+        return {step: image[0] for step, image in by_images.items()}
+
+    def write(
+        self, folder: FrameFolder, moment: Moment, cost: np.ndarray | None
+    ) -> None:
+        """Write the frame of a moment.
+
+        Args:
+            folder: where to.
+            moment: when.
+            cost: derivative of the objective by the image, (height, width, 3).
+        """
+        frame, names = moment.seen, [item.id for item in self.world.scenario.objects]
+        names = [] if self.empty else names
+        layers = frame.layers(["object"] if len(names) == 1 else names)
+        if cost is not None:
+            layers |= {f"cost.d{c}": cost[..., i] for i, c in enumerate("RGB")}
+        if moment.step < len(self.drive.controls):
+            (planes,) = self.world.policy.planes(policy_image(frame), moment.memory)
+            layers |= {f"input.{k}": plane for k, plane in enumerate(planes)}
+        # path-traced light sources may exceed the range of half precision
+        half = self.drive.environment == SURROGATE
+        time_s = moment.step * self.environment.period
+        folder.add(moment.step, time_s, frame, layers, self.describe(moment), half)
+
+    def describe(self, moment: Moment) -> dict[str, str]:
+        """Say what a frame shows; see :func:`frame_metadata`."""
+        world, drive, step = self.world, self.drive, moment.step
+        label, state = drive.environment, moment.state
+        return frame_metadata(
+            describe_lens(self.environment.camera),
+            moment.seen.camera_to_world,
+            drive.seed,
+            1 if label == SURROGATE else world.deployments[label].spp,
+            self.digests,
+            scenario=world.scenario.name,
+            environment=label,
+            case=drive.case,
+            run=drive.run,
+            step=step,
+            time_s=step * self.environment.period,
+            state=state.tolist(),
+            control=None
+            if step == len(drive.controls)
+            else float(drive.controls[step]),
+            cross_track_m=float(world.route.cross_track_numpy(state[None])[0]),
+        )
 
 
 def _digests(world: World, look: Appearance | None) -> dict[str, str]:
-    """Hash the scenario's files, and the textures as files of fields hold them."""
-    found = world.scenario.digests()
+    """Hash textures as files of fields hold them."""
     if look is None:
-        return found
+        return {}
+    found = {}
     objects = zip(world.scenario.objects, world.fields, look.textures, strict=True)
     for item, field, texture in objects:
         raw = texture[field.held_vertices()].astype(np.float16).tobytes()
         found[f"texture.{item.id}"] = hashlib.sha256(raw).hexdigest()
     return found
-
-
-def _describe(
-    world: World,
-    drive: Drive,
-    step: int,
-    frame: CameraFrame,
-    camera: Camera,
-    digests: Mapping[str, str],
-) -> dict[str, str]:
-    """Say what a frame of a drive shows; see :func:`frame_metadata`."""
-    state, label = drive.states[step], drive.environment
-    driven = step < len(drive.controls)
-    return frame_metadata(
-        describe_lens(camera),
-        frame.camera_to_world,
-        drive.seed,
-        1 if label == SURROGATE else world.deployments[label].spp,
-        digests,
-        scenario=world.scenario.name,
-        environment=label,
-        case=drive.case,
-        run=drive.run,
-        step=step,
-        time_s=step * world.scenario.vehicle.dt_s,
-        state=state.tolist(),
-        control=float(drive.controls[step]) if driven else None,
-        cross_track_m=float(world.route.cross_track_numpy(state[None])[0]),
-    )

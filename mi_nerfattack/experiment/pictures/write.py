@@ -1,0 +1,71 @@
+"""All pictures of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.experiment.attribution import attribute, write_attribution
+from mi_nerfattack.experiment.finished import Finished, Frames
+from mi_nerfattack.experiment.pictures.frames import write_frames
+from mi_nerfattack.experiment.pictures.triptych import write_triptych
+from mi_nerfattack.experiment.replayed import plot_control_changes
+from mi_nerfattack.experiment.stages import OnProgress, step_counter
+from mi_nerfattack.report.plots import drives as plots
+from mi_nerfattack.scenario.world import object_footprints
+
+
+def write_images(
+    output: Path,
+    done: Finished,
+    history: list[dict[str, Any]],
+    frames: Frames,
+    on_progress: OnProgress,
+) -> dict[str, Path]:
+    """Write plots, attribution and frames.
+
+    Args:
+        output: the run folder.
+        done: what the run came to; the objects look different afterwards.
+        history: a record an iteration of the attack.
+        frames: which frames become files.
+        on_progress: told about every time step of attribution and frames.
+
+    Returns:
+        the figures of the page by their titles.
+    """
+    world, limit = done.world, done.lane.wheel_m
+    images = _write_plots(output, done, history)
+    unit = world.scenario.vehicle.car().control_unit
+    images["Trajectories over the ground"] = write_triptych(output, done)
+    images |= plot_control_changes(output, done.replayed, unit)
+    names = [item.id for item in world.scenario.objects]
+    sweeps = 3 * world.horizon
+    on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
+    found = attribute(done.attack, names, limit, on_step)
+    images |= write_attribution(output, found, world.fields)
+    images["First-person frames"] = write_frames(output, done, frames, on_progress)
+    return images
+
+
+def _write_plots(
+    output: Path, done: Finished, history: list[dict[str, Any]]
+) -> dict[str, Path]:
+    images = {
+        "Overhead view": output / "overhead.png",
+        "Cross-track error": output / "errors.png",
+        "Convergence of the attack": output / "convergence.png",
+    }
+    world, drives, limit = done.world, done.driven, done.lane.wheel_m
+    route = world.route
+    plots.overhead(
+        images["Overhead view"],
+        drives,
+        route.points,
+        route.lane_width_m,
+        object_footprints(world),
+        limit,
+    )
+    plots.errors(images["Cross-track error"], drives, limit)
+    plots.convergence(images["Convergence of the attack"], history)
+    return images
