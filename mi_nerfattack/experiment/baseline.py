@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.baseline import RandomLooks, equal_count, judge
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.stages import Stages

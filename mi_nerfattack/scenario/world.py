@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -231,14 +232,14 @@ def build_surrogate(scenario: Scenario) -> FieldSensor:
     return FieldSensor(scene, posed, camera, mount, jitter, *look)
 
 
-def build_attack(world: World) -> GradientAttack:
-    """Make the attack of a scenario, before its first iteration.
+def build_rollout(world: World) -> tuple[Rollout, Any]:
+    """Make the drives that an attack is judged by; the policy needs no derivatives.
 
     Args:
         world: what the scenario describes.
 
-    Raises:
-        TypeError: the policy has no derivatives.
+    Returns:
+        the drives, and the initial states (m, n) that they start from.
     """
     scenario, section = world.scenario, world.scenario.attack
     disturbance = section.disturbance(scenario.seed)
@@ -253,9 +254,22 @@ def build_attack(world: World) -> GradientAttack:
     )
     poses = initial_states(scenario, world.route, section.poses, 2)
     poses[0] = world.route.pose_at(scenario.drive.start_m)
-    freedom = section.freedom.build()
-    initial = loop.initial(poses)
-    return GradientAttack(rollout, world.route, initial, freedom, section.schedule)
+    return rollout, loop.initial(poses)
+
+
+def build_attack(world: World) -> GradientAttack:
+    """Make the attack of a scenario, before its first iteration.
+
+    Args:
+        world: what the scenario describes.
+
+    Raises:
+        TypeError: the policy has no derivatives.
+    """
+    section = world.scenario.attack
+    freedom, schedule = section.freedom.build(), section.schedule
+    rollout, initial = build_rollout(world)
+    return GradientAttack(rollout, world.route, initial, freedom, schedule)
 
 
 def _load_layer(scenario: Scenario, path: Path) -> Layer:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from mi_nerfattack.attack.baseline import equal_count
+from mi_nerfattack.attack.black_box.random_looks import equal_count
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World, build_attack

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import toy_loop as toy
 
-from mi_nerfattack.attack.baseline import RandomLooks, equal_count, judge
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -50,6 +51,34 @@ class RandomLooks:
         limit = np.repeat([self.freedom.limit_m, self.freedom.limit_rad], 3)
         drawn = rng.uniform(-limit, limit, (len(self.fields), 6))
         return self.freedom.project(drawn)
+
+
+class RandomSearch(AbstractSearch):
+    """Proposes random textures, by their numbers; what they give changes nothing.
+
+    Args:
+        looks: the draws.
+
+    Raises:
+        InputError: they leave textures alone.
+    """
+
+    def __init__(self, looks: RandomLooks) -> None:
+        if looks.freedom.texture_rate is None:
+            raise InputError("RandomSearch: textures may not change")
+        self.looks = looks
+        self._number = 0
+
+    def ask(self) -> Proposal:
+        """See :meth:`AbstractSearch.ask`."""
+        textures = self.looks.textures(self._number)
+        assert textures is not None  # textures may change
+        return Proposal(textures)
+
+    def tell(self, objective: float) -> None:
+        """See :meth:`AbstractSearch.tell`."""
+        del objective
+        self._number += 1
 
 
 def equal_count(iterations: int, backward_multiple: float) -> int:

@@ -1,0 +1,11 @@
+from .bayesian import BayesianSearch as BayesianSearch
+from .blocks import BlockSearch as BlockSearch
+from .evolution import EvolutionSearch as EvolutionSearch
+from .low_frequency import LowFrequency as LowFrequency
+from .random_looks import RandomLooks as RandomLooks
+from .random_looks import RandomSearch as RandomSearch
+from .search import AbstractSearch as AbstractSearch
+from .search import BlackBoxAttack as BlackBoxAttack
+from .search import Judged as Judged
+from .search import Proposal as Proposal
+from .surrogate import SurrogateJudge as SurrogateJudge

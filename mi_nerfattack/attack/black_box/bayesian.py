@@ -1,0 +1,79 @@
+"""Bayesian optimisation on the lowest frequencies of textures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
+from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
+from mi_nerfattack.errors import InputError, SetupError
+
+if TYPE_CHECKING:
+    import optuna
+
+#: Coefficients beyond which a Gaussian process learns too little from few drives.
+MOST = 64
+_RANDOM_FIRST = 10
+
+
+class BayesianSearch(AbstractSearch):
+    """Fits a Gaussian process to what was told, and asks where it expects a gain.
+
+    Args:
+        basis: of the textures, at most 64 coefficients.
+        known: coefficients (count,) whose objective is known from elsewhere, as that of
+            a surrogate, with it: they shape the process as if they had been told.
+        seed: of all draws.
+
+    Raises:
+        InputError: more coefficients.
+        SetupError: Optuna is not installed.
+
+    Source: Hvarfner et al., ICML 2024 (dimension-scaled priors); Optuna's `GPSampler`.
+    """
+
+    def __init__(
+        self,
+        basis: LowFrequency,
+        known: Sequence[tuple[np.ndarray, float]] = (),
+        seed: int = 0,
+    ) -> None:
+        if basis.count > MOST:
+            raise InputError(f"coefficients: {basis.count}; at most {MOST}")
+        try:
+            import optuna
+        except ImportError as err:
+            raise SetupError(
+                "Bayesian optimisation needs Optuna: "
+                "pip install 'mi-nerfattack[bayesian]'"
+            ) from err
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.basis = basis
+        sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=_RANDOM_FIRST)
+        self._study = optuna.create_study(sampler=sampler)
+        one = optuna.distributions.FloatDistribution(-1.0, 1.0)
+        self._space = {f"{i:02d}": one for i in range(basis.count)}
+        self._asked: optuna.trial.Trial | None = None
+        for coefficients, objective in known:
+            at = dict(zip(self._space, map(float, coefficients), strict=True))
+            self._study.add_trial(
+                optuna.trial.create_trial(
+                    params=at, distributions=dict(self._space), value=objective
+                )
+            )
+
+    def ask(self) -> Proposal:
+        """See :meth:`AbstractSearch.ask`; asked again, it asks the same."""
+        if self._asked is None:
+            self._asked = self._study.ask(dict(self._space))
+        asked = [self._asked.params[name] for name in self._space]
+        return self.basis.propose(np.array(asked))
+
+    def tell(self, objective: float) -> None:
+        """See :meth:`AbstractSearch.tell`."""
+        assert self._asked is not None  # it was asked
+        self._study.tell(self._asked, objective)
+        self._asked = None

@@ -1,0 +1,93 @@
+"""Attacks on the observations along an unattacked drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import toy_loop as toy
+
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.nominal import open_loop
+from mi_nerfattack.attack.objectives import CrossTrackDeviation
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.objective import StageSum
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+HORIZON = 6
+
+
+@pytest.fixture
+def closed():
+    loop, field = toy.make_loop()
+    initial = loop.initial(np.array([[0.0, 0.1, 0.0], [0.0, 0.2, 0.05]]))
+    rollout = Rollout(loop, StageSum(CrossTrackDeviation(toy.ROUTE)), HORIZON)
+    return rollout, initial, field
+
+
+def test_unattacked_it_is_the_closed_loop(closed):
+    rollout, initial, _ = closed
+    opened = open_loop(rollout, initial)
+    first, second = (r.run(initial).trajectory for r in (rollout, opened))
+    np.testing.assert_allclose(first.states_numpy(), second.states_numpy(), atol=1e-6)
+
+
+def test_images_do_not_follow_the_vehicle(closed):
+    """From another start, the policy does the same as along the nominal path."""
+    rollout, initial, _ = closed
+    opened = open_loop(rollout, initial)
+    elsewhere = rollout.loop.initial(np.array([[0.0, -0.7, 0.1], [0.0, 0.6, -0.2]]))
+    expected = opened.measure(initial).trajectory.controls_numpy()
+    found = opened.measure(elsewhere).trajectory.controls_numpy()
+    np.testing.assert_array_equal(found, expected)
+    closed_ones = rollout.measure(elsewhere).trajectory.controls_numpy()
+    assert np.abs(closed_ones - expected).max() > 1e-3
+
+
+def test_one_frame_is_shown_at_all_times(closed):
+    rollout, initial, _ = closed
+    nominal = rollout.measure(initial).trajectory.controls_numpy()
+    controls = open_loop(rollout, initial, 3).measure(initial).trajectory
+    expected = np.repeat(nominal[:, 3:4], HORIZON, axis=1)
+    np.testing.assert_allclose(controls.controls_numpy(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("frame", [None, 2])
+def test_its_gradient_is_its_derivative(closed, frame):
+    rollout, initial, field = closed
+    opened = open_loop(rollout, initial, frame)
+    texture = toy.texture_of(field)
+    gradient = opened.gradient(opened.run(initial)).textures[0].numpy()
+    rng = np.random.default_rng(2)
+    way = rng.normal(size=texture.shape).astype(np.float32)
+    values = []
+    for sign in (1, -1):
+        rollout.loop.sensor.set_textures([texture + sign * 0.02 * way])
+        values.append(opened.measure(initial).value)
+    slope = (values[0] - values[1]) / 0.04
+    assert slope == pytest.approx(float((gradient * way).sum()), rel=0.02)
+
+
+def test_an_attack_by_it_makes_the_closed_loop_worse(closed):
+    rollout, initial, field = closed
+    opened = open_loop(rollout, initial)
+    before = rollout.measure(initial).value
+    attack = GradientAttack(opened, toy.ROUTE, initial, Freedom(0.3))
+    for _ in range(5):
+        attack.step()
+    attack.restore_best()
+    assert rollout.measure(initial).value < before - 0.01 * abs(before)
+
+
+def test_what_makes_no_sense_is_refused(closed):
+    rollout, initial, _ = closed
+    with pytest.raises(InputError, match="frame: 6; the drive has 6"):
+        open_loop(rollout, initial, HORIZON)
+    opened = open_loop(rollout, initial)
+    from dataclasses import replace
+
+    attached = replace(opened, attached=True)
+    with pytest.raises(InputError, match="set attached to false"):
+        attached.gradient(attached.run(initial))
