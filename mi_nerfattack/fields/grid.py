@@ -15,7 +15,9 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
 
-_ROUNDING = 1e-3  # cells of a level, more than single precision errs by
+_ROUNDING = (
+    1e-3  # cells of a level, more than single precision errs by; files rely on it
+)
 
 
 @dataclass(frozen=True)
@@ -260,16 +262,14 @@ class GridField(AbstractField):
         return held
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """Return occupancy bits, and what files keep of the vertices.
+        """Return density and texture of the held vertices, in half precision, and bits.
 
-        These are the values of :meth:`held_vertices` alone, in half precision, and
-        ``held``, a bit a vertex.
+        The bits are the occupancy's, which say what is held.
         """
         held = self.held_vertices()
         return {
             "density": self._density.numpy()[held].astype(np.float16),
             "texture": self.texture.numpy()[held].astype(np.float16),
-            "held": np.packbits(held),
             **self.occupancy_tensors(),
         }
 
@@ -278,7 +278,6 @@ class GridField(AbstractField):
         return {
             **self.info,
             **{k: str(v) for k, v in asdict(self.layout).items()},
-            "vertices": str(self.n_vertices),
             **box_metadata(self, self.info),
             "density_scale": repr(self.density_scale),
         }

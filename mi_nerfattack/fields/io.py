@@ -87,41 +87,31 @@ def _check_finite(path: str | Path, tensors: Mapping[str, np.ndarray]) -> None:
 def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridField:
     names = ("levels", "base_resolution", "max_resolution")
     layout = GridLayout(**{name: _number(meta, name, int) for name in names})
-    return GridField(
+    field = GridField(
         layout,
         _vector(meta, "lower"),
         _vector(meta, "upper"),
-        **_vertex_values(tensors, meta),
         occupancy=_occupancy(tensors, meta),
         density_scale=_number(meta, "density_scale", float),
         step_m=_number(meta, "step_m", float),
         info=_info(meta),
     )
-
-
-def _vertex_values(
-    tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]
-) -> dict[str, np.ndarray]:
-    """Return density and texture of all vertices, zero where the file has none."""
-    values = {name: tensors[name] for name in ("density", "texture")}
-    if "held" not in tensors:  # files of earlier versions have all
-        return values
-    bits, count = tensors["held"], _number(meta, "vertices", int)
-    if bits.dtype != np.uint8 or bits.shape != ((count + 7) // 8,):
-        raise ValueError(
-            f"held: {bits.dtype} {bits.shape} for {count} vertices; expected a bit "
-            "each, the file is damaged, make or copy it again"
-        )
-    held = np.unpackbits(bits, count=count).astype(bool)
-    for name, given in values.items():
-        if given.shape[:1] != (held.sum(),):
+    held = field.held_vertices()
+    for name, more in {"density": (), "texture": (3,)}.items():
+        given, count = tensors[name], int(held.sum())
+        if given.shape == (count, *more):
+            values = np.zeros((len(held), *more), np.float32)
+            values[held] = given
+        elif given.shape == (len(held), *more):  # as earlier versions wrote them
+            values = given
+        else:
             raise ValueError(
-                f"{name}: shape {given.shape} for {held.sum()} held vertices; the "
-                "file is damaged, make or copy it again"
+                f"{name}: shape {given.shape}; {count} vertices are held by the "
+                f"occupied cells, of {len(held)}; the file is damaged, make or copy it "
+                "again"
             )
-        values[name] = np.zeros((count, *given.shape[1:]), given.dtype)
-        values[name][held] = given
-    return values
+        field.set_parameter(name, values)
+    return field
 
 
 def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField:

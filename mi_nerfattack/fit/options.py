@@ -36,7 +36,8 @@ class FitOptions:
         learning_rate: of Adam, constant in the first half of the fit.
         final_rate: share of `learning_rate` that is left at the end; between, it
             falls exponentially.
-        occupancy_resolution: cells along the longest edge of the box.
+        occupancy_resolution: cells along the longest edge of the box; of a grid's box,
+            along each.
         occupancy_every: steps between two looks at some cells; every fourth changes
             the occupancy.
         occupancy_start: steps before the first one.

@@ -18,8 +18,8 @@ from mi_nerfattack.fit.batch import BatchSource, Score, mean_samples
 from mi_nerfattack.fit.cameras import EXPOSURE, POSES, CameraCorrections
 from mi_nerfattack.fit.cells import cells_near_surfaces, grid_shape
 from mi_nerfattack.fit.occupancy import RunningOccupancy, seen_cells
-from mi_nerfattack.fit.octants import dense_octants
 from mi_nerfattack.fit.options import FitOptions
+from mi_nerfattack.fit.pruning import dense_octants, seen_matter
 from mi_nerfattack.fit.rays import RayBank
 from mi_nerfattack.fit.scores import MIN_EDGE_PX
 from mi_nerfattack.fit.steps.march import MarchStep
@@ -106,7 +106,10 @@ class Training:
 
     def _allowed(self, depth: np.ndarray | None) -> np.ndarray:
         lower, upper = self.field.lower, self.field.upper
-        shape = grid_shape(lower, upper, self.options.occupancy_resolution)
+        n = self.options.occupancy_resolution
+        # the levels of a grid divide all edges alike
+        is_grid = isinstance(self.field, GridField)
+        shape = (n, n, n) if is_grid else grid_shape(lower, upper, n)
         if depth is None or np.isnan(depth[self.fitted]).any():
             cells = seen_cells(self.images, self.fitted, lower, upper, shape)
             if not cells.any():
@@ -188,11 +191,15 @@ class Training:
         """Detach the field from the optimiser.
 
         It keeps the occupancy of the last steps: density in other cells has had no
-        part in what was compared. Marches through an NGP also skip thin octants.
+        part in what was compared. Cells of a grid that do not show are emptied, since
+        files keep what they read; marches through an NGP also skip thin octants.
         """
         self._install({k: dr.detach(self.optimiser[k]) for k in self._values()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
+            seed = self.options.seed
+            shown = seen_matter(self.field, self.images, self.fitted, seed=seed)
+            self.field.occupy(Occupancy(shown))
         else:
             cells = self.field.window.cells
             self.field.occupancy = Occupancy(cells, dense_octants(self.field))

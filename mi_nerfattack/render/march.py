@@ -11,7 +11,7 @@ has no empty cell, for the part inside the bounding box. Lattice intervals whose
 lies in an empty cell of the occupancy are skipped: the density there is 0, and rises
 from it continuously (`fields.window`), so that no sample comes or goes at once when a
 ray moves. Where octants of cells are skipped, too, one of a small opacity does
-(`fit.octants`). Beyond ``2**23`` steps in a box a ray sees nothing.
+(`fit.pruning`). Beyond ``2**23`` steps in a box a ray sees nothing.
 
 Error bounds, for a ray that runs l metres through the box and leaves it at t_far:
 

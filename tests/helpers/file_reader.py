@@ -34,19 +34,18 @@ class FileReader:
                 raw[start + first : start + last], TYPES[entry["dtype"]]
             )
             self.tensors[name] = values.reshape(entry["shape"])
-        if "held" in self.tensors:
-            count = int(self.header["vertices"])
-            held = np.unpackbits(self.tensors["held"], count=count).astype(bool)
-            for name in ("density", "texture"):
-                kept = self.tensors[name]
-                self.tensors[name] = np.full((count, *kept.shape[1:]), np.nan)
-                self.tensors[name][held] = kept
         self.lower, self.upper = (self._numbers(key) for key in ("lower", "upper"))
         shape = self._numbers("occupancy_shape").astype(int)
         bits = np.unpackbits(self.tensors["occupancy"], count=shape.prod())
         self.cells = bits.reshape(shape).astype(bool)
         self.is_grid = self.header["kind"] == "grid_field"
         self.has_bricks = self.header["kind"] == "brick_field"
+        if self.is_grid:
+            held = np.concatenate([self._held(*level) for level in self._sizes()])
+            for name in ("density", "texture"):
+                kept = self.tensors[name]
+                self.tensors[name] = np.full((len(held), *kept.shape[1:]), np.nan)
+                self.tensors[name][held] = kept
 
     def density(self, points: np.ndarray) -> np.ndarray:
         """Evaluate (n,), 1/metre, at points (n, 3) in the box."""
@@ -123,16 +122,8 @@ class FileReader:
     def _levels(self, points: np.ndarray, table: np.ndarray) -> np.ndarray:
         """Interpolate (n, levels, values of a vertex) in a table of all vertices."""
         unit = np.clip((points - self.lower) / (self.upper - self.lower), 0, 1 - 1e-6)
-        levels, base, largest = (
-            int(self.header[key])
-            for key in ("levels", "base_resolution", "max_resolution")
-        )
-        growth = (largest / base) ** (1 / (levels - 1)) if levels > 1 else 1.0
         values, start = [], 0
-        for level in range(levels):
-            cells = np.exp2(level * np.log2(growth)) * base - 1
-            edge = int(np.ceil(cells)) + 1
-            size = self._size(edge)
+        for cells, edge, size in self._sizes():
             place = unit * cells
             low = np.floor(place).astype(np.uint64)
             total = np.zeros((len(points), table.shape[1]))
@@ -145,6 +136,28 @@ class FileReader:
             start += size
         assert start == len(table)
         return np.stack(values, 1)
+
+    def _sizes(self) -> list[tuple[float, int, int]]:
+        """Return cells and vertices along an edge, and all vertices, by level."""
+        levels, base, largest = (
+            int(self.header[key])
+            for key in ("levels", "base_resolution", "max_resolution")
+        )
+        growth = (largest / base) ** (1 / (levels - 1)) if levels > 1 else 1.0
+        cells = np.exp2(np.arange(levels) * np.log2(growth)) * base - 1
+        edges = np.ceil(cells).astype(int) + 1
+        return [(c, n, self._size(n)) for c, n in zip(cells, edges, strict=True)]
+
+    def _held(self, cells: float, edge: int, size: int) -> np.ndarray:
+        """Tell which vertices of a level the file has (size,)."""
+        held = np.zeros((edge, edge, edge), bool)
+        shape = np.array(self.cells.shape)
+        for cell in np.argwhere(self.cells):
+            low = np.floor(cell / shape * cells - 0.001).astype(int)
+            high = np.floor((cell + 1) / shape * cells + 0.001).astype(int) + 2
+            (x, y, z), (u, v, w) = np.maximum(low, 0), high
+            held[z:w, y:v, x:u] = True
+        return np.append(held.ravel(), np.zeros(size - edge**3, bool))
 
     def _size(self, edge: int) -> int:
         """Return the vertices that a level takes in the file."""

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
 
+import mi_nerfattack
+from mi_nerfattack import plugins, scenes
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.scenes import bundled, manifest
 from mi_nerfattack.scenes.car import build as car
@@ -39,6 +43,26 @@ def test_manifest_reports_each_kind_of_difference(tmp_path) -> None:
         "extra.bin: not listed",
         "changed.bin: SHA-256 differs from the manifest's",
         "longer.bin: 4 bytes; the manifest says 3",
+    ]
+
+
+def test_budget_of_the_wheel_is_kept_and_told() -> None:
+    text = bundled("README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `?([\w/. ]+?)`? \| (\d+) \|$", text, re.MULTILINE)
+    assert {name: int(mb) for name, mb in rows} == manifest.BUDGET_MB
+    assert sum(manifest.BUDGET_MB.values()) == 45
+    folders = [Path(m.__file__).parent for m in (mi_nerfattack, plugins, scenes)]
+    paths = {path for folder in folders for path in folder.rglob("*")}
+    code = [path for path in paths if path.suffix in (".py", ".pyi", ".j2", ".md")]
+    assert len(code) > 100
+    assert sum(path.stat().st_size for path in code) < 1e6 * manifest.BUDGET_MB["code"]
+
+
+def test_files_over_their_budget_are_named() -> None:
+    sizes = {"car/field.safetensors": 10_000_001, "a": 3_000_000, "b": 1_000_001}
+    assert manifest.over_budget(sizes | {"cube/field.safetensors": 4_000_000}) == [
+        "car/field.safetensors: 10000001 bytes; the budget is 10 million",
+        "other data: 4000001 bytes; the budget is 4 million",
     ]
 
 

@@ -24,7 +24,7 @@ from mi_nerfattack.fields.bricks import (
 )
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fit.octants import dense_octants
+from mi_nerfattack.fit.pruning import dense_octants
 from mi_nerfattack.ranges import Count, Positive, Seed, Whole, checked
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
