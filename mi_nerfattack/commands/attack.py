@@ -37,8 +37,9 @@ class Attack:
     """Write frames, plots, attribution and page beside the numbers, which takes about
     as long as five drives in each environment."""
     frames: Literal["all", "worst"] | int = 3
-    """Frames of each case that are written: all, worst (of the second that ends where
-    the drive is farthest from the lane's centre), or so many, equally spaced."""
+    """Frames of each case that are written: all (with videos), worst (of the second
+    that ends where the drive is farthest from the lane's centre), or so many, equally
+    spaced."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 
+import av
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from mi_nerfattack.io import files
 from mi_nerfattack.io.exr import read_layers, read_metadata
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.report.plots.strip import GAP_PX, TILE_PX
 from mi_nerfattack.rollout.drive import CASES, Drive
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.scenario.scenario import load_scenario
@@ -174,6 +176,27 @@ def test_a_replay_of_the_frames_gives_the_controls(folder, run, environment, cas
     assert found.states == pytest.approx(kept["states"], abs=1e-6)
     depth = read_layers(path / "0001.exr")[0]["Z"]
     assert np.array_equal(replay.recording.depth(1), depth)
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_videos_show_all_cases_side_by_side(run, label):
+    """Each tile is the frame of its case and time, as far as H.264 keeps colours."""
+    with av.open(str(run / "videos" / f"{label}.mp4")) as container:
+        (stream,) = container.streams
+        found = [f.to_ndarray(format="rgb24") for f in container.decode(stream)]
+    assert len(found) == HORIZON + 1 and stream.average_rate == 10
+    scale = TILE_PX // toy.WIDTH
+    height, width = scale * toy.HEIGHT, scale * toy.WIDTH
+    header = scale * toy.WIDTH // 22 + 2 * GAP_PX
+    for index, case in enumerate(CASES):
+        top = index // 2 * (header + height) + header
+        left = GAP_PX + index % 2 * (width + GAP_PX)
+        for step, picture in enumerate(found):
+            tile = picture[top : top + height, left : left + width]
+            path = run / "frames" / f"{label}_{case}" / f"{step:04d}.png"
+            centres = tile[scale // 2 :: scale, scale // 2 :: scale].astype(int)
+            assert np.abs(centres - files.read_image(path)).mean() < 4, (case, step)
+            assert picture[top - header : top, left : left + width].min() < 80  # title
 
 
 def made(distances):

@@ -52,7 +52,7 @@ def run_scenario(
     for sentence in [*document["verdict"], *document["flags"]]:
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
-    _print_files(console, output, document, frames is not None)
+    _print_files(console, output, document, frames)
     return 0
 
 
@@ -85,7 +85,7 @@ def _run(
 
 
 def _print_files(
-    console: Any, output: Path, document: dict[str, Any], pictures: bool
+    console: Any, output: Path, document: dict[str, Any], frames: Frames | None
 ) -> None:
     cost = document["cost"]
     console.print(
@@ -100,10 +100,11 @@ def _print_files(
         "strip.png": "what the policy sees",
         "attribution*.png": "when and where the failure is made",
         "frames/": "EXR frames with layers, and as recordings for replay",
+        **({"videos/": "all cases side by side"} if frames == "all" else {}),
     }
     numbers = {
         "metrics.json, *.csv": "the numbers",
         "objects/": "the fields, as the attack leaves them",
     }
-    for name, meaning in ({**shown, **numbers} if pictures else numbers).items():
+    for name, meaning in ({**shown, **numbers} if frames else numbers).items():
         console.print(f"  {name:24s} {meaning}")

@@ -9,6 +9,7 @@ from mi_nerfattack.experiment.attribution import attribute, write_attribution
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.pictures.frames import write_frames
 from mi_nerfattack.experiment.pictures.triptych import write_triptych
+from mi_nerfattack.experiment.pictures.videos import write_videos
 from mi_nerfattack.experiment.replayed import plot_control_changes
 from mi_nerfattack.experiment.stages import OnProgress, step_counter
 from mi_nerfattack.report.plots import drives as plots
@@ -22,7 +23,7 @@ def write_images(
     frames: Frames,
     on_progress: OnProgress,
 ) -> dict[str, Path]:
-    """Write plots, attribution and frames.
+    """Write plots, attribution and frames; of all frames, videos, too.
 
     Args:
         output: the run folder.
@@ -45,6 +46,8 @@ def write_images(
     found = attribute(done.attack, names, limit, on_step)
     images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = write_frames(output, done, frames, on_progress)
+    if frames == "all":
+        write_videos(output, done, on_progress)
     return images
 
 

@@ -1,4 +1,4 @@
-"""A strip of first-person frames: one row per drive, one column per place."""
+"""First-person frames in one picture: a strip by places, tiles of one time."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from mi_nerfattack.vehicle.route.route import Route
 SCALE = 2
 GAP_PX = 6
 FONT_PX = 24
+TILE_PX = 400  # to which small images of tiles are enlarged, where a factor fits
 
 _BACKGROUND, _INK, _ABSENT = (255, 255, 255), (20, 20, 20), (225, 225, 225)
 
@@ -90,13 +91,44 @@ def aligned_steps(
     return places, steps
 
 
-def _enlarged(frame: np.ndarray) -> Image.Image:
-    return Image.fromarray(frame.repeat(SCALE, axis=0).repeat(SCALE, axis=1))
+def tiles(images: Mapping[str, np.ndarray], columns: int = 2) -> np.ndarray:
+    """Lay images out row by row, each under its title.
+
+    Small ones are enlarged by a whole factor, not interpolated.
+
+    Args:
+        images: by title, sRGB, uint8, (H, W, 3), of one size.
+        columns: how many.
+
+    Returns:
+        the picture, (height, width, 3), uint8; its size depends on that of the images
+        and their number alone.
+    """
+    height, width = next(iter(images.values())).shape[:2]
+    scale = max(1, TILE_PX // width)
+    font_px = max(10, scale * width // 22)
+    font, header_px = _font(font_px), font_px + 2 * GAP_PX
+    column_px, row_px = scale * width + GAP_PX, header_px + scale * height
+    rows = -(-len(images) // columns)
+    size = (GAP_PX + columns * column_px, rows * row_px + GAP_PX)
+    sheet = Image.new("RGB", size, _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    for index, (title, image) in enumerate(images.items()):
+        row, column = divmod(index, columns)
+        left, top = GAP_PX + column * column_px, row * row_px
+        middle = (left, top + header_px // 2)
+        draw.text(middle, title, _INK, font, anchor="lm")
+        sheet.paste(_enlarged(image, scale), (left, top + header_px))
+    return np.asarray(sheet)
 
 
-def _font() -> ImageFont.FreeTypeFont:
+def _enlarged(frame: np.ndarray, scale: int = SCALE) -> Image.Image:
+    return Image.fromarray(frame.repeat(scale, axis=0).repeat(scale, axis=1))
+
+
+def _font(size_px: int = FONT_PX) -> ImageFont.FreeTypeFont:
     fonts = Path(matplotlib.get_data_path(), "fonts", "ttf")
-    return ImageFont.truetype(fonts / "DejaVuSans.ttf", FONT_PX)
+    return ImageFont.truetype(fonts / "DejaVuSans.ttf", size_px)
 
 
 def _text_width(font: ImageFont.FreeTypeFont, label: str) -> int:

@@ -54,3 +54,17 @@ def test_laps_are_places_of_their_own():
     places, (steps,) = strip.aligned_steps(square, [lap], 4)
     np.testing.assert_allclose(places, [0, 20, 40, 60])
     assert steps == [0, 20, 40, 60]
+
+
+def test_tiles_stand_row_by_row_under_their_titles():
+    colours = {"one": 10, "two": 90, "three": 170}
+    images = {n: np.full((5, 100, 3), v, np.uint8) for n, v in colours.items()}
+    sheet = strip.tiles(images)
+    scale = strip.TILE_PX // 100
+    assert scale == 4 and sheet.shape[1] == 2 * (400 + strip.GAP_PX) + strip.GAP_PX
+    found = [int(v) for v in sheet[:, strip.GAP_PX + 399, 0] if v in colours.values()]
+    assert found == [10] * 20 + [170] * 20
+    right = sheet[:, 2 * strip.GAP_PX + 400 :, 0]
+    assert (right == 90).sum() >= 20 * 400
+    large = strip.tiles({"one": np.zeros((5, 900, 3), np.uint8)}, 1)
+    assert large.shape[1] == 900 + 2 * strip.GAP_PX
