@@ -66,6 +66,9 @@ class Asset:
     """End the fit after this time."""
     resume: bool = False
     """Continue an interrupted fit from its checkpoint, beside the output."""
+    min_weight: float = 0.05
+    """Cells that give no ray of the views this share of its colour are emptied: more of
+    them make a smaller file, and leave out what is seen through."""
     batch_rays: int = 4096
     """Rays a step."""
     seed: int = 0
@@ -124,6 +127,7 @@ class Asset:
             batch_rays=self.batch_rays,
             seed=self.seed,
             occupancy_resolution=self.resolution,
+            min_weight=self.min_weight,
         )
 
     def _views(self, bars: StageBars) -> ObjectViews:

@@ -13,7 +13,15 @@ from mi_nerfattack.fields.io import save_field
 from mi_nerfattack.fields.ngp import NGPField
 from mi_nerfattack.fit.loss import LossWeights
 from mi_nerfattack.fit.scores import ViewScore
-from mi_nerfattack.ranges import Count, Fraction, Positive, SomeShare, Whole, checked
+from mi_nerfattack.ranges import (
+    Count,
+    Fraction,
+    Positive,
+    Share,
+    SomeShare,
+    Whole,
+    checked,
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +49,8 @@ class FitOptions:
         occupancy_every: steps between two looks at some cells; every fourth changes
             the occupancy.
         occupancy_start: steps before the first one.
+        min_weight: of a sample in the colour of a fitted image's ray; cells of a grid
+            where none reaches it are emptied at the end.
         sky: of an NGP and images without alpha, learn light from behind the box, by
             direction; otherwise a random colour lies behind each ray, as with objects.
         exposure: learn the exposure of each image.
@@ -61,6 +71,7 @@ class FitOptions:
     occupancy_resolution: Count = 128
     occupancy_every: Count = 16
     occupancy_start: Whole = 128
+    min_weight: Share = 0.05
     sky: bool = True
     exposure: bool = False
     poses: bool = False

@@ -19,8 +19,6 @@ from mi_nerfattack.render.walk import Walk
 #: Of a step near the camera: what gives less is skipped.
 MIN_OPACITY = 0.03
 _SAMPLES = 3  # along each edge of an octant
-#: Of a sample in its ray's colour: what never gives more is left out.
-MIN_WEIGHT = 0.05
 
 
 def dense_octants(field: AbstractField, min_opacity: float = MIN_OPACITY) -> np.ndarray:
@@ -76,7 +74,7 @@ def seen_matter(
     field: AbstractField,
     images: PosedImages,
     indices: Iterable[int],
-    min_weight: float = MIN_WEIGHT,
+    min_weight: float,
     seed: int = 0,
 ) -> np.ndarray:
     """Find the occupied cells that show in images.

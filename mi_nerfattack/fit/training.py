@@ -197,8 +197,8 @@ class Training:
         self._install({k: dr.detach(self.optimiser[k]) for k in self._values()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
-            seed = self.options.seed
-            shown = seen_matter(self.field, self.images, self.fitted, seed=seed)
+            least, seed = self.options.min_weight, self.options.seed
+            shown = seen_matter(self.field, self.images, self.fitted, least, seed)
             self.field.occupy(Occupancy(shown))
         else:
             cells = self.field.window.cells

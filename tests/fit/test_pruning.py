@@ -53,7 +53,7 @@ def test_cells_show_in_front_of_the_first_surface_alone():
     pose = look_at(np.array([2.5, 0, 0]), np.zeros(3))[None]
     pixels, lens = np.zeros((1, 64, 64, 4), np.uint8), from_fov(64, 64, 30)
     images = PosedImages(pixels, pose, lens, ("a",))
-    shown = seen_matter(field, images, [0])
+    shown = seen_matter(field, images, [0], min_weight=0.05)
     assert not shown[~full].any() and shown[12, 6:14, 10:14].all()
     assert not shown[13:].any() and not shown[:11].any()
     more = seen_matter(field, images, [0], min_weight=1e-3)
