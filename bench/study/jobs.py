@@ -10,7 +10,6 @@ from typing import Any
 from bench.study.rows import Row
 from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.experiment.job import Job
-from mi_nerfattack.scenario.policy import build_differentiable
 from mi_nerfattack.scenario.scenario import load_scenario
 
 _CASE = (
@@ -37,7 +36,7 @@ def run(write: Callable[[Path], Path]) -> Row:
     with tempfile.TemporaryDirectory() as name, one_thread():
         folder = Path(name)
         scenario, text = load_scenario(write(folder))
-        policy = build_differentiable(scenario.policy)
+        policy = scenario.build_policy()
         job = Job(scenario, text, policy, folder / "run", frames=None)
         document = job.run(anyway=True)
     return {

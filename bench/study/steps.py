@@ -23,11 +23,11 @@ import rich.table
 from bench.study import rows
 from bench.study.places import NATURAL_M, ROUTES, Place
 from bench.study.tables import geometric_mean, markdown
-from mi_nerfattack.attack.colours import AbstractColouring, Colours
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.schedule import Schedule
-from mi_nerfattack.attack.texture_statistics import seen_weights, texture_statistics
+from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
+from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import World, build_attack, build_world

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.attack.colours import AbstractColouring, Colours
+from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 

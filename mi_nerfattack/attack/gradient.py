@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -12,12 +12,12 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from mi_nerfattack.attack.colours import AbstractColouring
+from mi_nerfattack.attack.base import AbstractAttack, IterationRecord, distances
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.attack.texture.colours import AbstractColouring
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Evaluation, Rollout
-from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -27,26 +27,7 @@ OFFSETS = "offsets"
 Parameters = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class IterationRecord:
-    """What one iteration gave, measured before its update.
-
-    Attributes:
-        iteration: from 0.
-        objective: the cost that is minimised, reduced over the poses.
-        cross_track_mean_m: mean |e| over steps and poses, metres.
-        cross_track_max_m: largest |e|, metres.
-        costs: of each pose, before their reduction.
-    """
-
-    iteration: int
-    objective: float
-    cross_track_mean_m: float
-    cross_track_max_m: float
-    costs: tuple[float, ...]
-
-
-class GradientAttack:
+class GradientAttack(AbstractAttack):
     """Minimise a cost of the closed loop by its objects' textures and poses.
 
     Holds the parameters, Adam's moments, the history and the best parameters so far;
@@ -61,13 +42,9 @@ class GradientAttack:
         initial: (m, n) initial states.
         freedom: what may change.
         schedule: of the learning rates; constant by default.
-
-    Attributes:
-        history: a record an iteration.
-        best_offsets: (k, 6) object offsets of the iteration with the least objective.
-        best_mean_m: mean |e| of the same, metres.
-        whole: False while an update is half done, when the state must not be kept.
     """
+
+    sweeps = 2
 
     def __init__(
         self,
@@ -77,15 +54,9 @@ class GradientAttack:
         freedom: Freedom | None = None,
         schedule: Schedule | None = None,
     ) -> None:
-        self.rollout = rollout
-        self.route = route
-        self.initial = initial
-        self.freedom = freedom or Freedom()
+        freedom = freedom or Freedom()
+        super().__init__(rollout, route, initial, freedom, differentiable(rollout.loop))
         self.schedule = schedule or Schedule(sys.maxsize)
-        self.sensor = differentiable(rollout.loop)
-        self.history: list[IterationRecord] = []
-        self.best_objective = np.inf
-        self.best_mean_m = 0.0
         self.optimiser = Adam(lr=1.0)
         self._colourings: dict[str, AbstractColouring] = {}
         self._best: Parameters = {}  # of the iteration with the least objective
@@ -95,15 +66,8 @@ class GradientAttack:
                 self._colourings[str(i)] = colouring
                 self._best[str(i)] = colouring.start
                 self.optimiser[str(i)] = _tensor(colouring.start)
-        self.best_offsets = self._offsets()
-        self.whole = True
         if self.freedom.pose_rate is not None:
             self.optimiser[OFFSETS] = _tensor(self.best_offsets)
-
-    @property
-    def iteration(self) -> int:
-        """Number of finished iterations."""
-        return len(self.history)
 
     @property
     def is_over(self) -> bool:
@@ -114,10 +78,6 @@ class GradientAttack:
     def has_converged(self) -> bool:
         """Whether there was nothing more to gain at the full rates."""
         return self.schedule.has_converged(self._objectives)
-
-    @property
-    def _objectives(self) -> list[float]:
-        return [record.objective for record in self.history]
 
     def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
         """Do one iteration.
@@ -140,23 +100,15 @@ class GradientAttack:
         self.whole = True
         return record
 
+    def finish(self) -> None:
+        """See :meth:`AbstractAttack.finish`."""
+        self.measure()
+        self.restore_best()
+
     def measure(self) -> IterationRecord:
         """Drive with the present parameters, so that the last update counts too."""
         self._install()
         return self._record(self.rollout.measure(self.initial))
-
-    def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
-        """Drive with what the objects look like, seen by another sensor.
-
-        Args:
-            sensor: that shows the same objects.
-
-        Returns:
-            mean distance from the lane centre, metres.
-        """
-        loop = replace(self.rollout.loop, sensor=sensor)
-        seen = replace(self.rollout, loop=loop).measure(self.initial)
-        return float(self._errors(seen).mean())
 
     @property
     def best(self) -> list[np.ndarray]:
@@ -164,11 +116,6 @@ class GradientAttack:
         if not self._colourings:
             return [texture.numpy().copy() for texture in self.sensor.textures()]
         return self._textures(self._best)
-
-    @property
-    def best_is_judged(self) -> bool:
-        """Whether the best parameters were measured by this attack's objective."""
-        return not self.history or np.isfinite(self.best_objective)
 
     def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
         """Measure the best parameters anew; costs one drive.
@@ -179,12 +126,6 @@ class GradientAttack:
         self.restore_best()
         self.best_objective = np.inf
         self._record(self.rollout.measure(self.initial, on_step), self._best)
-
-    def restore_best(self) -> None:
-        """Give the objects the parameters of the iteration with the least objective."""
-        self.sensor.set_textures(self.best)
-        if self.sensor.offsets() is not None:
-            self.sensor.set_offsets(self.best_offsets)
 
     def _values(self, gradient: Gradient) -> dict[str, Any]:
         """Return the gradient by the optimiser's keys, checked."""
@@ -237,12 +178,6 @@ class GradientAttack:
 
     def _textures(self, colours: Parameters) -> list[np.ndarray]:
         return [c.texture(colours[key]) for key, c in self._colourings.items()]
-
-    def _offsets(self) -> np.ndarray:
-        """Return the objects' offsets, (k, 6); zeros where they cannot be moved."""
-        offsets = self.sensor.offsets()
-        count = len(self.sensor.fields)
-        return np.zeros((count, 6)) if offsets is None else offsets
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
@@ -347,7 +282,7 @@ class GradientAttack:
             colours: that it was driven with; the present ones by default.
         """
         colours = self._colours() if colours is None else colours
-        error = self._errors(seen)
+        error = distances(self.route, seen)
         mean, value = float(error.mean()), seen.value
         value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
         if value < self.best_objective:
@@ -355,11 +290,6 @@ class GradientAttack:
             self.best_objective, self.best_mean_m = value, mean
         costs = tuple(map(float, seen.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)
-
-    def _errors(self, seen: Evaluation) -> np.ndarray:
-        """Return the distances from the lane centre, metres, of all states."""
-        states = seen.trajectory.states_numpy()[:, 1:]
-        return np.abs(self.route.cross_track_numpy(states.reshape(-1, states.shape[2])))
 
 
 def _tensor(value: np.ndarray) -> Any:

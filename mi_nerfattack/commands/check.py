@@ -39,7 +39,6 @@ class Check:
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.checks import check as checks
         from mi_nerfattack.io import files
-        from mi_nerfattack.scenario.policy import build_differentiable
         from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.scenario.world import build_world
 
@@ -54,7 +53,7 @@ class Check:
             def show(stage: str, done: int, total: int, remark: str) -> None:
                 bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-            world = build_world(scenario, build_differentiable(scenario.policy))
+            world = build_world(scenario, scenario.build_policy())
             check = checks.Check(world, show)
             check.run(self.drives)
             show("drawing", 0, 1, "")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.texture_statistics import seen_weights, texture_statistics
+from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
 from mi_nerfattack.rollout.drive import OWN, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.heat import side_views, write_heat
@@ -38,7 +38,7 @@ class FailureAttribution:
 
 
 def attribute(
-    attack: GradientAttack,
+    attack: AbstractAttack,
     objects: Sequence[str],
     limit_m: float,
     on_step: OnStep | None = None,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks, equal_count, judge
-from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.stages import Stages
 from mi_nerfattack.rollout.drive import BEST_RANDOM, RANDOM
@@ -33,7 +33,7 @@ class Baseline:
         objectives: of the looks, once they are judged.
     """
 
-    attack: GradientAttack
+    attack: AbstractAttack
     looks: RandomLooks
     original: Appearance
     count: int
@@ -46,7 +46,7 @@ class Baseline:
         cls,
         world: World,
         original: Appearance,
-        attack: GradientAttack,
+        attack: AbstractAttack,
         effort: Effort,
     ) -> Baseline:
         """Make the baseline of a finished attack.

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.backend.determinism import random_states, restore_random_states
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.effort import Effort
@@ -39,7 +39,7 @@ class CheckpointRecord(Record):
 class CheckpointFile:
     """The complete state of an attack on disk.
 
-    Textures, moments and history (:meth:`GradientAttack.tensors`), the states of the
+    Textures, moments and history (:meth:`AbstractAttack.tensors`), the states of the
     global random generators, the scenario with the hashes of its files, and versions.
     Writing is not put off to another thread: only so is a finished iteration never
     further from the disk than one checkpoint interval.
@@ -94,11 +94,11 @@ class CheckpointFile:
         """Whether :meth:`read` found a checkpoint."""
         return self._kept is not None
 
-    def restore(self, attack: GradientAttack) -> None:
+    def restore(self, attack: AbstractAttack) -> None:
         """Give an attack the state that was read, which is forgotten here.
 
         Where differences are ignored, the best parameters are still to be judged:
-        :meth:`GradientAttack.judge_best`.
+        :meth:`AbstractAttack.judge_best`.
 
         Raises:
             InputError: an entry does not fit the objects.
@@ -119,7 +119,7 @@ class CheckpointFile:
         if kept.ignored:
             self.save(attack, kept.record.effort)
 
-    def save(self, attack: GradientAttack, effort: Effort) -> None:
+    def save(self, attack: AbstractAttack, effort: Effort) -> None:
         """Write the complete state.
 
         Args:
@@ -142,7 +142,7 @@ class CheckpointFile:
         self.iteration = attack.iteration
         self.seconds += time.perf_counter() - start
 
-    def _advice(self, attack: GradientAttack) -> str:
+    def _advice(self, attack: AbstractAttack) -> str:
         kept = (
             f"the checkpoint of iteration {self.iteration} is intact"
             if self.iteration

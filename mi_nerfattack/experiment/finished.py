@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.scenario.world import Appearance, World
 
@@ -30,7 +30,7 @@ class Finished:
 
     world: World
     drives: list[Drive]
-    attack: GradientAttack
+    attack: AbstractAttack
     looks: Mapping[str, Appearance | None]
     ignored: list[str]
     baseline: dict[str, Any]

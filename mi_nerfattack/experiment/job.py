@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.backend.determinism import deterministic
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
@@ -195,7 +195,7 @@ class Job:
         folder: RunFolder,
         account: Account,
         effort: Callable[[], Effort],
-    ) -> GradientAttack:
+    ) -> AbstractAttack:
         """Do the iterations that are missing; whatever stops them, keep those done."""
         attack = build_attack(world)
         section, checkpoint = self.scenario.attack, folder.checkpoint
@@ -216,16 +216,16 @@ class Job:
             done = attack.iteration > checkpoint.iteration
             if done and attack.whole and not checkpoint.failed:
                 checkpoint.save(attack, effort())
-        attack.measure()
-        attack.restore_best()
+        attack.finish()
         return attack
 
     def _iterate(
-        self, attack: GradientAttack, account: Account, check: Callable[[], None]
+        self, attack: AbstractAttack, account: Account, check: Callable[[], None]
     ) -> None:
         horizon = attack.rollout.horizon
-        total = 2 * horizon * self.scenario.attack.max_iterations
-        done = 2 * horizon * attack.iteration
+        section, frames = self.scenario.attack, horizon * self.scenario.attack.poses
+        total = attack.sweeps * horizon * section.method.iterations(frames)
+        done = attack.sweeps * horizon * attack.iteration
         remark = f"iteration {attack.iteration + 1}"
         if attack.history:
             mean = attack.history[-1].cross_track_mean_m
@@ -235,7 +235,7 @@ class Job:
             nonlocal done
             del step
             done += 1
-            if done % horizon == 0:  # there, back, ...
+            if done % horizon == 0:  # there; back, if it goes back
                 times.append(time.perf_counter())
             self.on_progress("surrogate: optimisation", done, total, remark)
             check()

@@ -10,11 +10,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from mi_nerfattack.attack.colours import Colours
-from mi_nerfattack.attack.constraints import Constraints
 from mi_nerfattack.attack.freedom import Freedom
-from mi_nerfattack.attack.gamut import Gamut
-from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.attack.texture.colours import Colours
+from mi_nerfattack.attack.texture.constraints import Constraints
+from mi_nerfattack.attack.texture.gamut import Gamut
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.ranges import (
@@ -23,7 +22,6 @@ from mi_nerfattack.ranges import (
     NonNegative,
     Positive,
     Share,
-    SomeShare,
 )
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.adjoint import (
@@ -32,6 +30,7 @@ from mi_nerfattack.rollout.adjoint import (
     KeptBackgrounds,
     Replay,
 )
+from mi_nerfattack.scenario.method import GradientMethod, MethodSection
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section, refuse
 
@@ -156,8 +155,7 @@ class BothFreedom(AbstractTextureFreedom, AbstractPoseFreedom):
 class AttackSection(Section):
     """How textures and poses are optimised."""
 
-    max_iterations: Count = 48  # fewer where the attack converges before
-    final_rate: SomeShare = 0.1  # of the learning rates, at the end
+    method: MethodSection = Field(default=GradientMethod(), validation_alias="(method)")
     poses: Count = 1  # initial poses of an iteration; the first is nominal
     freedom: Annotated[
         TextureFreedom | PoseFreedom | BothFreedom, Kinds("parameters")
@@ -177,8 +175,3 @@ class AttackSection(Section):
         """Make what the attack's images go through."""
         sizes = self.exposure_ev_sd, self.blur_px_sd, self.noise_sd
         return Disturbance(*sizes, seed)
-
-    @property
-    def schedule(self) -> Schedule:
-        """Of the learning rates."""
-        return Schedule(self.max_iterations, self.final_rate)

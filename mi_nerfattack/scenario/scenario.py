@@ -20,6 +20,7 @@ from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
@@ -33,7 +34,11 @@ from mi_nerfattack.scenario.deployment import (
 )
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
-from mi_nerfattack.scenario.policy import PilotNetSection, PolicySection
+from mi_nerfattack.scenario.policy import (
+    PilotNetSection,
+    PolicySection,
+    build_differentiable,
+)
 from mi_nerfattack.scenario.section import Location, Section, problems, refuse
 from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
 from mi_nerfattack.vehicle.route.route import Route
@@ -183,6 +188,17 @@ class Scenario(Section):
     attack: AttackSection = AttackSection()
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSections = RenderedDeployment()
+
+    def build_policy(self) -> AbstractPolicy:
+        """Make the policy under test.
+
+        Raises:
+            InputError: it cannot be made, or the attack's method needs derivatives,
+                which it does not have.
+        """
+        if self.attack.method.needs_derivatives:
+            return build_differentiable(self.policy)
+        return self.policy.build()
 
     @model_validator(mode="after")
     def _check_sections(self) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.gradient import GradientAttack
+from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
@@ -32,6 +32,7 @@ from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
+from mi_nerfattack.scenario.method import Task
 from mi_nerfattack.scenario.scenario import Scenario
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -257,19 +258,20 @@ def build_rollout(world: World) -> tuple[Rollout, Any]:
     return rollout, loop.initial(poses)
 
 
-def build_attack(world: World) -> GradientAttack:
+def build_attack(world: World) -> AbstractAttack:
     """Make the attack of a scenario, before its first iteration.
 
     Args:
         world: what the scenario describes.
 
     Raises:
-        TypeError: the policy has no derivatives.
+        InputError: its method cannot change what it may.
+        TypeError: the policy has no derivatives, and its method needs them.
     """
     section = world.scenario.attack
-    freedom, schedule = section.freedom.build(), section.schedule
     rollout, initial = build_rollout(world)
-    return GradientAttack(rollout, world.route, initial, freedom, schedule)
+    rest = section.freedom.build(), world.scenario.seed
+    return section.method.build(Task(rollout, world.route, initial, *rest))
 
 
 def _load_layer(scenario: Scenario, path: Path) -> Layer:

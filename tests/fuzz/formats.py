@@ -270,7 +270,7 @@ def _forked(task: dict[str, Any], stages: Any) -> int:
 def _profile(folder: Path) -> list[tuple[Path, Read]]:
     from PIL import ImageCms
 
-    from mi_nerfattack.attack.gamut import Gamut
+    from mi_nerfattack.attack.texture.gamut import Gamut
 
     path = folder / "monitor.icc"
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
@@ -279,7 +279,7 @@ def _profile(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _patches(folder: Path) -> list[tuple[Path, Read]]:
-    from mi_nerfattack.attack.gamut import Gamut
+    from mi_nerfattack.attack.texture.gamut import Gamut
 
     path = folder / "patches.csv"
     np.savetxt(path, np.random.default_rng(0).uniform(0, 1, (9, 3)), delimiter=",")

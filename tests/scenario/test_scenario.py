@@ -54,7 +54,7 @@ def write(tmp_path):
 def test_defaults_and_text(write):
     scenario, text = load_scenario(write(MINIMAL))
     assert text == MINIMAL
-    assert scenario.attack.max_iterations == 3
+    assert scenario.attack.method.max_iterations == 3
     assert scenario.camera.width == 200 and scenario.camera.height == 66
     assert [item.scale for item in scenario.objects] == [1.0, 2.0]
 

@@ -9,3 +9,4 @@ from .search import BlackBoxAttack as BlackBoxAttack
 from .search import Judged as Judged
 from .search import Proposal as Proposal
 from .surrogate import SurrogateJudge as SurrogateJudge
+from .surrogate import SurrogateSearch as SurrogateSearch

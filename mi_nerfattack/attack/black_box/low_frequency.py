@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mi_nerfattack.attack.black_box.search import Proposal, propose
-from mi_nerfattack.attack.colours import Colours
+from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 
 

@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 
-from mi_nerfattack.attack.colours import Colours
+from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import OnStep
 

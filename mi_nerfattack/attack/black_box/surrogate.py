@@ -1,4 +1,4 @@
-"""Judgement of textures by drives in the surrogate."""
+"""Searches by drives in the surrogate."""
 
 from __future__ import annotations
 
@@ -7,11 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.attack.black_box.search import Judged, Textures
+from mi_nerfattack.attack.base import AbstractAttack, IterationRecord, distances
+from mi_nerfattack.attack.black_box.search import (
+    AbstractSearch,
+    BlackBoxAttack,
+    Judged,
+    Textures,
+)
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.schedule import has_settled
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
-from mi_nerfattack.rollout.loop import OnStep
+from mi_nerfattack.rollout.loop import ClosedLoop, OnStep
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -37,14 +45,94 @@ class SurrogateJudge:
         Raises:
             InputError: the sensor shows no fields.
         """
-        sensor = self.rollout.loop.sensor
-        if not isinstance(sensor, FieldSensor):
-            raise InputError(f"{type(sensor).__name__}: has no textures to change")
+        sensor = textured(self.rollout.loop)
         sensor.set_textures(list(textures))
         before = sensor.renders
         seen = self.rollout.measure(self.initial, on_step)
-        states = seen.trajectory.states_numpy()[:, 1:]
-        rows = states.reshape(-1, states.shape[2])
-        error = np.abs(self.route.cross_track_numpy(rows))
+        error = distances(self.route, seen)
         frames = sensor.renders - before
         return Judged(seen.value, float(error.mean()), float(error.max()), frames)
+
+
+class SurrogateSearch(AbstractAttack):
+    """A search as an attack on a surrogate, which goes on where it was stopped.
+
+    An iteration is one judgement.
+
+    Args:
+        search: makes the proposals; new.
+        rollout: the loop and its objective.
+        route: the lane centre.
+        initial: (m, n) initial states of each judgement.
+        freedom: what may change.
+        frames: budget.
+
+    Raises:
+        InputError: the sensor shows no fields.
+    """
+
+    sweeps = 1
+
+    def __init__(
+        self,
+        search: AbstractSearch,
+        rollout: Rollout,
+        route: Route,
+        initial: Any,
+        freedom: Freedom,
+        frames: int,
+    ) -> None:
+        super().__init__(rollout, route, initial, freedom, textured(rollout.loop))
+        self._original = [t.numpy().copy() for t in self.sensor.textures()]
+        judge = SurrogateJudge(rollout, route, initial)
+        self._attack = BlackBoxAttack(search, judge, frames)
+
+    @property
+    def is_over(self) -> bool:
+        """See :attr:`AbstractAttack.is_over`."""
+        return self._attack.is_over
+
+    @property
+    def has_converged(self) -> bool:
+        """See :attr:`AbstractAttack.has_converged`."""
+        return has_settled(self._objectives)
+
+    @property
+    def best(self) -> list[np.ndarray]:
+        """See :attr:`AbstractAttack.best`."""
+        found = self._attack.best
+        return self._original if found is None else found
+
+    def step(self, on_step: OnStep | None = None) -> IterationRecord:
+        """See :meth:`AbstractAttack.step`."""
+        self._add(self._attack.step(on_step))
+        return self.history[-1]
+
+    def _add(self, judged: Judged) -> None:
+        objective, mean = judged.objective, judged.cross_track_mean_m
+        if objective < self.best_objective:
+            self.best_objective, self.best_mean_m = objective, mean
+        numbers = objective, mean, judged.cross_track_max_m
+        self.history.append(IterationRecord(self.iteration, *numbers))
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """See :meth:`AbstractAttack.tensors`."""
+        return self._attack.tensors()
+
+    def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
+        """See :meth:`AbstractAttack.load_tensors`."""
+        self._attack.load_tensors(tensors)
+        for judged in self._attack.history:
+            self._add(judged)
+        self.restore_best()
+
+
+def textured(loop: ClosedLoop) -> FieldSensor:
+    """Return a loop's sensor, whose objects have textures.
+
+    Raises:
+        InputError: it shows no fields.
+    """
+    if not isinstance(loop.sensor, FieldSensor):
+        raise InputError(f"{type(loop.sensor).__name__}: has no textures to change")
+    return loop.sensor

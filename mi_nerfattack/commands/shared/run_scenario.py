@@ -69,12 +69,11 @@ def _run(
     from mi_nerfattack.backend.threads import one_thread
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.job import Job
-    from mi_nerfattack.scenario.policy import build_differentiable
     from mi_nerfattack.scenario.scenario import load_scenario
 
     scenario, text = load_scenario(path, object_field)
     variant.ensure()
-    policy = build_differentiable(scenario.policy)
+    policy = scenario.build_policy()
     with StageBars(started) as bars, one_thread():
 
         def show(stage: str, done: int, total: int, remark: str) -> None:

@@ -57,7 +57,8 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     """
     scenario, horizon = world.scenario, world.horizon
     forward, backward, update, disk = _iteration(world)
-    section, count = scenario.attack, scenario.attack.max_iterations
+    section = scenario.attack
+    count = section.method.iterations(horizon * section.poses)
     looks = scenario.baseline.textures or equal_count(count, backward / forward)
     iteration = horizon * (forward + backward) + update
     periods = {SURROGATE: 4 * scenario.drive.runs + looks}
@@ -68,7 +69,8 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     drives = sum(n * drive_s.get(label, 0.0) for label, n in periods.items())
     passes = count + 3  # attribution is about three more
     wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
-    again = 1 if isinstance(section.adjoint.build(), KeptBackgrounds) else 2
+    kept = isinstance(section.adjoint.build(), KeptBackgrounds)
+    again = 1 if kept or not backward else 2
     frames = section.poses * (again * passes + looks + 1) + sum(periods.values())
     return Cost(
         count,
@@ -104,7 +106,8 @@ def _iteration(world: World) -> tuple[float, float, float, float]:
     finally:
         world.show(original)
     forward = (times[periods] - times[0]) / periods
-    backward = (times[2 * periods] - times[periods]) / periods
+    there = attack.sweeps * periods
+    backward = (times[there] - times[periods]) / periods
     return forward, backward, end - times[-1], (kept + _field_bytes(world)) / 1e6
 
 

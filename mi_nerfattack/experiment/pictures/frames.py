@@ -187,11 +187,12 @@ class Film:
             steps: control periods.
 
         Returns:
-            by period (height, width, 3): by sRGB values in [0, 1]. Nothing where the
-            environment has no derivatives, and of an image that no policy saw.
+            by period (height, width, 3): by sRGB values in [0, 1]. Nothing where
+            environment or policy has no derivatives, and of an image no policy saw.
         """
         environment, world = self.environment, self.world
-        if not isinstance(environment, SurrogateEnvironment):
+        is_surrogate = isinstance(environment, SurrogateEnvironment)
+        if not is_surrogate or not world.policy.differentiable:
             return {}
         found = list(self.moments(()))
         rows = [to_state(np.full((1, 3), u))[0] for u in self.drive.controls]

@@ -40,11 +40,12 @@ def write_images(
     unit = world.scenario.vehicle.car().control_unit
     images["Trajectories over the ground"] = write_triptych(output, done)
     images |= plot_control_changes(output, done.replayed, unit)
-    names = [item.id for item in world.scenario.objects]
-    sweeps = 3 * world.horizon
-    on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
-    found = attribute(done.attack, names, limit, on_step)
-    images |= write_attribution(output, found, world.fields)
+    if world.policy.differentiable:
+        names = [item.id for item in world.scenario.objects]
+        sweeps = 3 * world.horizon
+        on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
+        found = attribute(done.attack, names, limit, on_step)
+        images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = write_frames(output, done, frames, on_progress)
     if frames == "all":
         write_videos(output, done, on_progress)

@@ -19,9 +19,9 @@ from mi_nerfattack.attack.black_box import (
     SurrogateJudge,
 )
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
-from mi_nerfattack.attack.colours import Colours, vertex_colours
-from mi_nerfattack.attack.constraints import Constraints
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
+from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout, Occupancy
 from mi_nerfattack.rollout.function import Rollout

@@ -22,7 +22,7 @@ def field_of(levels: int, rng: np.random.Generator) -> GridField:
 
 @pytest.mark.parametrize("levels", [1, 3, 9])
 def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rng):
-    from mi_nerfattack.attack.colours import Colours, vertex_colours
+    from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
 
     field = field_of(levels, rng)
     colours = Colours(field)
@@ -34,8 +34,8 @@ def test_a_step_changes_colours_by_its_length_on_any_number_of_levels(levels, rn
 
 
 def test_projection_allows_colours_and_what_was_there(rng):
-    from mi_nerfattack.attack.colours import Colours
-    from mi_nerfattack.attack.constraints import MARGIN
+    from mi_nerfattack.attack.texture.colours import Colours
+    from mi_nerfattack.attack.texture.constraints import MARGIN
 
     field = field_of(1, rng)
     texture = field.texture.numpy().copy()
@@ -50,7 +50,7 @@ def test_projection_allows_colours_and_what_was_there(rng):
 
 
 def test_gradient_is_that_of_the_texture(rng):
-    from mi_nerfattack.attack.colours import Colours
+    from mi_nerfattack.attack.texture.colours import Colours
 
     field = field_of(3, rng)
     colours = Colours(field)
@@ -88,7 +88,7 @@ def test_rates_fall_when_nothing_more_is_gained_or_time_is_short():
 def test_statistics_of_a_texture_that_is_known():
     import mitsuba as mi
 
-    from mi_nerfattack.attack.texture_statistics import seen_weights, texture_statistics
+    from mi_nerfattack.attack.texture.statistics import seen_weights, texture_statistics
 
     loop, grid = toy.make_loop()
     original = toy.texture_of(grid)
@@ -112,7 +112,7 @@ def test_statistics_of_a_texture_that_is_known():
 
 
 def test_spectrum_tells_fine_structure_from_coarse(variant):
-    from mi_nerfattack.attack.texture_statistics import texture_statistics
+    from mi_nerfattack.attack.texture.statistics import texture_statistics
     from mi_nerfattack.fields import GridField, GridLayout
 
     grid = GridField(GridLayout(1, 8, 8), -np.ones(3), np.ones(3))

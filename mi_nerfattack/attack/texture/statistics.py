@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.attack.colours import vertex_colours
-from mi_nerfattack.attack.constraints import neighbours
+from mi_nerfattack.attack.texture.colours import vertex_colours
+from mi_nerfattack.attack.texture.constraints import neighbours
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 
@@ -98,7 +98,7 @@ def texture_statistics(
     return TextureStatistics(
         float(np.sqrt((weight * (change**2).mean(axis=1)).sum())),
         float(np.abs(change).max()),
-        float((weight * saturated.mean(axis=1)).sum()),
+        float(min(1, (weight * saturated.mean(axis=1)).sum())),  # weights round
         _variation(colour, seen, weights),
         _spectrum(change, seen, weights),
     )

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from mi_nerfattack.attack.constraints import Allowed, Constraints, vertex_points
+from mi_nerfattack.attack.texture.constraints import Allowed, Constraints, vertex_points
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError

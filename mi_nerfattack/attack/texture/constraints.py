@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.attack.gamut import Gamut
+from mi_nerfattack.attack.texture.gamut import Gamut
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField, GridLevel
 from mi_nerfattack.ranges import NonNegative, Positive, Share, checked

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import ImageCms
 
-from mi_nerfattack.attack.constraints import Constraints
-from mi_nerfattack.attack.gamut import Gamut
+from mi_nerfattack.attack.texture.constraints import Constraints
+from mi_nerfattack.attack.texture.gamut import Gamut
 from mi_nerfattack.errors import InputError
 
 CORNERS = np.array(np.meshgrid([0.2, 0.7], [0.2, 0.7], [0.2, 0.7])).reshape(3, 8).T
@@ -29,7 +29,7 @@ def test_colours_are_drawn_into_the_hull(rng):
 
 
 def test_attacks_keep_to_the_gamut_and_to_other_constraints(variant, rng):
-    from mi_nerfattack.attack.colours import Colours
+    from mi_nerfattack.attack.texture.colours import Colours
     from mi_nerfattack.fields import GridField, GridLayout
 
     field = GridField(GridLayout(1, 6, 6), -np.ones(3), np.ones(3))

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_nerfattack.attack.constraints import Constraints
+from mi_nerfattack.attack.texture.constraints import Constraints
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.fields.occupancy import Occupancy
@@ -27,7 +27,7 @@ def field(rng):
 
 
 def colours(field, **constraints):
-    from mi_nerfattack.attack.colours import Colours
+    from mi_nerfattack.attack.texture.colours import Colours
 
     return Colours(field, smoothing=0, constraints=Constraints(**constraints))
 

@@ -1,0 +1,191 @@
+"""What all attacks on a surrogate have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.rollout.function import Evaluation, Rollout
+from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
+from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """What one iteration gave, measured before its update.
+
+    Attributes:
+        iteration: from 0.
+        objective: the cost that is minimised, reduced over the poses.
+        cross_track_mean_m: mean |e| over steps and poses, metres.
+        cross_track_max_m: largest |e|, metres.
+        costs: of each pose, before their reduction; of a search, none.
+    """
+
+    iteration: int
+    objective: float
+    cross_track_mean_m: float
+    cross_track_max_m: float
+    costs: tuple[float, ...] = ()
+
+
+class AbstractAttack(ABC):
+    """Minimises a cost of the closed loop, iteration by iteration.
+
+    Everything that is needed to go on is in :meth:`tensors`.
+
+    Args:
+        rollout: the loop, its objective and its adjoint.
+        route: the lane centre, for the record.
+        initial: (m, n) initial states.
+        freedom: what may change.
+        sensor: of the loop.
+
+    Attributes:
+        sweeps: of an iteration through the horizon, there and back.
+        history: a record an iteration.
+        best_objective: least so far.
+        best_mean_m: mean |e| of the same iteration, metres.
+        best_offsets: (k, 6) object offsets of the same.
+        whole: False while an update is half done, when the state must not be kept.
+    """
+
+    sweeps: ClassVar[int]
+
+    def __init__(
+        self,
+        rollout: Rollout,
+        route: Route,
+        initial: Any,
+        freedom: Freedom,
+        sensor: AbstractDifferentiableSensor,
+    ) -> None:
+        self.rollout = rollout
+        self.route = route
+        self.initial = initial
+        self.freedom = freedom
+        self.sensor = sensor
+        self.history: list[IterationRecord] = []
+        self.best_objective = np.inf
+        self.best_mean_m = 0.0
+        self.best_offsets = self._offsets()
+        self.whole = True
+
+    @property
+    def iteration(self) -> int:
+        """Number of finished iterations."""
+        return len(self.history)
+
+    @property
+    @abstractmethod
+    def is_over(self) -> bool:
+        """Whether to stop here."""
+
+    @property
+    @abstractmethod
+    def has_converged(self) -> bool:
+        """Whether there was nothing more to gain."""
+
+    @property
+    def _objectives(self) -> list[float]:
+        return [record.objective for record in self.history]
+
+    @abstractmethod
+    def step(self, on_step: Callable[[int], None] | None = None) -> IterationRecord:
+        """Do one iteration.
+
+        Args:
+            on_step: called after each of the `sweeps` x horizon control periods.
+
+        Raises:
+            InputError: objective or gradient is not finite; nothing is updated.
+        """
+
+    @property
+    @abstractmethod
+    def best(self) -> list[np.ndarray]:
+        """Textures (n_vertices, 3) of the iteration with the least objective."""
+
+    @property
+    def best_is_judged(self) -> bool:
+        """Whether the best parameters were measured by this attack's objective."""
+        return not self.history or np.isfinite(self.best_objective)
+
+    def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
+        """Measure the best parameters anew; costs one drive.
+
+        Args:
+            on_step: called after each control period.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: every iteration is judged")
+
+    def finish(self) -> None:
+        """Judge what no iteration has judged yet, and install the best."""
+        self.restore_best()
+
+    def restore_best(self) -> None:
+        """Give the objects the parameters of the iteration with the least objective."""
+        self.sensor.set_textures(self.best)
+        if self.sensor.offsets() is not None:
+            self.sensor.set_offsets(self.best_offsets)
+
+    def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
+        """Drive with what the objects look like, seen by another sensor.
+
+        Args:
+            sensor: that shows the same objects.
+
+        Returns:
+            mean distance from the lane centre, metres.
+        """
+        loop = replace(self.rollout.loop, sensor=sensor)
+        seen = replace(self.rollout, loop=loop).measure(self.initial)
+        return float(distances(self.route, seen).mean())
+
+    @abstractmethod
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Return the complete state as arrays."""
+
+    @abstractmethod
+    def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
+        """Take over a state written by :meth:`tensors`, and install its best.
+
+        Raises:
+            InputError: the entries do not fit each other, or what is allowed.
+            KeyError: an entry is missing.
+        """
+
+    def go_on_from(self, tensors: dict[str, np.ndarray]) -> None:
+        """Take over the state of an attack that differed from this one.
+
+        By default, nothing of it counts.
+
+        Args:
+            tensors: its :meth:`tensors`.
+
+        Raises:
+            InputError: nothing of it counts here.
+            KeyError: an entry is missing.
+        """
+        raise InputError(
+            f"{type(self).__name__}: what it was told is of another scenario, and "
+            "counts no longer; start a new run folder"
+        )
+
+    def _offsets(self) -> np.ndarray:
+        """Return the objects' offsets, (k, 6); zeros where they cannot be moved."""
+        offsets = self.sensor.offsets()
+        count = len(self.sensor.fields)
+        return np.zeros((count, 6)) if offsets is None else offsets
+
+
+def distances(route: Route, seen: Evaluation) -> np.ndarray:
+    """Return the distances from the lane centre, metres, of all states of drives."""
+    states = seen.trajectory.states_numpy()[:, 1:]
+    return np.abs(route.cross_track_numpy(states.reshape(-1, states.shape[2])))

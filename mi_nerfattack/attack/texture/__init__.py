@@ -1,0 +1,1 @@
+"""What an attack steps in: colours of an object, and which of them are allowed."""
