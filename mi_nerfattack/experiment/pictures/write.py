@@ -47,6 +47,8 @@ def write_images(
         found = attribute(done.attack, names, limit, on_step)
         images |= write_attribution(output, found, world.fields)
     images["First-person frames"] = write_frames(output, done, frames, on_progress)
+    for path in (output / "videos").glob("*.mp4"):  # of an earlier run
+        path.unlink()
     if frames == "all":
         write_videos(output, done, on_progress)
     return images
