@@ -77,6 +77,11 @@ class AbstractBlackBox(AbstractPolicy):
             control = steering(values, len(images), self.output, self.name)
         return to_row(self.control_scale * control, image), (step + 1, past)
 
+    def planes(self, image: Any, memory: Memory) -> np.ndarray:
+        """Return the stack of pre-processed frames, whatever their layout."""
+        images = to_torch(image).to("cpu", torch.float32)
+        return self.preprocess.planes(images, memory[1])
+
     def control(self, image: Any, goal: Any) -> Any:
         """Ask about first images."""
         return self.step(image, goal, self.initial_memory(len(image)))[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 
 from mi_nerfattack.errors import InputError
@@ -292,6 +293,17 @@ class Preprocess:
         for transform in self.transforms:
             planes = transform.apply(planes)
         return planes
+
+    def planes(self, image: torch.Tensor, past: torch.Tensor) -> np.ndarray:
+        """Return (n, k, h, w): the stack that images complete, whatever the layout.
+
+        Args:
+            image: as for `transform`.
+            past: as for `stack`.
+        """
+        with torch.no_grad():
+            frames, _ = self.select(self.transform(image), past)
+            return frames.flatten(1, 2).numpy(force=True)
 
     def stack(
         self, planes: torch.Tensor, past: torch.Tensor

@@ -98,11 +98,9 @@ class TorchPolicy(AbstractPolicy):
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
         """Return the stack of pre-processed frames, whatever their layout."""
-        with torch.no_grad():
-            images = to_torch(image)
-            images = images.to(self._precision() or images.dtype)
-            frames, _ = self.preprocess.select(*self._transform(images, memory))
-            return frames.flatten(1, 2).numpy(force=True)
+        images = to_torch(image)
+        images = images.to(self._precision() or images.dtype)
+        return self.preprocess.planes(images, self._past(images, memory))
 
     def step_vjp(
         self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
@@ -177,7 +175,8 @@ class TorchPolicy(AbstractPolicy):
         self.module.to(image.device)
         image = image.to(self._precision() or image.dtype)
         memory = tuple(part.to(image) for part in memory)
-        planes, past = self._transform(image, memory)
+        planes = self.preprocess.transform(image)
+        past = self._past(planes, memory)
         network_image, past = self.preprocess.stack(planes, past)
         hidden = memory[1:] if self.preprocess.history else memory
         goals = self.goal.arguments(expand_goals(goal, image), image)
@@ -195,13 +194,9 @@ class TorchPolicy(AbstractPolicy):
         stack = (past,) if self.preprocess.history else ()
         return self.control_scale * control, (*stack, *after)
 
-    def _transform(
-        self, image: torch.Tensor, memory: Memory
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the planes of images, and past ones."""
-        planes = self.preprocess.transform(image)
-        past = memory[0] if self.preprocess.history else planes.new_zeros(0, 0)
-        return planes, past
+    def _past(self, like: torch.Tensor, memory: Memory) -> torch.Tensor:
+        """Return earlier frames of the stack; none where there is no stack."""
+        return memory[0] if self.preprocess.history else like.new_zeros(0, 0)
 
     def _plain_layers(self) -> AbstractContextManager[None]:
         """Switch cuDNN off for recurrent layers: it differentiates none in evaluation.

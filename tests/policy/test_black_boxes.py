@@ -76,9 +76,13 @@ def test_black_boxes_see_the_frame_stack(tmp_path, rng):
         tmp_path, kind="callable", file="mine.py:drive", preprocess=preprocess
     )
     memory = policy.initial_memory(1)
-    expected = [0.0, -0.25, -0.25]
+    expected, before = [0.0, -0.25, -0.25], 0.25
     for level, control in zip((0.25, 0.5, 0.75), expected, strict=True):
         image = mi.TensorXf(np.full((1, 66, 200, 3), level, "f4"))
+        planes = policy.planes(image, memory)
+        assert planes.shape == (1, 2, 4, 5)
+        assert planes[0, :, 1, 2] == pytest.approx([before, level], abs=1e-6)
+        before = level
         seen, memory = policy.step(image, 0, memory)
         assert seen.numpy() == pytest.approx(control, abs=1e-6)
         assert memory[1].numel() == 4 * 5
