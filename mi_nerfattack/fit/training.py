@@ -192,11 +192,15 @@ class Training:
 
         It keeps the occupancy of the last steps: density in other cells has had no
         part in what was compared. Cells of a grid that do not show are emptied, since
-        files keep what they read; marches through an NGP also skip thin octants.
+        files keep what cells read, and a thinner shell needs half the step; marches
+        through an NGP also skip thin octants.
         """
         self._install({k: dr.detach(self.optimiser[k]) for k in self._values()})
         if isinstance(self.field, GridField):
             unpack(self.field, dr.detach(self.field.packed))
+            self.field.refine(
+                self.field.step_m / 2
+            )  # for the thinner shell that is left
             least, seed = self.options.min_weight, self.options.seed
             shown = seen_matter(self.field, self.images, self.fitted, least, seed)
             self.field.occupy(Occupancy(shown))
