@@ -66,7 +66,7 @@ class Asset:
     """End the fit after this time."""
     resume: bool = False
     """Continue an interrupted fit from its checkpoint, beside the output."""
-    min_weight: float = 0.05
+    min_weight: float = 0.02
     """Cells that give no ray of the views this share of its colour are emptied: more of
     them make a smaller file, and leave out what is seen through."""
     batch_rays: int = 4096

@@ -71,7 +71,7 @@ class FitOptions:
     occupancy_resolution: Count = 128
     occupancy_every: Count = 16
     occupancy_start: Whole = 128
-    min_weight: Share = 0.05
+    min_weight: Share = 0.02
     sky: bool = True
     exposure: bool = False
     poses: bool = False
