@@ -78,7 +78,7 @@ def test_every_row_of_every_study_is_a_scenario(tmp_path):
     for row in robust.ROWS:
         path = place.write(1.5, robust.scenario_keys(row), tmp_path)
         scenario, _ = load_scenario(path)
-        frames = scenario.attack.poses * scenario.attack.max_iterations
+        frames = scenario.attack.poses * scenario.attack.method.max_iterations
         assert frames == robust.DRIVES
     for row in textures.ROWS:
         load_scenario(place.write(1.5, textures.scenario_keys(row), tmp_path))
