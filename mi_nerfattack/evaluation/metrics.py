@@ -30,7 +30,7 @@ def summarise(
     - `n`: number of runs;
     - `cross_track_mean_m`: mean of |e| over all steps of all runs;
     - `cross_track_mean_ci95_m`: of `random`, where every run has a texture of its own,
-      the 95 % percentile bootstrap interval of the mean over runs of each run's mean of
+      the 95 % interval (BCa bootstrap) of the mean over runs of each run's mean of
       |e|; null for a single run, and for cases that show one look, however many starts
       they are driven from: starts tell nothing about other attacks;
     - `cross_track_mean_worst_run_m`: largest of the runs' means;

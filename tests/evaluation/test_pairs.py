@@ -1,0 +1,183 @@
+"""Paired comparisons of made drives whose figures are known by hand."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers.made_drives import make_document, make_drive
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.intervals import (
+    bootstrap_interval,
+    interquartile_mean,
+    mean_interval,
+)
+from mi_nerfattack.evaluation.pairs import (
+    Outcome,
+    compare,
+    compare_departures,
+    outcomes,
+)
+
+ERROR, OUT = "cross_track_mean_m", "wheel_out_s"
+
+#: Mean errors by scenario and seed: of two starts attacked, and of the same unattacked.
+ERRORS = {
+    ("bend", 0): ([0.4, 0.6], [0.1, 0.1]),  # 0.5 - 0.1 = 0.4
+    ("bend", 1): ([0.7, 0.7], [0.2, 0.0]),  # 0.7 - 0.1 = 0.6
+    ("lane", 0): ([0.3, 0.3], [0.1, 0.1]),  # 0.3 - 0.1 = 0.2
+    ("lane", 1): ([1.6, 2.4], [0.4, 0.4]),  # 2.0 - 0.4 = 1.6
+}
+
+
+def side(number: int, figure: str = ERROR, table=None) -> list[Outcome]:
+    case = ("attack", "own")[number]
+    return [
+        Outcome(name, seed, "surrogate", case, run, run, {figure: value})
+        for (name, seed), sides in (ERRORS if table is None else table).items()
+        for run, value in enumerate(sides[number])
+    ]
+
+
+def test_effect_by_hand():
+    found = compare(reversed(side(0)), side(1), ERROR)
+    assert (found.attacks, found.drives, found.unpaired) == (4, 8, 0)
+    assert found.seeds == 2
+    assert found.one == pytest.approx(3.5 / 4)
+    assert found.other == pytest.approx(0.7 / 4)
+    assert found.difference == pytest.approx(2.8 / 4)
+    assert found.iqm == pytest.approx((0.4 + 0.6) / 2)  # without 0.2 and 1.6
+    assert found.ratio == pytest.approx(5)
+    # bend: 0.4 and 0.6, squares about their mean 0.02; lane: 0.2 and 1.6, 0.98; of
+    # one degree of freedom each
+    assert found.spread == pytest.approx(math.sqrt((0.02 + 0.98) / 2))
+
+
+def test_interval_is_efrons():
+    """Of all 256 resamples of the four differences, by his formulas.
+
+    Leaving out 0.2, 0.4, 0.6, 1.6 gives means 2.6/3, 2.4/3, 2.2/3, 1.2/3, whose
+    distances below their mean are d = -0.5/3, -0.3/3, -0.1/3, 0.9/3: the sum of cubes
+    is 0.576/27, that of squares 1.16/9, and a = 0.576 / (6 * 1.16^1.5) = 0.0768.
+    """
+    differences = (0.2, 0.4, 0.6, 1.6)
+    resampled = np.sort([np.mean(r) for r in itertools.product(differences, repeat=4)])
+    below = ((resampled < 0.7 - 1e-9).sum() + (resampled < 0.7 + 1e-9).sum()) / 512
+    bias, normal = scipy.stats.norm.ppf(below), scipy.stats.norm
+    ends = []
+    for z in normal.ppf([0.025, 0.975]):
+        level = normal.cdf(bias + (bias + z) / (1 - 0.0768 * (bias + z)))
+        ends.append(resampled[int(level * 256)])
+    assert compare(side(0), side(1), ERROR).difference_ci95 == pytest.approx(ends)
+    percentile = np.quantile(resampled, [0.025, 0.975])
+    assert np.abs(ends - percentile).max() > 0.04  # which they must differ from
+
+
+def test_looks_of_one_start_are_averaged_and_strays_left_out():
+    attack = [Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})]
+    attack.append(Outcome("bend", 7, "surrogate", "attack", 0, 0, {ERROR: 9.0}))
+    looks = [
+        Outcome("bend", 0, "surrogate", "random", run, run % 2, {ERROR: value})
+        for run, value in enumerate([0.1, 8.0, 0.3])
+    ]
+    found = compare(attack, looks, ERROR)
+    assert (found.attacks, found.drives, found.unpaired) == (1, 1, 2)
+    assert (found.one, found.other) == (0.5, pytest.approx(0.2))
+
+
+def test_one_attack_has_no_interval_and_no_spread():
+    table = {("bend", 0): ERRORS["bend", 0]}
+    found = compare(side(0, table=table), side(1, table=table), ERROR)
+    assert found.attacks == found.seeds == 1
+    assert found.difference == found.iqm == pytest.approx(0.4)
+    assert found.ratio == pytest.approx(5)
+    intervals = found.difference_ci95, found.iqm_ci95, found.ratio_ci95
+    assert intervals == (None, None, None) and found.spread is None
+
+
+def test_equal_attacks_give_points():
+    table = {("bend", seed): ([0.75], [0.25]) for seed in range(5)}
+    found = compare(side(0, table=table), side(1, table=table), ERROR)
+    assert found.difference_ci95 == found.iqm_ci95 == [0.5, 0.5]
+    assert found.ratio_ci95 == [3, 3]
+    assert found.spread == 0 and found.seeds == 5
+
+
+def test_there_is_no_ratio_to_nothing():
+    table = {("bend", 0): ([0.5], [0.0]), ("bend", 1): ([0.5], [0.25])}
+    found = compare(side(0, table=table), side(1, table=table), ERROR)
+    assert (found.ratio, found.ratio_ci95) == (None, None)
+    assert found.difference_ci95 == [0.25, 0.5]
+
+
+def test_one_that_differs_does_not_tell_the_interval_of_the_quartiles():
+    values = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+    assert interquartile_mean(values) == 0
+    assert bootstrap_interval(interquartile_mean, (values,), 0) is None
+    assert mean_interval(values, 0) is not None
+    assert interquartile_mean(np.array([0.0, 0.0, 3.0])) == 1  # no quarter of three
+
+
+def test_departures_by_hand():
+    """Of eight attacks, five depart under attack alone, and one on both sides."""
+    table = {("bend", seed): ([0.5, 1.5], [0.0, 0.9]) for seed in range(5)}
+    table |= {("lane", 0): ([3.0], [1.0]), ("lane", 1): ([0.9], [0.9])}
+    table["lane", 2] = [0.0, 1.9], [0.0, 0.0]  # once, but not on average
+    sides = side(0, OUT, table), side(1, OUT, table)
+    found = compare_departures(*sides)
+    assert (found.both, found.one, found.other, found.neither) == (1, 5, 0, 2)
+    assert found.p_value == pytest.approx(2 / 2**5)  # five of five, either way
+    # Wilson's interval of 6 in 8, by its formula
+    z, share = 1.959963984540054, 6 / 8
+    middle = (share + z**2 / 16) / (1 + z**2 / 8)
+    half = z / (1 + z**2 / 8) * math.sqrt(share * (1 - share) / 8 + z**2 / 256)
+    assert found.one_ci95 == pytest.approx([middle - half, middle + half])
+    assert found.other_ci95[0] < 1 / 8 < found.other_ci95[1]
+    assert compare_departures(sides[1], sides[0]).p_value == found.p_value
+    assert compare_departures(sides[0], sides[0]).p_value == 1  # none differ
+    assert compare_departures(*sides, least=0.2).both == 7
+
+
+def test_a_run_gives_its_drives_with_their_starts():
+    drives = [make_drive([0.1], case="own", run=k) for k in range(2)]
+    drives += [make_drive([0.2 + 0.1 * k], case="random", run=k) for k in range(3)]
+    document = make_document(drives)
+    found = outcomes(document, "surrogate", "random", "bend")
+    assert [(o.scenario, o.seed, o.run, o.start) for o in found] == [
+        ("bend", 7, 0, 0),
+        ("bend", 7, 1, 1),
+        ("bend", 7, 2, 0),
+    ]
+    assert found[2].figures[ERROR] == pytest.approx(0.4)
+    assert outcomes(document, "surrogate", "own")[0].scenario == "x"
+    effect = compare(found, outcomes(document, "surrogate", "own", "bend"), ERROR)
+    assert effect.difference == pytest.approx((0.2 + 0.2) / 2)
+    with pytest.raises(InputError, match="mitsuba / own: no such.*surrogate / random"):
+        outcomes(document, "mitsuba", "own")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"case": "random"}, "drives of surrogate / attack, surrogate / random"),
+        ({"run": 0}, "bend, seed 0, run 0: twice on one side"),
+        ({"figures": {}}, f"bend, seed 0, run 1: {ERROR} is None"),
+        ({"figures": {ERROR: math.nan}}, f"run 1: {ERROR} is nan"),
+    ],
+)
+def test_sides_that_cannot_be_compared_are_refused(change, message):
+    drive = Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})
+    second = replace(drive, run=1, start=1)
+    with pytest.raises(InputError, match=message):
+        compare([drive, replace(second, **change)], [drive], ERROR)
+
+
+def test_without_pairs_there_is_nothing_to_compare():
+    drive = Outcome("bend", 0, "surrogate", "attack", 0, 0, {ERROR: 0.5})
+    with pytest.raises(InputError, match="1 starts on one side, 0 on the other"):
+        compare([drive], [], ERROR)
