@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -112,6 +112,17 @@ class AbstractAttack(ABC):
     def best(self) -> list[np.ndarray]:
         """Textures (n_vertices, 3) of the iteration with the least objective."""
 
+    @abstractmethod
+    def curve(self, backward_multiple: float) -> np.ndarray:
+        """Return the best so far against the cost, a row a measurement.
+
+        Args:
+            backward_multiple: cost of a pass back, in drives.
+
+        Returns:
+            (n, 3): see :func:`best_so_far`.
+        """
+
     @property
     def best_is_judged(self) -> bool:
         """Whether the best parameters were measured by this attack's objective."""
@@ -183,6 +194,25 @@ class AbstractAttack(ABC):
         offsets = self.sensor.offsets()
         count = len(self.sensor.fields)
         return np.zeros((count, 6)) if offsets is None else offsets
+
+
+def best_so_far(
+    frames: Sequence[float], objectives: Sequence[float], means_m: Sequence[float]
+) -> np.ndarray:
+    """Return what a search had found after each of its measurements.
+
+    Args:
+        frames: rendered until the end of each.
+        objectives: of each, minimised.
+        means_m: mean |e| of each, metres.
+
+    Returns:
+        (n, 3): frames until then, least objective, its mean |e| in metres.
+    """
+    values = np.array(objectives, np.float64)
+    before = np.minimum.accumulate(np.append(np.inf, values[:-1]))[: len(values)]
+    best = np.maximum.accumulate(np.where(values < before, np.arange(len(values)), 0))
+    return np.column_stack([frames, values[best], np.array(means_m)[best]])
 
 
 def distances(route: Route, seen: Evaluation) -> np.ndarray:

@@ -12,7 +12,12 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from mi_nerfattack.attack.base import AbstractAttack, IterationRecord, distances
+from mi_nerfattack.attack.base import (
+    AbstractAttack,
+    IterationRecord,
+    best_so_far,
+    distances,
+)
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring
@@ -60,6 +65,7 @@ class GradientAttack(AbstractAttack):
         self.optimiser = Adam(lr=1.0)
         self._colourings: dict[str, AbstractColouring] = {}
         self._best: Parameters = {}  # of the iteration with the least objective
+        self._last: IterationRecord | None = None  # what the last update gave
         if self.freedom.texture_rate is not None:
             for i, field in enumerate(self.sensor.fields):
                 colouring = self.freedom.colouring(field)
@@ -102,8 +108,21 @@ class GradientAttack(AbstractAttack):
 
     def finish(self) -> None:
         """See :meth:`AbstractAttack.finish`."""
-        self.measure()
+        self._last = self.measure()
         self.restore_best()
+
+    def curve(self, backward_multiple: float) -> np.ndarray:
+        """See :meth:`AbstractAttack.curve`; once finished, the last update counts too.
+
+        A measurement is a drive, after which an update takes a pass back.
+        """
+        records = [*self.history, *([self._last] if self._last else [])]
+        drive = self.rollout.horizon * len(self.initial[0])
+        frames = [
+            drive * (1 + k * (1 + backward_multiple)) for k in range(len(records))
+        ]
+        means = [record.cross_track_mean_m for record in records]
+        return best_so_far(frames, [record.objective for record in records], means)
 
     def measure(self) -> IterationRecord:
         """Drive with the present parameters, so that the last update counts too."""

@@ -227,6 +227,19 @@ class _Baseline(_Model):
     attack_objective: float
 
 
+class _Curve(_Model):
+    frames: list[pydantic.PositiveInt]
+    objective: list[float]
+    cross_track_mean_m: list[pydantic.NonNegativeFloat]
+
+    @pydantic.model_validator(mode="after")
+    def _count_rows(self) -> _Curve:
+        counts = {len(column) for _, column in self}
+        if len(counts) > 1:
+            raise ValueError("columns of different lengths")
+        return self
+
+
 _Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
@@ -258,6 +271,7 @@ class _Document(_Model):
     textures: dict[str, _Texture] | None = None
     verdict: list[str] | None = None
     baseline: _Baseline | None = None
+    curve: _Curve | None = None
     bricks: _Bricks | None = None
     object_poses: dict[str, Any] | None = None
     ignored_changes: list[str] | None = None

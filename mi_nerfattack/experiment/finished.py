@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.scenario.world import Appearance, World
@@ -41,6 +43,22 @@ class Finished:
         look = self.looks[case]
         assert look is not None, "objects are there"
         return look
+
+    @property
+    def curve(self) -> dict[str, list[float]] | None:
+        """What the attack had found after how many frames, for ``metrics.json``.
+
+        None where changes were ignored: then its objectives may have several units.
+        """
+        if self.ignored:
+            return None
+        multiple = self.baseline["backward_multiple"]
+        frames, objectives, means = self.attack.curve(multiple).T
+        return {
+            "frames": np.rint(frames).astype(int).tolist(),
+            "objective": objectives.tolist(),
+            "cross_track_mean_m": means.tolist(),
+        }
 
     @property
     def replayed(self) -> list[Drive]:

@@ -98,6 +98,8 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
         more["object_poses"] = _poses(world, done.look(ATTACK))
     if done.ignored:
         more["ignored_changes"] = done.ignored
+    if (curve := done.curve) is not None:
+        more["curve"] = curve
     more["converged"] = done.attack.has_converged
     if scenario.scene.bricks is not None:
         more["bricks"] = _in_bricks(done)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers import toy_loop as toy
 
+from mi_nerfattack.attack.base import best_so_far
 from mi_nerfattack.attack.objectives import (
     AbsoluteDeviation,
     CrossTrackDeviation,
@@ -74,3 +75,39 @@ def test_an_attack_makes_it_smaller(loop, name):
     grid.set_parameter("texture", texture)
     first = attack.history[0].objective
     assert last < first - 0.01 * abs(first)
+
+
+def test_the_curve_counts_drives_and_passes_back(loop):
+    """Two poses over six periods are 12 frames; a pass back costs 1.5 drives here."""
+    from mi_nerfattack.attack.freedom import Freedom
+    from mi_nerfattack.attack.gradient import GradientAttack
+    from mi_nerfattack.rollout.function import Rollout
+
+    closed, grid = loop
+    texture = toy.texture_of(grid)
+    initial = closed.initial(np.array([[0.0, 0.1, 0.0], [0.0, 0.2, 0.05]]))
+    rollout = Rollout(closed, CASES["absolute"][0], HORIZON)
+    attack = GradientAttack(rollout, toy.ROUTE, initial, Freedom(0.3))
+    assert attack.curve(1.5).shape == (0, 3)
+    attack.step()
+    attack.step()
+    before = closed.sensor.renders
+    attack.finish()
+    curve, (first, second) = attack.curve(1.5), attack.history
+    grid.set_parameter("texture", texture)
+    assert closed.sensor.renders - before == 12
+    assert curve[:, 0].tolist() == [12, 12 + 30, 12 + 60]
+    assert curve[0, 1:].tolist() == [first.objective, first.cross_track_mean_m]
+    assert curve[1, 1] == min(first.objective, second.objective)
+    assert curve[2, 1] == attack.best_objective < first.objective
+    assert curve[2, 2] == attack.best_mean_m
+
+
+def test_the_curve_keeps_the_first_of_the_best():
+    found = best_so_far([2, 4, 6, 8], [-1.0, 3.0, -1.0, -2.0], [0.1, 0.4, 0.3, 0.2])
+    assert found.tolist() == [
+        [2, -1.0, 0.1],
+        [4, -1.0, 0.1],
+        [6, -1.0, 0.1],
+        [8, -2.0, 0.2],
+    ]

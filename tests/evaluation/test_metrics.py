@@ -176,6 +176,11 @@ def test_document_follows_the_schema(tmp_path):
         (("cost", "wall_s"), float("nan"), "metrics.cost.wall_s"),
         (("routes",), {}, "metrics.routes"),
         (
+            ("curve",),
+            {"frames": [4], "objective": [], "cross_track_mean_m": [0.1]},
+            "metrics.curve: Value error, columns of different lengths",
+        ),
+        (
             ("routes", "straight", "moon"),
             {"lost": {}},
             "metrics.routes.straight.moon.lost",

@@ -43,6 +43,7 @@ def leave_out_results(monkeypatch):
         cost = effort().model_dump()
         files.write_json(output / "metrics.json", {"cost": cost})
         found = {"ignored_changes": done.ignored, "flags": done.flags}
+        found["curve"] = done.curve
         return {"cost": cost, "drives": done.drives, **found}
 
     monkeypatch.setattr(results, "write_results", only_numbers)

@@ -49,6 +49,10 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert rows == [(1, 4), (2, 4)]
     # four cases of 2 twice, random looks judged, driven, deployed; 3 there and back
     assert cost["renders"] >= 4 * (16 + 2 * count + few + 6)
+    curve, period = document["curve"], 4 * (1 + multiple)
+    assert curve["frames"] == [round(4 + k * period) for k in range(4)]
+    assert curve["objective"][-1] == baseline["attack_objective"]
+    assert curve["objective"] == sorted(curve["objective"], reverse=True)
     assert document["converged"] is False  # in 3 iterations
     [(name, texture)] = document["textures"].items()
     assert name == "ball" and 0 < texture["l2"] <= texture["linf"] <= 1

@@ -43,6 +43,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     assert first[0] == 4 * 4 + 1 and len(checkpoint_of(output)["history"]) == 6
     line = "scenario.attack.learning_rate: 0.5 -> 0.25"
     assert line in document["ignored_changes"]
+    assert document["curve"] is None  # of two learning rates
     assert any(line in notice for notice in notices)
     assert "learning_rate = 0.25" in (output / "scenario.toml").read_text()
     # from then on the run is that of the changed scenario, its drives too

@@ -63,6 +63,8 @@ def test_an_interrupted_search_goes_on(folder, tmp_path, no_results, method):
     interrupt(folder, output, *stage, change=change)
     resumed = job(folder, output, change).run(resume=True)
     assert_same_drives(resumed["drives"], whole["drives"])
+    assert resumed["curve"] == whole["curve"]
+    assert resumed["curve"]["frames"] == [2, 4, 6, 8, 10, 12]
 
 
 def test_a_search_does_not_go_on_in_another_scenario(folder, tmp_path, no_results):

@@ -49,6 +49,8 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
     assert len(checkpoint_of(output)["history"]) == 50
     assert_same_state(output, whole)
     assert_same_drives(result["drives"], expected["drives"])
+    assert result["curve"] == expected["curve"]
+    assert len(result["curve"]["frames"]) == 51  # what the last update gave, too
     assert result["cost"]["processes"] == 3
     assert 0 < result["cost"]["checkpoint_s"] < result["cost"]["wall_s"]
 

@@ -8,6 +8,7 @@ from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 
+from mi_nerfattack.attack.base import best_so_far
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import OnStep
@@ -133,15 +134,12 @@ class BlackBoxAttack:
         """Return the best so far against the cost, a row a judgement.
 
         Returns:
-            (n, 3): frames until then, least objective, its mean |e| in metres.
+            (n, 3): see :func:`best_so_far`.
         """
-        rows, best, frames = [], None, 0
-        for judged in self.history:
-            frames += judged.frames
-            if best is None or judged.objective < best.objective:
-                best = judged
-            rows.append((frames, best.objective, best.cross_track_mean_m))
-        return np.array(rows, np.float64).reshape(-1, 3)
+        frames = np.cumsum([judged.frames for judged in self.history])
+        objectives = [judged.objective for judged in self.history]
+        means = [judged.cross_track_mean_m for judged in self.history]
+        return best_so_far(frames.tolist(), objectives, means)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return what :meth:`load_tensors` needs: the history."""

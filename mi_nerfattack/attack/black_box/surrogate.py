@@ -115,6 +115,11 @@ class SurrogateSearch(AbstractAttack):
         numbers = objective, mean, judged.cross_track_max_m
         self.history.append(IterationRecord(self.iteration, *numbers))
 
+    def curve(self, backward_multiple: float) -> np.ndarray:
+        """See :meth:`AbstractAttack.curve`; nothing passes back here."""
+        del backward_multiple
+        return self._attack.curve()
+
     def tensors(self) -> dict[str, np.ndarray]:
         """See :meth:`AbstractAttack.tensors`."""
         return self._attack.tensors()

@@ -13,6 +13,7 @@ from mi_nerfattack.experiment.pictures.videos import write_videos
 from mi_nerfattack.experiment.replayed import plot_control_changes
 from mi_nerfattack.experiment.stages import OnProgress, step_counter
 from mi_nerfattack.report.plots import drives as plots
+from mi_nerfattack.report.plots.convergence import convergence
 from mi_nerfattack.scenario.world import object_footprints
 
 
@@ -73,5 +74,5 @@ def _write_plots(
         limit,
     )
     plots.errors(images["Cross-track error"], drives, limit)
-    plots.convergence(images["Convergence of the attack"], history)
+    convergence(images["Convergence of the attack"], history, done.curve)
     return images

@@ -1,4 +1,4 @@
-"""Plots of drives and of an attack's progress, written as PNG files.
+"""Plots of drives, written as PNG files.
 
 Colours stay apart for colour-blind readers (after Okabe and Ito 2008) and are drawn
 with different widths and dashes too. Figures are 1200 pixels wide.
@@ -6,7 +6,7 @@ with different widths and dashes too. Figures are 1200 pixels wide.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -256,31 +256,6 @@ def control_change(
         axis.set_ylabel(f"change of control ({unit})")
         axis.grid(alpha=0.25)
         figure.legend(loc="outside lower center", ncols=5, frameon=False)
-
-
-def convergence(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
-    """Plot an attack's objective and mean cross-track error per iteration.
-
-    Args:
-        path: PNG file.
-        history: one mapping per iteration with the keys `objective` and
-            `cross_track_mean_m`; iterations count from 0.
-    """
-    names = {"objective": "objective", "cross_track_mean_m": "mean distance (m)"}
-    iterations = np.arange(len(history))
-    marker = "o" if len(history) < 60 else ""
-    with chart(path, 4.2) as figure:
-        for axis, (name, label) in zip(
-            figure.subplots(2, 1, sharex=True), names.items(), strict=True
-        ):
-            values = [float(entry[name]) for entry in history]
-            axis.plot(iterations, values, color="#D55E00", marker=marker, markersize=3)
-            axis.set_ylabel(label)
-            axis.grid(alpha=0.25)
-            axis.xaxis.get_major_locator().set_params(integer=True)
-        figure.axes[0].set_title("Attack, per iteration", loc="left")
-        figure.axes[-1].set_xlabel("iteration")
-        figure.align_ylabels()
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:

@@ -63,13 +63,8 @@ def test_overhead_has_a_panel_for_an_environment_of_your_own(tmp_path):
     assert one.shape != two.shape
 
 
-def test_errors_and_convergence(tmp_path):
+def test_errors(tmp_path):
     plots.errors(tmp_path / "errors.png", plot_drives(), 0.85)
     image = files.read_image(tmp_path / "errors.png")
     assert image.shape[1] == plots.WIDTH_PX
     assert min(count(image, BLUE), count(image, RED)) > 500
-    history = [{"objective": i, "cross_track_mean_m": 0.1 * i} for i in range(5)]
-    plots.convergence(tmp_path / "convergence.png", history)
-    image = files.read_image(tmp_path / "convergence.png")
-    assert image.shape[1] == plots.WIDTH_PX
-    assert count(image, RED) > 1000
