@@ -21,6 +21,7 @@ from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
+from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
 
 
@@ -46,6 +47,7 @@ COMMANDS: dict[str, type[Command]] = {
     "evaluate": Evaluate,
     "check": Check,
     "attack": Attack,
+    "sweep": Sweep,
 }
 
 __all__ = ["COMMANDS", "Command"]

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomlkit
 from pydantic import Field, ValidationError, model_validator
-from tomlkit.container import OutOfOrderTableProxy
-from tomlkit.items import AoT, Table
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -32,6 +31,7 @@ from mi_nerfattack.scenario.deployment import (
     RenderedDeployment,
     labelled,
 )
+from mi_nerfattack.scenario.lines import tell
 from mi_nerfattack.scenario.named_file import File, NamedFile
 from mi_nerfattack.scenario.objective import ObjectiveSection
 from mi_nerfattack.scenario.policy import (
@@ -39,14 +39,14 @@ from mi_nerfattack.scenario.policy import (
     PolicySection,
     build_differentiable,
 )
-from mi_nerfattack.scenario.section import Location, Section, problems, refuse
+from mi_nerfattack.scenario.section import Section, problems, refuse
 from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
 from mi_nerfattack.vehicle.route.route import Route
 
+#: Returns the name of a file without its folder, and the SHA-256 of its content.
+Content = Callable[[NamedFile], dict[str, str]]
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
-_MARK = "a line that no file has"
 _MAX_CHARACTERS = 1 << 16
-_MOST_PROBLEMS = 8  # that are told
 
 Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
@@ -252,8 +252,11 @@ class Scenario(Section):
                 if getattr(section, key) != section.defaults()[key]:
                     refuse(f"{where}.{key}", f"{xml} says it; leave it out")
 
-    def identity(self) -> dict[str, str]:
+    def identity(self, content: Content = NamedFile.content) -> dict[str, str]:
         """Return all values by key, as JSON, and the content of the files they name.
+
+        Args:
+            content: reads it; one that remembers serves many scenarios.
 
         Returns:
             ``{"scenario.drive.horizon": "60", ...}``; a file is given by its name and
@@ -265,7 +268,7 @@ class Scenario(Section):
         found = {}
         for location, value in self.leaves():
             key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in location)
-            value = value.content() if isinstance(value, NamedFile) else value
+            value = content(value) if isinstance(value, NamedFile) else value
             found[f"scenario{key}"] = json.dumps(value, sort_keys=True)
         return found
 
@@ -278,13 +281,18 @@ class Scenario(Section):
         """
         return self.digests()["scenario"]
 
-    def digests(self) -> dict[str, str]:
+    def digests(self, content: Content = NamedFile.content) -> dict[str, str]:
         """Return :meth:`digest` as ``scenario``, and the files' SHA-256 by their keys.
+
+        Args:
+            content: as of :meth:`identity`.
 
         Raises:
             InputError: a file cannot be read.
         """
-        values = {key: json.loads(value) for key, value in self.identity().items()}
+        values = {
+            key: json.loads(value) for key, value in self.identity(content).items()
+        }
         named = {key: value for key, value in values.items() if isinstance(value, dict)}
         for value in named.values():
             value.pop("file")
@@ -319,15 +327,7 @@ def load_scenario(
         folder = {"folder": Path(path).parent}
         scenario = Scenario.model_validate(data, context=folder)
     except ValidationError as err:
-        lines, found = [], list(problems(err))
-        for location, problem in found[:_MOST_PROBLEMS]:
-            line = _line_of(text, location)
-            where = f"{path}:{line}" if line else f"{path}"
-            key = ".".join(map(str, location))
-            lines.append(f"{where}: {key}: {problem}")
-        if more := len(found) - len(lines):
-            lines.append(f"{path}: and {more} more")
-        raise InputError("\n".join(lines)) from err
+        raise InputError(tell(path, text, problems(err))) from err
     if object_field is None:
         return scenario, text
     field = NamedFile(str(object_field.resolve()), object_field.resolve())
@@ -346,33 +346,3 @@ def portable_text(scenario: Scenario, text: str) -> str:
                 table = table[part]
             table[last] = value.portable
     return tomlkit.dumps(document)
-
-
-def _line_of(text: str, location: Location) -> int | None:
-    """Find the line of a key, or of the table that lacks it; 1-based.
-
-    Of a table without a header, such as dotted keys make, it is that of its first key.
-    """
-    document = tomlkit.parse(text)
-    item: Any = document
-    holder: Any = None
-    key: Any = None
-    for part in location:
-        inner = item.get(part) if isinstance(part, str) else item[part]
-        if inner is None:
-            break
-        holder, key, item = item, part, inner
-        if not isinstance(inner, Table | AoT | OutOfOrderTableProxy):
-            break  # a value, or an inline table
-    if holder is None:
-        return None
-    while isinstance(item, AoT | OutOfOrderTableProxy) or (
-        isinstance(item, Table) and item.is_super_table()
-    ):
-        holder, key = item, 0 if isinstance(item, AoT) else next(iter(item))
-        item = holder[key]
-    if isinstance(item, Table):
-        item.comment(_MARK)
-    else:
-        holder[key] = _MARK
-    return tomlkit.dumps(document).partition(_MARK)[0].count("\n") + 1

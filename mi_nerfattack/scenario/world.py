@@ -170,15 +170,8 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         bricks = _load_layer(scenario, place.bricks.file)
         optimised = surrogate.showing(surrogate.objects, bricks)
     camera, mount = surrogate.camera, surrogate.mount
-    route = Route.from_file(place.routes.file, place.route)
     motion = scenario.vehicle.motion()
-    speed = getattr(motion.dynamics, "speed", route.speed_ms)
-    route = replace(route, speed_ms=speed)
-    if scenario.drive.start_m >= route.length:
-        raise InputError(
-            f"drive.start_m: {scenario.drive.start_m:g} m; route {route.name!r} is "
-            f"{route.length:.1f} m long, start before its end"
-        )
+    route = driven_route(scenario, motion)
     objective = scenario.objective.build(scenario, route, motion.dynamics)
     where = Place(
         scene=place.deployment.file,
@@ -203,6 +196,34 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         objective,
         initial_states(scenario, route, scenario.drive.runs, 0),
     )
+
+
+def driven_route(scenario: Scenario, motion: Motion) -> Route:
+    """Load the lane centre, with the vehicle's speed where that is its own.
+
+    Raises:
+        InputError: the file is missing or wrong, or the drive begins beyond its end.
+    """
+    route = Route.from_file(scenario.scene.routes.file, scenario.scene.route)
+    speed = getattr(motion.dynamics, "speed", route.speed_ms)
+    route = replace(route, speed_ms=speed)
+    if scenario.drive.start_m >= route.length:
+        raise InputError(
+            f"drive.start_m: {scenario.drive.start_m:g} m; route {route.name!r} is "
+            f"{route.length:.1f} m long, start before its end"
+        )
+    return route
+
+
+def judged_frames(scenario: Scenario) -> int:
+    """Return the frames of the drives by which an attack is judged once.
+
+    Raises:
+        InputError: as of :func:`driven_route`.
+    """
+    vehicle = scenario.vehicle
+    route = driven_route(scenario, vehicle.motion())
+    return scenario.drive.steps(route, vehicle.dt_s) * scenario.attack.poses
 
 
 def build_surrogate(scenario: Scenario) -> FieldSensor:

@@ -11,13 +11,13 @@ import multiprocessing
 import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.system.cores import cores
 from mi_nerfattack.system.processes import safe_path
 
@@ -25,6 +25,15 @@ from mi_nerfattack.system.processes import safe_path
 MOST = 256
 #: Called with units of work that were just done.
 OnUnits = Callable[[int], None]
+#: Called with a piece that has ended, and why it failed; None where it is done.
+OnEnd = Callable[[int, Exception | None], None]
+
+
+def raise_failure(piece: int, error: Exception | None) -> None:
+    """End all work with the first piece that fails."""
+    del piece
+    if error is not None:
+        raise error
 
 
 class AbstractWork(ABC):
@@ -53,17 +62,23 @@ class AbstractWorkers(ABC):
     """Who does the work."""
 
     @abstractmethod
-    def run(self, work: AbstractWork, pieces: Sequence[int], report: OnUnits) -> None:
+    def run(
+        self,
+        work: AbstractWork,
+        pieces: Sequence[int],
+        report: OnUnits,
+        on_end: OnEnd = raise_failure,
+    ) -> None:
         """Do all pieces.
 
         Args:
             work: see there.
             pieces: indices; each is done once, in any order.
-            report: called with units of work as they are done, here; an exception
-                from it ends the work.
-
-        Raises:
-            InputError: from a piece; or a worker ended before its work.
+            report: called with units of work as they are done, here, where they can
+                be heard; an exception from it ends the work.
+            on_end: called with each piece that has ended, here; what it raises ends
+                the work, by default the error of a piece: an InputError from it, or of
+                a worker that ended in the midst of it; or a RuntimeError.
         """
 
 
@@ -71,14 +86,27 @@ class AbstractWorkers(ABC):
 class InThisProcess(AbstractWorkers):
     """One piece after the other, without a process of its own."""
 
-    def run(self, work: AbstractWork, pieces: Sequence[int], report: OnUnits) -> None:
+    def run(
+        self,
+        work: AbstractWork,
+        pieces: Sequence[int],
+        report: OnUnits,
+        on_end: OnEnd = raise_failure,
+    ) -> None:
         """Do all pieces, in order."""
         if not pieces:
             return
         opened = work.open()
         try:
             for index in pieces:
-                work.do(opened, index, report)
+                try:
+                    work.do(opened, index, report)
+                except Exception as error:
+                    if is_interrupt(error):
+                        raise
+                    on_end(index, error)
+                else:
+                    on_end(index, None)
         finally:
             work.close(opened)
 
@@ -87,39 +115,51 @@ class InThisProcess(AbstractWorkers):
 class Processes(AbstractWorkers):
     """Several processes with one thread each for rendering and one for torch.
 
-    A process takes the next piece when it is done with one. They end with this
-    process, however it ends; when one of them ends early, so do the others.
+    A process takes the next piece when it is done with one; a new one takes the place
+    of one that died or failed. They end with this process, however it ends.
 
     Args:
         count: 1 to `MOST`.
+        pieces_each: that a process does before a new one takes its place; None: any
+            number.
     """
 
     count: int = field(default_factory=lambda: available_cores())
+    pieces_each: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.count, int) or not 1 <= self.count <= MOST:
             raise InputError(f"workers: {self.count!r}; 1 to {MOST}")
 
-    def run(self, work: AbstractWork, pieces: Sequence[int], report: OnUnits) -> None:
+    def run(
+        self,
+        work: AbstractWork,
+        pieces: Sequence[int],
+        report: OnUnits,
+        on_end: OnEnd = raise_failure,
+    ) -> None:
         """Do all pieces."""
         team: list[_Member] = []
         left = list(reversed(pieces))
         try:
-            for _ in range(min(self.count, len(pieces))):
-                team.append(_Member(work))
-                team[-1].give(left)
-            while busy := {m.connection: m for m in team if m.piece is not None}:
+            while left or team:
+                while left and len(team) < self.count:
+                    team.append(_Member(work))
+                    team[-1].give(left.pop())
+                busy = {member.connection: member for member in team}
                 for connection in wait(list(busy)):
                     member = busy[connection]  # pyright: ignore[reportArgumentType]
                     kind, value = member.hear()
                     if kind == "units":
                         report(value)
-                    elif kind == "error":
-                        raise InputError(value)
-                    elif kind == "bug":
-                        raise RuntimeError(f"piece {member.piece} failed:\n{value}")
+                        continue
+                    piece = member.piece
+                    if kind == "done" and left and member.done != self.pieces_each:
+                        member.give(left.pop())
                     else:
-                        member.give(left)
+                        team.remove(member)
+                        member.stop(kind == "done")
+                    on_end(piece, None if kind == "done" else value)
         finally:
             for member in team:
                 member.stop()
@@ -131,49 +171,52 @@ class _Member:
     def __init__(self, work: AbstractWork) -> None:
         context = multiprocessing.get_context("spawn")  # Dr.Jit is not fork-safe
         self.connection, theirs = context.Pipe()
-        self.piece: int | None = None
+        self.piece, self.done = 0, 0
         self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
         with safe_path(), _blocked_interrupts():
             self._process.start()
         theirs.close()  # so that its end is noticed
 
-    def give(self, left: list[int]) -> None:
-        """Hand over the last of the pieces that are left, or none."""
-        self.piece = left.pop() if left else None
-        try:
-            self.connection.send(self.piece)
-        except OSError:
-            if self.piece is not None:
-                self._report_end()
+    def give(self, piece: int | None) -> None:
+        """Hand over a piece, or that there are none left."""
+        self.piece = self.piece if piece is None else piece
+        with suppress(OSError):  # it has ended, which is heard
+            self.connection.send(piece)
 
     def hear(self) -> tuple[str, Any]:
-        """Return the next message."""
+        """Return the next message: units, done, or failed with the error."""
         try:
-            return self.connection.recv()
+            kind, value = self.connection.recv()
         except (EOFError, OSError):
-            self._report_end()
-            raise AssertionError("not reached") from None
+            return "failed", self._end()
+        self.done += kind == "done"
+        if kind == "error":
+            return "failed", InputError(value)
+        if kind == "bug":
+            return "failed", RuntimeError(f"piece {self.piece} failed:\n{value}")
+        return kind, value
 
-    def stop(self) -> None:
+    def stop(self, idle: bool = False) -> None:
         """End the process: at once, unless it has nothing to do."""
-        if self.piece is None:
+        if idle:
+            self.give(None)
             self._process.join(10)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
         self.connection.close()
 
-    def _report_end(self) -> None:
+    def _end(self) -> InputError:
         self._process.join(10)
         code = self._process.exitcode
         how = (
             f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
         )
         memory = "; it may have run out of memory: use fewer workers" * (code == -9)
-        raise InputError(
+        return InputError(
             f"a worker process ended by {how} in piece {self.piece}{memory}; "
             "finished pieces are kept, the same command continues"
-        ) from None
+        )
 
 
 def available_cores() -> int:

@@ -54,6 +54,30 @@ def _scenario(folder: Path) -> list[tuple[Path, Read]]:
     return [(path, lambda path: load_scenario(path)[0].identity())]
 
 
+def _grid(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.scenario_text import HEAD, write_named_files
+
+    from mi_nerfattack import variant
+
+    variant.ensure()
+    from mi_nerfattack.experiment.sweep.grid import load_cells
+
+    write_named_files(folder)
+    route = {"goal": 0, "points_m": [[0, 0], [9, 0]], "lane_width_m": 3.5}
+    (folder / "routes.json").write_text(json.dumps({"lane": route | {"speed_ms": 5.0}}))
+    (folder / "scenario.toml").write_text(HEAD)
+    path = folder / "grid.toml"
+    path.write_text(
+        'scenario = "scenario.toml"\nseeds = [0, 1]\nbudgets = [400]\n'
+        'backward_multiple = 1.5\n[[routes]]\nname = "lane"\n'
+        'set.drive.length_m = 5\n[[objects]]\nname = "hydrant"\nroutes = ["lane"]\n'
+        '[[objects.set.objects]]\nid = "a"\nfield = "object.safetensors"\n'
+        'position_m = [1, 2, 0]\n[[methods]]\nname = "blocks"\n'
+        'set.attack.method = "blocks"\n[[methods]]\nname = "gradient"\n'
+    )
+    return [(path, load_cells)]
+
+
 def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
     from mi_nerfattack.commands.shared.evaluate_options import (
         PolicyOptions,
@@ -308,6 +332,7 @@ _TENSORS = one_of(of_tensors, of_tensors, of_bytes)
 _PNG = one_of(of_png, of_bytes)
 FORMATS: dict[str, Format] = {
     "scenario": Format(_scenario, _TEXT),
+    "grid": Format(_grid, _TEXT),
     "policy_toml": Format(_policy_toml, _TEXT),
     "field": Format(_field, _TENSORS),
     "glb": Format(_gltf, one_of(of_glb, of_glb, of_bytes)),

@@ -188,3 +188,14 @@ def test_number_of_workers_is_checked(count):
 def test_a_large_machine_has_as_many_workers_as_are_allowed(monkeypatch):
     monkeypatch.setattr(workers, "cores", lambda: 384)
     assert Processes().count == 256
+
+
+def test_work_goes_on_without_a_piece_that_fails():
+    """With a new process in the place of the one that died with it."""
+    ended = {}
+    Processes(1, pieces_each=2).run(
+        Piece(signal.SIGKILL), range(4), lambda units: None, ended.__setitem__
+    )
+    assert list(ended) == [0, 1, 2, 3]
+    assert "signal 9 in piece 2" in str(ended.pop(2))
+    assert set(ended.values()) == {None} and not multiprocessing.active_children()

@@ -1,0 +1,116 @@
+"""``mi-nerfattack sweep``: the attacks of a grid, and one table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from mi_nerfattack.experiment.sweep.cell import Cell
+    from mi_nerfattack.experiment.sweep.sweep import Sweep as Done
+    from mi_nerfattack.system.workers import AbstractWorkers
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Attack in every cell of a grid: routes, objects, methods, budgets and seeds.
+
+    Writes a run folder a cell and one table of all drives, results.parquet. Stopped, or
+    killed, the same command continues; complete cells are never done again, failed
+    ones are. Ends with 0, or with 1 if cells failed (with --check, if some would be
+    refused).
+    """
+
+    grid: tyro.conf.Positional[Path]
+    """Grid file (TOML)."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder of the sweep, new or begun."""
+    check: bool = False
+    """Do nothing yet: tell how many cells and frames there are, what time and disk they
+    would take, and what would be refused."""
+    drives: bool = True
+    """With --check: drive once from each start at each place, unattacked, and time the
+    attacks; without, only what needs no drive is told."""
+    workers: int | None = None
+    """Cells that are done at a time, each by a process of its own; as many as there are
+    cores for by default."""
+    cores: int = 1
+    """Cores that each cell renders with."""
+    json: bool = False
+    """End with one line of JSON in place of the sentences."""
+
+    def run(self) -> int:
+        """Check the grid, or do its cells."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.experiment.sweep.grid import load_cells
+
+        if self.cores < 1:
+            raise InputError(f"--cores: {self.cores}; at least 1")
+        workers = self._workers()
+        variant.ensure()
+        cells = load_cells(self.grid)
+        return self._check(cells) if self.check else self._run(cells, workers)
+
+    def _count(self) -> int:
+        from mi_nerfattack.system.workers import available_cores
+
+        fitting = max(1, available_cores() // self.cores)
+        return fitting if self.workers is None else self.workers
+
+    def _workers(self) -> AbstractWorkers:
+        from mi_nerfattack.system.workers import Processes
+
+        return Processes(self._count(), pieces_each=1)
+
+    def _check(self, cells: list[Cell]) -> int:
+        import json
+
+        from mi_nerfattack.backend.threads import one_thread
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.experiment.sweep.forecast import Forecast, sentences
+
+        with StageBars() as bars, one_thread():
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            forecast = Forecast(cells, self.output, show)
+            forecast.run(self.drives)
+        document = forecast.document()
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            print(*sentences(document, self._count()), sep="\n")
+        return int(any(document["refused"].values()))
+
+    def _run(self, cells: list[Cell], workers: AbstractWorkers) -> int:
+        import json
+
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.experiment.sweep.sweep import Cells
+        from mi_nerfattack.experiment.sweep.sweep import Sweep as Work
+
+        with StageBars() as bars:
+
+            def show(sweep: Done) -> None:
+                done, total = len(sweep.complete), len(cells)
+                state = f"{done}/{total}, {sweep.steps} control periods"
+                if sweep.errors:
+                    state += f", {len(sweep.errors)} failed"
+                bars.show("cells", done, total, state, kept=done == sweep.kept)
+
+            sweep = Work(Cells(tuple(cells), self.output, self.cores), show)
+            sweep.run(workers)
+        if self.json:
+            failed = {cells[i].id: error for i, error in sweep.errors.items()}
+            found = {"cells": len(cells), "complete": len(sweep.complete)}
+            print(json.dumps({**found, "failed": failed, "table": str(sweep.table)}))
+        else:
+            print(f"{len(sweep.complete)} of {len(cells)} cells: {sweep.table}")
+            for index, error in sorted(sweep.errors.items()):
+                print(f"failed: {cells[index].id}: {error.splitlines()[-1]}")
+        return int(bool(sweep.errors))

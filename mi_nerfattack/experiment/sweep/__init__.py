@@ -1,0 +1,1 @@
+"""Many attacks: a grid of scenarios, its cells done by any executor, one table."""

@@ -1,0 +1,114 @@
+"""One cell of a sweep: a scenario, and the run folder that is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from mi_nerfattack.backend.threads import one_thread
+from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.claim import claimed
+from mi_nerfattack.experiment.job import Job
+from mi_nerfattack.io import files
+from mi_nerfattack.io.strict_toml import parse_toml
+from mi_nerfattack.scenario.scenario import Scenario
+
+#: Empty file in the folder of a cell that is done.
+COMPLETE = "_complete"
+#: What a cell was done of: its row of the grid, digests and versions.
+PROVENANCE = "cell.json"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A row of the grid, with the whole scenario.
+
+    Attributes:
+        route: name of the choice.
+        objects: likewise.
+        method: likewise.
+        budget: rendered frames that the attack may cost; None: as the scenario says.
+        seed: of the scenario.
+        text: the scenario file, its paths absolute.
+        digests: of the scenario and the files that it names.
+        anyway: attack although the checks before find that it proves nothing.
+        pictures: write frames, plots and page, too.
+    """
+
+    route: str
+    objects: str
+    method: str
+    budget: int | None
+    seed: int
+    text: str
+    digests: dict[str, str]
+    anyway: bool = False
+    pictures: bool = False
+
+    @property
+    def id(self) -> str:
+        """Name of the folder: no other scenario has it."""
+        words = [self.route, self.objects, self.method, self.budget, self.seed]
+        words.append(self.digests["scenario"])
+        return "-".join(str(word) for word in words if word is not None)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario.
+
+        Raises:
+            InputError: what it names is not usable here.
+        """
+        try:
+            return Scenario.model_validate(parse_toml(self.id, self.text))
+        except ValidationError as err:  # it was valid where the cell was made
+            raise InputError(f"{self.id}: {err}; is a file missing here?") from err
+
+
+def folder_of(sweep: Path, cell: Cell) -> Path:
+    """Return the run folder of a cell."""
+    return sweep / "cells" / cell.id
+
+
+def is_complete(sweep: Path, cell: Cell) -> bool:
+    """Whether a cell is done, and need never be done again."""
+    return (folder_of(sweep, cell) / COMPLETE).exists()
+
+
+def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
+    """Do a cell, or what is left of it, as ``mi-nerfattack attack`` would.
+
+    Args:
+        cell: what to do.
+        sweep: folder of the sweep.
+        on_step: called after each control period of a drive.
+
+    Raises:
+        InputError: a file has changed since the sweep began, another process works in
+            the cell's folder; or as of :meth:`Job.run`.
+        SetupError: as of :meth:`Job.run`.
+    """
+    output, scenario = folder_of(sweep, cell), cell.scenario
+    with claimed(output, resume=True):
+        if is_complete(sweep, cell):
+            return
+        if (found := scenario.digests()) != cell.digests:
+            wrong = sorted(k for k, v in found.items() if v != cell.digests.get(k))
+            raise InputError(
+                f"{cell.id}: {', '.join(wrong)}: other content here than where the "
+                "sweep began; give the same command again, and all machines one disk"
+            )
+        policy, frames = scenario.build_policy(), 3 if cell.pictures else None
+        job = Job(scenario, cell.text, policy, output, lambda *told: on_step())
+        job.frames = frames
+        with one_thread():
+            job.run_claimed(resume=True, anyway=cell.anyway)
+        about = asdict(cell) | {"versions": versions()}
+        del about["text"]  # the run folder's scenario.toml
+        files.write_json(output / PROVENANCE, about)
+        files.write_bytes(output / COMPLETE, b"")

@@ -1,0 +1,147 @@
+"""What a sweep would cost, and what of it would be refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.experiment.checks.check import Check, duration
+from mi_nerfattack.experiment.checks.cost import Cost, estimate
+from mi_nerfattack.experiment.sweep.cell import Cell, is_complete
+from mi_nerfattack.scenario.world import build_world
+
+#: What cells have in common that stand at one place: route, objects.
+Place = tuple[str, str]
+
+
+@dataclass(eq=False)
+class Forecast:
+    """What is known of a sweep before it is made.
+
+    Of each place (a route with its objects), the first cell is checked as
+    ``mi-nerfattack check`` does; of each further method and budget there, the first
+    seed's attack is timed. Other seeds are taken to be like the first.
+
+    Attributes:
+        cells: all.
+        folder: of the sweep; may be missing.
+        on_progress: told of a stage, units done, all units, and a remark.
+        refused: why `attack` would refuse the cells of a place, a sentence each.
+        doubts: what it would not refuse, and is seldom meant.
+        costs: of one attack of each place, method and budget; None where none could
+            be tried.
+    """
+
+    cells: Sequence[Cell]
+    folder: Path
+    on_progress: Callable[[str, int, int, str], None] = lambda *told: None
+    refused: dict[Place, list[str]] = field(default_factory=dict)
+    doubts: dict[Place, list[str]] = field(default_factory=dict)
+    costs: dict[tuple[Any, ...], Cost | None] = field(default_factory=dict)
+
+    def run(self, drives: bool = True) -> None:
+        """Find what there is to find.
+
+        Args:
+            drives: make the drives of the checks, and time the attacks; otherwise only
+                what needs none is found.
+        """
+        first = {_kind(cell): cell for cell in reversed(self.cells)}
+        kinds = [kind for kind in dict.fromkeys(map(_kind, self.cells))]
+        period_s: dict[Place, dict[str, float]] = {}
+        for number, kind in enumerate(kinds):
+            cell, place = first[kind], kind[:2]
+            self.on_progress("checking", number, len(kinds), " ".join(map(str, kind)))
+            if place not in self.refused:
+                self._check(cell, place, drives)
+                if cost := self.costs[kind]:
+                    period_s[place] = cost.period_s
+            elif place in period_s:
+                self.costs[kind] = self._price(cell, period_s[place])
+            else:
+                self.costs[kind] = None
+        self.on_progress("checking", len(kinds), len(kinds), "")
+
+    def _check(self, cell: Cell, place: Place, drives: bool) -> None:
+        self.refused[place], self.doubts[place] = [], []
+        self.costs[_kind(cell)] = None
+        try:
+            check = Check(build_world(cell.scenario, cell.scenario.build_policy()))
+            check.run(drives)
+        except (InputError, SetupError) as err:
+            self.refused[place].append(str(err))
+            return
+        if drives:
+            check.price()
+        self.refused[place] += check.refused
+        self.doubts[place] += check.doubts
+        self.costs[_kind(cell)] = check.cost
+
+    def _price(self, cell: Cell, period_s: dict[str, float]) -> Cost | None:
+        try:
+            world = build_world(cell.scenario, cell.scenario.build_policy())
+            return estimate(world, period_s)
+        except (InputError, SetupError) as err:
+            self.refused[_kind(cell)[:2]].append(f"{cell.method}: {err}")
+            return None
+
+    def document(self) -> dict[str, Any]:
+        """Return all that was found, as JSON takes it."""
+        left = [cell for cell in self.cells if not is_complete(self.folder, cell)]
+        costs = [self.costs[_kind(cell)] for cell in left]
+        known = [cost for cost in costs if cost is not None]
+        whole = len(known) == len(left)
+        told = {
+            " ".join(map(str, kind)): None if cost is None else cost.document()
+            for kind, cost in self.costs.items()
+        }
+        return {
+            "cells": len(self.cells),
+            "complete": len(self.cells) - len(left),
+            "frames": sum(cost.frames for cost in known) if whole else None,
+            "wall_s": sum(cost.wall_s for cost in known) if whole else None,
+            "disk_mb": sum(cost.disk_mb for cost in known) if whole else None,
+            "memory_mb": max((c.memory_mb for c in known), default=None),
+            "refused": {" ".join(p): lines for p, lines in self.refused.items()},
+            "doubts": {" ".join(p): lines for p, lines in self.doubts.items()},
+            "costs": told,
+        }
+
+
+def sentences(document: dict[str, Any], workers: int) -> list[str]:
+    """Tell a forecast in words.
+
+    Args:
+        document: of :meth:`Forecast.document`.
+        workers: cells that are done at a time.
+    """
+    cells, complete = document["cells"], document["complete"]
+    left = f"; {complete} are complete, the rest" if complete else ""
+    lines = [f"{cells} cells{left}"]
+    if document["wall_s"] is None:
+        lines[0] += "; not all of them could be timed"
+    else:
+        lines[0] += (
+            f": {document['frames']} frames, {duration(document['wall_s'] / workers)} "
+            f"for {workers} at a time, as busy as this machine is, "
+            f"{document['disk_mb']:.0f} MB of disk, at most "
+            f"{document['memory_mb']:.0f} MB of memory each"
+        )
+    for name, cost in document["costs"].items():
+        if cost is not None and cost["period_s"]["backward"]:
+            times = cost["period_s"]
+            multiple = times["backward"] / times["forward"]
+            lines.append(f"{name}: a pass back costs {multiple:.1f} drives")
+    for word in ("refused", "doubts"):
+        shown = "refused" if word == "refused" else "look at"
+        for place, told in document[word].items():
+            lines += [f"{shown}: {place}: {line}" for line in told]
+    return lines
+
+
+def _kind(cell: Cell) -> tuple[Any, ...]:
+    """Return what cells have in common that differ in their seed alone."""
+    return cell.route, cell.objects, cell.method, cell.budget

@@ -1,0 +1,251 @@
+"""The grid file: routes x objects x methods x budgets x seeds of one scenario.
+
+A TOML file that names a scenario and, of each axis, choices that set keys of it.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tomlkit
+from pydantic import Field, ValidationError, model_validator
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.sweep.cell import Cell
+from mi_nerfattack.io import files
+from mi_nerfattack.io.strict_toml import parse_toml
+from mi_nerfattack.ranges import Count, NonNegative, Seed
+from mi_nerfattack.scenario.lines import tell
+from mi_nerfattack.scenario.named_file import File, NamedFile
+from mi_nerfattack.scenario.scenario import Scenario, load_scenario, portable_text
+from mi_nerfattack.scenario.section import Location, Section, problems, refuse
+from mi_nerfattack.scenario.world import judged_frames
+
+MOST_CELLS = 10_000
+_LENGTHS = ("max_iterations", "frames")  # of [attack], by method
+
+Label = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,39}$")]
+
+
+class AbstractChoice(Section):
+    """A value of an axis."""
+
+    name: Label  # in the table
+    set: dict[str, Any] = {}  # keys of the scenario, over those of the file
+
+
+class Choice(AbstractChoice):
+    """A route or a method."""
+
+
+class ObjectsChoice(AbstractChoice):
+    """Objects, which stand somewhere beside some routes."""
+
+    routes: tuple[str, ...] | None = None  # by name; all
+
+
+class Grid(Section):
+    """A grid file."""
+
+    scenario: File  # what the choices change
+    routes: tuple[Choice, ...] = ()
+    objects: tuple[ObjectsChoice, ...] = ()
+    methods: tuple[Choice, ...] = ()
+    budgets: tuple[Count, ...] = ()  # rendered frames; as the scenario says
+    backward_multiple: NonNegative | None = None  # cost of a pass back, in drives
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    anyway: bool = False  # attack although it would prove nothing
+    pictures: bool = False  # write frames, plots and page of each attack
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Any:
+        """Refuse what stands twice, and routes that there are none of."""
+        for key in ("budgets", "seeds"):
+            values = getattr(self, key)
+            if len(set(values)) < len(values):
+                refuse(key, f"{list(values)}; give each once")
+        for axis in ("routes", "methods"):
+            names = [choice.name for choice in getattr(self, axis)]
+            if len(set(names)) < len(names):
+                refuse(axis, f"names {names}; must differ")
+        known, taken = [route.name for route in self.routes], set()
+        for index, choice in enumerate(self.objects):
+            for name in choice.routes or ():
+                if name not in known:
+                    refuse(f"objects.{index}.routes", f"{name!r}; one of {known}")
+            for name in choice.routes or known or [""]:
+                if (name, choice.name) in taken:
+                    refuse(
+                        f"objects.{index}.name",
+                        f"{choice.name!r} is there twice at one route; names differ, "
+                        "or their routes do",
+                    )
+                taken.add((name, choice.name))
+        if self.budgets:
+            for index, choice in enumerate(self.methods):
+                for key in _LENGTHS:
+                    if _depth(choice.set, ("attack", key)) == 2:
+                        refuse(
+                            f"methods.{index}.set.attack.{key}",
+                            "stands beside budgets, which say it; give one of them",
+                        )
+        return self
+
+
+class GridReader:
+    """What the cells of a grid are made of.
+
+    Args:
+        path: the grid file.
+
+    Raises:
+        InputError: it or the scenario cannot be read, is no TOML, or a key is unknown,
+            missing, of the wrong type or out of range; with file and line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.text, data = files.read_text(path), files.read_toml(path)
+        try:
+            context = {"folder": path.parent}
+            self.grid = Grid.model_validate(data, context=context)
+        except ValidationError as err:
+            raise InputError(tell(path, self.text, problems(err))) from err
+        self.base_path = self.grid.scenario.file
+        self.base, self.base_text = load_scenario(self.base_path)
+        portable = portable_text(self.base, self.base_text)
+        self.values = parse_toml(self.base_path, portable)
+        self._content = functools.cache(NamedFile.content)
+
+    def cells(self) -> Iterator[Cell]:
+        """Yield the cells, in the order of the table."""
+        grid, base = self.grid, self.base
+        ids = "+".join(item.id for item in base.objects)
+        routes = grid.routes or (Choice(name=_label(base.scene.route)),)
+        objects = grid.objects or (ObjectsChoice(name=_label(ids)),)
+        methods = grid.methods or (Choice(name=base.attack.method.method),)
+        for (i, route), (j, these), (k, method) in itertools.product(
+            enumerate(routes), enumerate(objects), enumerate(methods)
+        ):
+            if these.routes is not None and route.name not in these.routes:
+                continue
+            layers: dict[Location, Any] = {
+                ("routes", i, "set"): route.set,
+                ("objects", j, "set"): these.set,
+                ("methods", k, "set"): method.set,
+            }
+            names = route.name, these.name, method.name
+            budgets = grid.budgets or (None,)
+            for budget, seed in itertools.product(budgets, grid.seeds):
+                made = self._scenario(layers, budget, seed)
+                yield Cell(*names, budget, seed, *made, grid.anyway, grid.pictures)
+
+    def _scenario(
+        self, layers: Mapping[Location, Any], budget: int | None, seed: int
+    ) -> tuple[str, dict[str, str]]:
+        """Return the text of a cell's scenario, and its digests."""
+        values = self.values
+        for layer in (*layers.values(), {"seed": seed}):
+            values = _merged(values, layer)
+        attack = values.get("attack")
+        if budget is not None and isinstance(attack, dict):
+            kept = {k: v for k, v in attack.items() if k not in _LENGTHS}
+            values = values | {"attack": kept}
+        scenario = self._read(values, layers)
+        if budget is not None:
+            values = _merged(values, {"attack": self._length(scenario, budget)})
+            scenario = self._read(values, layers)
+        text = portable_text(scenario, tomlkit.dumps(values))
+        return text, scenario.digests(self._content)
+
+    def _read(self, values: Any, layers: Mapping[Location, Any]) -> Scenario:
+        context = {"folder": self.path.parent}
+        try:
+            return Scenario.model_validate(values, context=context)
+        except ValidationError as err:
+            raise InputError(self._told(list(problems(err)), layers)) from err
+
+    def _told(
+        self, found: list[tuple[Location, str]], layers: Mapping[Location, Any]
+    ) -> str:
+        """Tell problems of a cell where the keys were given."""
+        here: list[tuple[Location, str]] = []
+        there: list[tuple[Location, str]] = []
+        for keys, problem in found:
+            depth, where = max(
+                (_depth(layer, keys), where) for where, layer in layers.items()
+            )
+            if depth and depth >= _depth(self.values, keys):
+                here.append(((*where, *keys), problem))
+            else:
+                there.append((keys, problem))
+        told = tell(self.path, self.text, here) if here else ""
+        rest = tell(self.base_path, self.base_text, there) if there else ""
+        return "\n".join(filter(None, (told, rest)))
+
+    def _length(self, scenario: Scenario, budget: int) -> dict[str, int]:
+        """Return the key that says how long an attack is, for a budget of frames."""
+        method, frames = scenario.attack.method, judged_frames(scenario)
+        if not method.needs_derivatives:
+            return {"frames": budget}
+        multiple = self.grid.backward_multiple
+        if multiple is None:
+            raise InputError(
+                f"{self.path}: backward_multiple: is missing; budgets of gradients "
+                "count a pass back as so many drives: --check without budgets "
+                "measures it"
+            )
+        iterations = int(budget / ((1 + multiple) * frames))
+        if not iterations:
+            raise InputError(
+                f"{self.path}: budgets: {budget} frames; an iteration of "
+                f"{method.method} costs {(1 + multiple) * frames:g}"
+            )
+        return {"max_iterations": iterations}
+
+
+def load_cells(path: Path) -> list[Cell]:
+    """Read a grid file, and make its cells; every key of theirs is checked.
+
+    Raises:
+        InputError: a file cannot be read, a key is wrong (with file and line), or there
+            are more than `MOST_CELLS` cells.
+    """
+    reader = GridReader(path)
+    cells = list(itertools.islice(reader.cells(), MOST_CELLS + 1))
+    if len(cells) > MOST_CELLS:
+        raise InputError(f"{path}: more than {MOST_CELLS} cells; make several grids")
+    if not cells:
+        raise InputError(f"{path}: no cell; no objects stand at any of the routes")
+    return cells
+
+
+def _label(text: str) -> str:
+    """Make a name of an axis of any text."""
+    return re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).strip("_.+-")[:40] or "own"
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge tables key by key; other values replace what is below."""
+    found = dict(below)
+    for key, value in above.items():
+        old = found.get(key)
+        if isinstance(old, dict) and isinstance(value, dict):
+            value = _merged(old, value)
+        found[key] = value
+    return found
+
+
+def _depth(values: Any, keys: Sequence[str | int]) -> int:
+    """Return how many of the keys that lead to a value there are."""
+    for depth, key in enumerate(keys):
+        try:
+            values = values[key]
+        except (KeyError, IndexError, TypeError):
+            return depth
+    return len(keys)

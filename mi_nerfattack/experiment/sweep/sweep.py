@@ -1,0 +1,163 @@
+"""A sweep: all cells done once, failed ones tried again, one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+
+from mi_nerfattack import variant
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.sweep.cell import (
+    Cell,
+    folder_of,
+    is_complete,
+    run_cell,
+)
+from mi_nerfattack.experiment.sweep.table import (
+    RESULTS,
+    Row,
+    complete_rows,
+    failed_row,
+    require_parquet,
+    write_table,
+)
+from mi_nerfattack.io import files, locks
+from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
+
+#: How often a cell is tried in one run of a sweep.
+ATTEMPTS = 3
+#: Folder of what failed cells told.
+FAILED = "failed"
+#: Does a cell in the sweep's folder, and tells of each control period.
+Task = Callable[[Cell, Path, Callable[[], None]], None]
+
+
+@dataclass(frozen=True)
+class Cells(AbstractWork):
+    """The cells of a sweep, as work for any executor.
+
+    Attributes:
+        cells: all.
+        folder: of the sweep.
+        threads: of each cell's rendering.
+        task: does one.
+    """
+
+    cells: tuple[Cell, ...]
+    folder: Path
+    threads: int = 1
+    task: Task = run_cell
+
+    def open(self) -> int:
+        """Set up the renderer; returns its threads before."""
+        variant.ensure()
+        before = dr.thread_count()
+        dr.set_thread_count(self.threads)
+        return before
+
+    def do(self, opened: Any, index: int, report: OnUnits) -> None:
+        """Do a cell."""
+        self.task(self.cells[index], self.folder, partial(report, 1))
+
+    def close(self, opened: Any) -> None:
+        """Let the renderer have its threads again."""
+        dr.set_thread_count(opened)
+
+
+@dataclass(eq=False)
+class Sweep:
+    """What a sweep has come to.
+
+    Attributes:
+        work: its cells.
+        on_change: called when anything has happened.
+        steps: control periods that cells have told of.
+        complete: cells that are done, by their index.
+        kept: how many were when this run began.
+        errors: why others failed when they were tried last.
+    """
+
+    work: Cells
+    on_change: Callable[[Sweep], None] = lambda sweep: None
+    steps: int = 0
+    complete: set[int] = field(default_factory=set)
+    kept: int = 0
+    errors: dict[int, str] = field(default_factory=dict)
+    _rows: dict[int, list[Row]] = field(default_factory=dict)
+
+    @property
+    def table(self) -> Path:
+        """The file of the table."""
+        return self.work.folder / RESULTS
+
+    def run(self, workers: AbstractWorkers) -> None:
+        """Do all cells that are not complete.
+
+        A cell that fails, or whose process dies, is tried `ATTEMPTS` times; each goes
+        on from the cell's last checkpoint. The table is written after each cell.
+
+        Args:
+            workers: who does them.
+
+        Raises:
+            InputError: another process works on the sweep, or a file cannot be read or
+                written.
+            SetupError: pyarrow is not installed.
+        """
+        require_parquet()
+        work = self.work
+        for name in ("cells", FAILED):
+            files.make_folder(work.folder / name)
+        with locks.exclusive(work.folder):
+            for index, cell in enumerate(work.cells):
+                if is_complete(work.folder, cell):
+                    self._take(index)
+                elif (path := self._failure(index)).exists():
+                    self._fail(index, files.read_text(path))
+            self.kept = len(self.complete)
+            self._write()
+            for _ in range(ATTEMPTS):
+                left = [i for i in range(len(work.cells)) if i not in self.complete]
+                workers.run(work, left, self._count, self._end)
+
+    def _count(self, steps: int) -> None:
+        self.steps += steps
+        self.on_change(self)
+
+    def _end(self, index: int, error: Exception | None) -> None:
+        cell, folder = self.work.cells[index], self.work.folder
+        if error is None and not is_complete(folder, cell):
+            error = InputError(
+                f"{folder_of(folder, cell)}: the cell ended, and its files are not "
+                "there; the sweep's folder must be on a disk that all machines share"
+            )
+        path = self._failure(index)
+        if error is None:
+            path.unlink(missing_ok=True)
+            self._take(index)
+        else:
+            files.write_text(path, str(error))
+            self._fail(index, str(error))
+        self._write()
+
+    def _take(self, index: int) -> None:
+        self.errors.pop(index, None)
+        self.complete.add(index)
+        self._rows[index] = complete_rows(self.work.cells[index], self.work.folder)
+
+    def _fail(self, index: int, error: str) -> None:
+        self.errors[index] = error
+        self._rows[index] = [failed_row(self.work.cells[index], error)]
+
+    def _failure(self, index: int) -> Path:
+        return self.work.folder / FAILED / f"{self.work.cells[index].id}.txt"
+
+    def _write(self) -> None:
+        rows = [row for index in sorted(self._rows) for row in self._rows[index]]
+        write_table(self.table, rows)
+        self.on_change(self)

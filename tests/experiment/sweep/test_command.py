@@ -1,0 +1,117 @@
+"""``mi-nerfattack sweep``: what it foresees, does and tells."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from mi_nerfattack import cli
+from mi_nerfattack.commands.sweep import Sweep
+from mi_nerfattack.experiment.sweep import sweep as module
+from mi_nerfattack.experiment.sweep.forecast import sentences
+from mi_nerfattack.system import workers
+from mi_nerfattack.system.workers import InThisProcess
+from tests.experiment.sweep.conftest import finish
+
+pytest.importorskip(
+    "pyarrow", reason="needs the extra 'sweep': pyarrow writes the table"
+)
+pytestmark = pytest.mark.usefixtures("variant")
+
+GRID = """\
+scenario = "scenario.toml"
+seeds = [3, 4, 5]
+budgets = [30]
+backward_multiple = 1.5
+[[routes]]
+name = "line"
+set.baseline.textures = 2
+[[methods]]
+name = "gradient"
+[[methods]]
+name = "blocks"
+set.attack.method = "blocks"
+"""
+ALOFT = """\
+[[objects]]
+name = "aloft"
+[[objects.set.objects]]
+id = "ball"
+field = "object.safetensors"
+position_m = [7.0, 4.2, 4.6]
+"""
+
+
+@pytest.fixture
+def command(scenario_folder, tmp_path, capsys):
+    """Return what runs the command on a grid: exit code, output, errors."""
+
+    def run(text, *options):
+        path = scenario_folder / "grid.toml"
+        path.write_text(text)
+        words = ["sweep", str(path), "-o", str(tmp_path / "out"), *options]
+        code = cli.main(words)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+def test_what_is_foreseen(command):
+    """Frames as `check` tells of one attack; seeds cost the same.
+
+    Gradient, 3 iterations: see `test_check`; blocks: 8 drives of 4 periods, without a
+    second frame for a way back.
+    """
+    code, out, _ = command(GRID, "--check", "--json")
+    document = json.loads(out)
+    assert code == 0 and not any(document["refused"].values())
+    assert (document["cells"], document["complete"]) == (6, 0)
+    costs = document["costs"]
+    assert [cost["frames"] for cost in costs.values()] == [140, 136]
+    assert document["frames"] == 3 * (140 + 136)
+    each = [cost["wall_s"] for cost in costs.values()]
+    assert document["wall_s"] == pytest.approx(3 * sum(each))
+    first, multiple, *_ = sentences(document, 2)
+    assert first.startswith("6 cells: 828 frames, ") and " for 2 at a time" in first
+    assert multiple.startswith("line ball gradient 30: a pass back costs ")
+
+
+def test_what_would_be_refused(command, tmp_path):
+    code, out, _ = command(GRID + ALOFT, "--check", "--no-drives")
+    assert code == 1
+    first, *rest = out.splitlines()
+    assert first == "6 cells; not all of them could be timed"
+    assert "refused: line aloft: ball is in the air of deployment.xml" in rest[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
+    def task(cell, folder, on_step):
+        if cell.seed == 4:
+            raise ValueError("a mistake\nin two lines")
+        finish(cell, folder)
+
+    monkeypatch.setattr(module, "Cells", partial(module.Cells, task=task))
+    monkeypatch.setattr(Sweep, "_workers", lambda self: InThisProcess())
+    code, out, err = command(GRID)
+    table, *failed = out.splitlines()
+    assert code == 1 and "cells: 0/6, 0 control periods" in err
+    assert table == f"4 of 6 cells: {tmp_path / 'out' / 'results.parquet'}"
+    assert [line.split("-")[2] for line in failed] == ["gradient", "blocks"]
+    assert all(line.endswith(": in two lines") for line in failed)
+    code, out, _ = command(GRID.replace("4, ", ""), "--json")
+    found = json.loads(out)
+    assert code == 0 and found["complete"] == found["cells"] == 4
+    assert not found["failed"]
+
+
+def test_as_many_workers_as_cores_allow(monkeypatch):
+    monkeypatch.setattr(workers, "cores", lambda: 8)
+    grid = Path("grid.toml")
+    counts = [Sweep(grid, grid, cores=cores)._count() for cores in (1, 3, 9)]
+    assert counts == [8, 2, 1]
+    assert Sweep(grid, grid, workers=5, cores=3)._count() == 5

@@ -1,0 +1,92 @@
+"""Cells of a grid file, and what is wrong with one."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.sweep import grid as module
+from mi_nerfattack.experiment.sweep.grid import load_cells
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_cells_are_the_product_of_the_axes(write_grid):
+    cells = load_cells(write_grid())
+    labels = [(c.route, c.objects, c.method, c.budget, c.seed) for c in cells]
+    methods = [(m, 40, seed) for m in ("gradient", "blocks") for seed in (3, 4)]
+    places = [("near", "ball"), ("far", "ball"), ("far", "two")]
+    assert labels == [(*place, *method) for place in places for method in methods]
+    assert len({cell.id for cell in cells}) == 12
+    for cell in cells:
+        scenario, far = cell.scenario, cell.route == "far"
+        assert scenario.seed == cell.seed
+        assert scenario.drive.horizon == (5 if far else 4)
+        assert len(scenario.objects) == (2 if cell.objects == "two" else 1)
+        assert scenario.digests() == cell.digests
+        method = scenario.attack.method
+        if cell.method == "gradient":  # 40 frames: iterations of 4 or 5, 2.5 times
+            assert method.iterations(5) == (3 if far else 4)
+        else:
+            assert method.iterations(5) == 8 and method.model_dump()["frames"] == 40
+
+
+def test_a_grid_of_a_scenario_alone(scenario_folder):
+    path = scenario_folder / "alone.toml"
+    path.write_text('scenario = "scenario.toml"')
+    (cell,) = load_cells(path)
+    assert cell.id.startswith("line-ball-gradient-0-")
+    assert cell.scenario.attack.method.iterations(1) == 3
+
+
+def test_another_content_of_a_file_is_another_cell(write_grid, scenario_folder):
+    path, route = write_grid(), scenario_folder / "routes.json"
+    before, text = load_cells(path), route.read_text()
+    route.write_text(text + "\n")
+    try:
+        after = load_cells(path)
+    finally:
+        route.write_text(text)
+    assert not {cell.id for cell in before} & {cell.id for cell in after}
+    assert load_cells(path) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds =", "seed =", r"grid.toml:2: seed: unknown key; allowed: scenario"),
+        ("[3, 4]", "[3, 3]", r"grid.toml:2: seeds: \[3, 3\]; give each once"),
+        ("[3, 4]", "[]", r"grid.toml:2: seeds: .*at least 1"),
+        ('"far"]', '"fra"]', r"grid.toml:\d+: objects.1.routes: 'fra'; one of \['near"),
+        ('"two"', '"ball"', r"grid.toml:\d+: objects.1.name: 'ball' is there twice"),
+        ('"blocks"\nset', '"a/b"\nset', r"grid.toml:\d+: methods.1.name: .*pattern"),
+        ("horizon", "horizn", r"grid.toml:11: routes.1.set.drive.horizn: unknown key"),
+        ("= 0.5", "= 5", r"grid.toml:\d+: methods.1.set.attack.first_block: .*less"),
+        ('d = "ob', 'd = "no', r"noject.safetensors: does not exist"),
+        (
+            "first_block = 0.5",
+            "frames = 7",
+            r"methods.1.set.attack.frames: stands beside budgets",
+        ),
+        ("[40]", "[9]", r"budgets: 9 frames; an iteration of gradient costs 10"),
+        ("backward_multiple = 1.5", "", r"backward_multiple: is missing; budgets of"),
+        (
+            "budgets = [40]\nbackward_multiple = 1.5",
+            "",
+            r"/scenario.toml:\d+: attack.max_iterations: has no meaning with method = "
+            '"blocks"',
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_where_it_stands(write_grid, old, new, message):
+    with pytest.raises(InputError) as error:
+        load_cells(write_grid((old, new)))
+    assert re.search(message, str(error.value)), error.value
+
+
+def test_a_grid_without_end_is_refused(write_grid, monkeypatch):
+    monkeypatch.setattr(module, "MOST_CELLS", 11)
+    with pytest.raises(InputError, match="more than 11 cells"):
+        load_cells(write_grid())
