@@ -35,10 +35,17 @@ class Sweep:
     """With --check: drive once from each start at each place, unattacked, and time the
     attacks; without, only what needs no drive is told."""
     workers: int | None = None
-    """Cells that are done at a time, each by a process of its own; as many as there are
-    cores for by default."""
+    """Cells that are done at a time, each by a process or job of its own; by default as
+    many as there are cores for, and 256 jobs."""
     cores: int = 1
     """Cores that each cell renders with."""
+    submitit: str | None = None
+    """Partition of a SLURM cluster that does the cells, a job each, in place of this
+    machine."""
+    memory_gb: float = 4.0
+    """Memory of each cell, which the cluster is asked for."""
+    minutes: int = 240
+    """After which SLURM stops a job; it is submitted again, up to three times."""
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
@@ -48,23 +55,33 @@ class Sweep:
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.grid import load_cells
 
-        if self.cores < 1:
-            raise InputError(f"--cores: {self.cores}; at least 1")
+        for name in ("cores", "memory_gb", "minutes"):
+            if not getattr(self, name) > 0:
+                option = name.replace("_", "-")
+                raise InputError(f"--{option}: {getattr(self, name)}; more than 0")
         workers = self._workers()
         variant.ensure()
         cells = load_cells(self.grid)
         return self._check(cells) if self.check else self._run(cells, workers)
 
     def _count(self) -> int:
-        from mi_nerfattack.system.workers import available_cores
+        from mi_nerfattack.system.workers import MOST, available_cores
 
-        fitting = max(1, available_cores() // self.cores)
-        return fitting if self.workers is None else self.workers
+        if self.workers is not None:
+            return self.workers
+        if self.submitit is not None:
+            return MOST
+        return max(1, available_cores() // self.cores)
 
     def _workers(self) -> AbstractWorkers:
+        from mi_nerfattack.system.slurm import SlurmJobs
         from mi_nerfattack.system.workers import Processes
 
-        return Processes(self._count(), pieces_each=1)
+        alone = Processes(self._count(), pieces_each=1)  # checks the number, too
+        if self.submitit is None:
+            return alone
+        each = self.cores, self.memory_gb, self.minutes
+        return SlurmJobs(self.output / "slurm", self.submitit, *each, self._count())
 
     def _check(self, cells: list[Cell]) -> int:
         import json

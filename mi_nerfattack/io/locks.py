@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mi_nerfattack.errors import InputError
@@ -43,6 +43,18 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         except OSError:  # some network file systems: work without, as on Windows
             pass
         yield
+    finally:
+        os.close(descriptor)
+
+
+def wait_for(folder: str | Path) -> None:
+    """Wait until no process works in a folder, which may be missing."""
+    if fcntl is None or not os.path.isdir(folder):
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # as of `exclusive`
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
     finally:
         os.close(descriptor)
 

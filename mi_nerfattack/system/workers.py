@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -17,7 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 from mi_nerfattack.system.cores import cores
 from mi_nerfattack.system.processes import safe_path
 
@@ -27,6 +28,11 @@ MOST = 256
 OnUnits = Callable[[int], None]
 #: Called with a piece that has ended, and why it failed; None where it is done.
 OnEnd = Callable[[int, Exception | None], None]
+
+
+#: What became of a piece, as one process tells another: "done"; "error" and a message;
+#: or "bug" and a traceback.
+Told = tuple[str, str]
 
 
 def raise_failure(piece: int, error: Exception | None) -> None:
@@ -56,6 +62,28 @@ class AbstractWork(ABC):
     @abstractmethod
     def close(self, opened: Any) -> None:
         """Let go of what `open` returned."""
+
+
+def do_alone(work: AbstractWork, index: int) -> Told:
+    """Do one piece in a process that does nothing else, and tell what became of it."""
+    _use_one_thread()
+    try:
+        opened = work.open()
+        try:
+            work.do(opened, index, lambda units: None)
+        finally:
+            work.close(opened)
+    except Exception as error:
+        return _failed(error)
+    return "done", ""
+
+
+def failure(piece: int, told: Told) -> Exception | None:
+    """Return what another process told of a piece as an error; None if it is done."""
+    kind, text = told
+    if kind == "error":
+        return InputError(text)
+    return RuntimeError(f"piece {piece} failed:\n{text}") if kind == "bug" else None
 
 
 class AbstractWorkers(ABC):
@@ -190,11 +218,8 @@ class _Member:
         except (EOFError, OSError):
             return "failed", self._end()
         self.done += kind == "done"
-        if kind == "error":
-            return "failed", InputError(value)
-        if kind == "bug":
-            return "failed", RuntimeError(f"piece {self.piece} failed:\n{value}")
-        return kind, value
+        error = failure(self.piece, (kind, value))
+        return (kind, value) if error is None else ("failed", error)
 
     def stop(self, idle: bool = False) -> None:
         """End the process: at once, unless it has nothing to do."""
@@ -244,8 +269,6 @@ def _blocked_interrupts() -> Iterator[None]:
 
 def _serve(work: AbstractWork, connection: Connection) -> None:
     """Do pieces until there are no more; runs in a process of its own."""
-    import traceback
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the employer decides
     try:
         _use_one_thread()
@@ -258,10 +281,9 @@ def _serve(work: AbstractWork, connection: Connection) -> None:
             work.close(opened)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the employer is gone
-    except InputError as error:
-        _tell(connection, "error", str(error))
-    except Exception:
-        _tell(connection, "bug", traceback.format_exc())
+    except Exception as error:
+        with suppress(OSError):  # nobody listens
+            connection.send(_failed(error))
 
 
 def _use_one_thread() -> None:
@@ -276,8 +298,7 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _tell(connection: Connection, kind: str, text: str) -> None:
-    try:
-        connection.send((kind, text))
-    except OSError:
-        pass  # nobody listens
+def _failed(error: Exception) -> Told:
+    if isinstance(error, NerfAttackError):
+        return "error", str(error)
+    return "bug", "".join(traceback.format_exception(error))

@@ -14,7 +14,7 @@ from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.job import Job
-from mi_nerfattack.io import files
+from mi_nerfattack.io import files, locks
 from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.scenario.scenario import Scenario
 
@@ -83,17 +83,19 @@ def is_complete(sweep: Path, cell: Cell) -> bool:
 def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
     """Do a cell, or what is left of it, as ``mi-nerfattack attack`` would.
 
+    What an earlier run of the sweep left at work on it is waited for.
+
     Args:
         cell: what to do.
         sweep: folder of the sweep.
         on_step: called after each control period of a drive.
 
     Raises:
-        InputError: a file has changed since the sweep began, another process works in
-            the cell's folder; or as of :meth:`Job.run`.
+        InputError: a file has changed since the sweep began; or as of :meth:`Job.run`.
         SetupError: as of :meth:`Job.run`.
     """
     output, scenario = folder_of(sweep, cell), cell.scenario
+    locks.wait_for(output)
     with claimed(output, resume=True):
         if is_complete(sweep, cell):
             return

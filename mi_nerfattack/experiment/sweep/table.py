@@ -57,9 +57,8 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
     """
     folder = folder_of(sweep, cell)
     document = files.read_json(folder / "metrics.json")
-    iterations = len(files.read_json(folder / "attack.json"))
     about = files.read_json(folder / PROVENANCE)
-    frames = _frames(cell.scenario, document, iterations)
+    frames = _frames(cell.scenario, document)
     labels = _labels(cell) | {"versions": json.dumps(about["versions"])}
     return [
         {
@@ -117,18 +116,16 @@ def _labels(cell: Cell) -> Row:
     }
 
 
-def _frames(scenario: Scenario, document: Any, iterations: int) -> dict[str, int]:
+def _frames(scenario: Scenario, document: Any) -> dict[str, int]:
     """Return the frames that finding what each case shows has cost.
 
     Args:
         scenario: of the cell.
         document: content of ``metrics.json``.
-        iterations: of the attack.
     """
-    judged, baseline = judged_frames(scenario), document["baseline"]
-    back = baseline["backward_multiple"] * scenario.attack.method.needs_derivatives
+    judged = judged_frames(scenario)
     return {
         RANDOM: judged,
-        BEST_RANDOM: judged * baseline["textures"],
-        ATTACK: round(judged * (1 + back) * iterations),
+        BEST_RANDOM: judged * document["baseline"]["textures"],
+        ATTACK: document["curve"]["frames"][-1],
     }

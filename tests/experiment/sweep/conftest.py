@@ -78,9 +78,9 @@ def finish(cell, sweep):
     drive["steps_departed"] = 15
     document = {
         "routes": {"line": {"surrogate": {"attack": {"per_run": [drive]}}}},
-        "baseline": {"textures": 2, "backward_multiple": 2.0},
+        "baseline": {"textures": 2},
+        "curve": {"frames": [4, 16, 28, 40]},
     }
     (output / "metrics.json").write_text(json.dumps(document))
-    (output / "attack.json").write_text(json.dumps([{}] * 3))
     (output / PROVENANCE).write_text(json.dumps({"versions": {"numpy": "2"}}))
     (output / COMPLETE).touch()

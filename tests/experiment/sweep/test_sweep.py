@@ -69,7 +69,7 @@ def test_the_table(cells, tmp_path):
             "environment": "surrogate",
             "case": "attack",
             "run": 0,
-            "frames": 36,  # 3 iterations of 4 periods, each rendered once and 2 back
+            "frames": 40,
             "cross_track_mean_m": 0.1 * cell.seed,
             "wheel_out_s": 1.5,
             "departed": True,

@@ -1,0 +1,125 @@
+"""Pieces of work as jobs of SLURM, through submitit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.system.extras import load_extra
+from mi_nerfattack.system.workers import (
+    MOST,
+    AbstractWork,
+    AbstractWorkers,
+    OnEnd,
+    OnUnits,
+    Told,
+    do_alone,
+    failure,
+    raise_failure,
+)
+
+_POLL_S = 0.5
+
+
+@dataclass(frozen=True)
+class SlurmJobs(AbstractWorkers):
+    """A job a piece; a job that is preempted or runs out of time is submitted again.
+
+    Jobs that are queued or running when this process is interrupted are cancelled;
+    killed, it leaves them to themselves. Units of work are not told.
+
+    Args:
+        folder: for scripts and logs; on a disk that all machines share.
+        partition: of the cluster; None: processes of this machine in its place.
+        cores: of each job.
+        memory_gb: of each job.
+        minutes: after which a job is stopped, and submitted again, up to three times.
+        count: most jobs at a time, queued ones included.
+    """
+
+    folder: Path
+    partition: str | None
+    cores: int = 1
+    memory_gb: float = 4.0
+    minutes: int = 240
+    count: int = MOST
+
+    def run(
+        self,
+        work: AbstractWork,
+        pieces: Sequence[int],
+        report: OnUnits,
+        on_end: OnEnd = raise_failure,
+    ) -> None:
+        """Do all pieces."""
+        if not pieces:
+            return
+        executor, errors = self._executor()
+        left: list[int] = list(reversed(pieces))
+        jobs: dict[int, Any] = {}
+        try:
+            while left or jobs:
+                while left and len(jobs) < self.count:
+                    piece = left.pop()
+                    try:
+                        jobs[piece] = executor.submit(_Piece(work, piece))
+                    except errors.FailedJobError as err:
+                        raise InputError(f"SLURM takes no job: {err}") from err
+                time.sleep(_POLL_S)
+                for piece in [piece for piece, job in jobs.items() if job.done()]:
+                    on_end(piece, _error(piece, jobs.pop(piece), errors))
+        finally:
+            for job in jobs.values():
+                job.cancel()
+
+    def _executor(self) -> tuple[Any, Any]:
+        """Return what submits, and the module of its errors."""
+        submitit, errors = (
+            load_extra(f"submitit{name}", "submitit", "SLURM")
+            for name in ("", ".core.utils")
+        )
+        cluster = "local" if self.partition is None else "slurm"
+        try:
+            executor = submitit.AutoExecutor(self.folder, cluster=cluster)
+        except RuntimeError as err:
+            raise SetupError(f"SLURM: {err}; run this where sbatch works") from err
+        executor.update_parameters(
+            name="mi-nerfattack",
+            timeout_min=self.minutes,
+            mem_gb=self.memory_gb,
+            cpus_per_task=self.cores,
+            slurm_partition=self.partition,
+        )
+        return executor, errors
+
+
+def _error(piece: int, job: Any, errors: Any) -> Exception | None:
+    """Return why a job that has ended did not do its piece."""
+    try:
+        return failure(piece, job.result())
+    except errors.UncompletedJobError as err:
+        told = str(err).splitlines()[-1]
+        return InputError(
+            f"job {job.job_id} ended in piece {piece}, {job.state}: {told}; see "
+            f"{job.paths.stderr}, and give more memory if it ran out of it"
+        )
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A piece, as a job does it."""
+
+    work: AbstractWork
+    index: int
+
+    def __call__(self) -> Told:
+        return do_alone(self.work, self.index)
+
+    def checkpoint(self) -> Any:
+        """Return what is submitted again; the piece itself knows what is left."""
+        helpers = load_extra("submitit.helpers", "submitit", "SLURM")
+        return helpers.DelayedSubmission(self)
