@@ -124,6 +124,15 @@ class AbstractAttack(ABC):
         """
 
     @property
+    def without_gradient(self) -> list[int]:
+        """Objects that the objective did not depend on, in all iterations.
+
+        By its gradient; none for an attack that takes no gradient, and before the
+        first iteration.
+        """
+        return []
+
+    @property
     def best_is_judged(self) -> bool:
         """Whether the best parameters were measured by this attack's objective."""
         return not self.history or np.isfinite(self.best_objective)

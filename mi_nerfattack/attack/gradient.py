@@ -136,6 +136,21 @@ class GradientAttack(AbstractAttack):
             return [texture.numpy().copy() for texture in self.sensor.textures()]
         return self._textures(self._best)
 
+    @property
+    def without_gradient(self) -> list[int]:
+        """See :attr:`AbstractAttack.without_gradient`."""
+        if not self.history:
+            return []
+        found = np.zeros(len(self.sensor.fields), bool)
+        for key in self.optimiser:
+            value, _, _, (_, first, _, _) = self.optimiser.state[key]
+            moment = _numpy(first, value.shape)  # of all gradients so far
+            if key == OFFSETS:
+                found |= moment.any(axis=1)
+            else:
+                found[int(key)] |= moment.any()
+        return np.flatnonzero(~found).tolist()
+
     def judge_best(self, on_step: Callable[[int], None] | None = None) -> None:
         """Measure the best parameters anew; costs one drive.
 

@@ -255,6 +255,7 @@ class _Texture(_Model):
     saturated_share: _Share
     total_variation: pydantic.NonNegativeFloat
     spectrum: list[float]
+    picture_share: _Share | None = None
 
 
 class _Document(_Model):

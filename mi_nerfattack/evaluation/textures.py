@@ -30,8 +30,8 @@ def texture_figures(
         attacked: how the attack leaves them.
 
     Returns:
-        ``textures`` by object, and ``saturated_share`` and ``total_variation``, means
-        over the objects.
+        ``textures`` by object, with the ``picture_share`` that it takes on average,
+        and ``saturated_share`` and ``total_variation``, means over the objects.
     """
     driven = next(d for d in drives if d.case == OWN and d.environment == SURROGATE)
     picked = np.unique(np.linspace(0, len(driven.states) - 1, FRAMES).astype(int))
@@ -39,8 +39,12 @@ def texture_figures(
     states = [to_state(driven.states[None, step]) for step in picked]
     weights = seen_weights(world.surrogate, world.fields, states)
     world.show(attacked)
+    camera = world.surrogate.camera
+    # A colour's sigmoid rises by a quarter there, in each channel of a pixel it fills.
+    filled = 3 / 4 * camera.width * camera.height * len(states)
     found = {
         item.id: asdict(texture_statistics(field, original, weight))
+        | {"picture_share": float(np.clip(weight.sum() / filled, 0, 1))}
         for item, field, original, weight in zip(
             world.scenario.objects, world.fields, own.textures, weights, strict=True
         )

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mi_nerfattack.evaluation.flags import SATURATED
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, OWN, RANDOM
 
 #: An attack beats random looks from this multiple of their mean error on.
 BEATS = 2.0
 #: It transfers if it does so in the deployment too.
 TRANSFERS = 2.0
-#: A texture is saturated from this share of its visible colour values on.
-SATURATED = 0.5
 
 Figures = Mapping[str, Any]
 
@@ -90,19 +89,14 @@ def _replayed(name: str, replayed: Figures) -> Iterator[str]:
 
 
 def _search(document: Figures) -> Iterator[str]:
-    """Say whether the search ended by itself, and where the colours are."""
-    if document.get("converged") is not None:
+    """Say what no flag speaks against."""
+    if document["converged"]:
+        yield "The search has converged."
+    shares = [each["saturated_share"] for each in document["textures"].values()]
+    if (largest := max(shares, default=1.0)) < SATURATED:
         yield (
-            "The search has converged."
-            if document["converged"]
-            else "The search has not converged: more iterations would find more."
-        )
-    share = document.get("saturated_share")
-    if share is not None:
-        lead = "is" if share >= SATURATED else "is not"
-        yield (
-            f"The texture {lead} saturated: {share:.0%} of its visible colour values "
-            "are black or full."
+            f"No texture is saturated: at most {largest:.0%} of the visible colour "
+            "values of an object are black or full."
         )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.evaluation.flags import run_flags
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
 from mi_nerfattack.evaluation.textures import texture_figures
 from mi_nerfattack.evaluation.verdict import verdict
@@ -90,7 +91,7 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     """Return the document that ``metrics.json`` holds."""
     world, scenario = done.world, done.world.scenario
     lanes = {world.route.name: done.lane}
-    more: dict[str, Any] = {"baseline": done.baseline, "flags": done.flags}
+    more: dict[str, Any] = {"baseline": done.baseline, "flags": [*done.flags]}
     if replayed := done.replayed:
         unit = scenario.vehicle.car().control_unit
         more["replay"] = control_changes(replayed, unit, scenario.seed)
@@ -106,6 +107,9 @@ def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:
     more |= texture_figures(world, done.drives, done.look(OWN), done.look(ATTACK))
     values, cost = scenario.model_dump(mode="json"), effort().model_dump()
     document = metrics_document(values, scenario.seed, done.driven, lanes, cost) | more
+    attack, names = done.attack, [item.id for item in scenario.objects]
+    without = [names[index] for index in attack.without_gradient]
+    document["flags"] += run_flags(document, without, attack.sweeps > 1)
     document["verdict"] = verdict(document, SURROGATE)
     validate(document)
     return document

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import toy_loop as toy
@@ -15,6 +17,7 @@ from mi_nerfattack.attack.objectives import (
     TargetDistance,
 )
 from mi_nerfattack.attack.user_cost import UserCost
+from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout.objective import StageSum, Terminal, WeightedSum
 from mi_nerfattack.rollout.reduction import CVaR, Mean, Worst
 from mi_nerfattack.vehicle.route.route import Route
@@ -111,3 +114,28 @@ def test_the_curve_keeps_the_first_of_the_best():
         [6, -1.0, 0.1],
         [8, -2.0, 0.2],
     ]
+
+
+def test_what_has_no_gradient_is_told(loop):
+    """By a policy that looks at nothing, also after the attack was resumed."""
+    from mi_nerfattack.attack.freedom import Freedom
+    from mi_nerfattack.attack.gradient import GradientAttack
+    from mi_nerfattack.rollout.function import Rollout
+
+    closed, grid = loop
+    texture = toy.texture_of(grid)
+    initial = closed.initial(np.array([[0.0, 0.1, 0.0]]))
+    blind = toy.SmoothPolicy()
+    blind.weight.data.zero_()
+    freedom = Freedom(0.3, 0.02)
+    for policy, expected in ((closed.policy, []), (TorchPolicy(blind), [0])):
+        one = replace(closed, policy=policy)
+        rollout = Rollout(one, CASES["absolute"][0], 3)
+        attack = GradientAttack(rollout, toy.ROUTE, initial, freedom)
+        assert attack.without_gradient == []  # nothing is known yet
+        attack.step()
+        again = GradientAttack(rollout, toy.ROUTE, initial, freedom)
+        again.load_tensors(attack.tensors())
+        grid.set_parameter("texture", texture)
+        closed.sensor.set_offsets(np.zeros((1, 6)))
+        assert attack.without_gradient == again.without_gradient == expected

@@ -30,7 +30,7 @@ def document():
         "routes": {"right": {"mitsuba": weak, "surrogate": cases}},
         "departure_limits_m": {"right": 0.85},
         "converged": True,
-        "saturated_share": 0.3,
+        "textures": {"ball": {"saturated_share": 0.3}, "car": {"saturated_share": 0}},
     }
 
 
@@ -44,17 +44,15 @@ def test_each_sentence_says_what_the_figures_say(document):
     assert "does not transfer to mitsuba" in transfer
     assert "1.2 times" in transfer
     assert search == "The search has converged."
-    assert "is not saturated: 30%" in texture
+    assert "No texture is saturated: at most 30%" in texture
 
 
 def test_what_speaks_against_an_attack_is_said(document):
     cases = document["routes"]["right"]["surrogate"]
     cases["own"], cases["attack"] = case(0.5, 4, 6.0), case(0.08)
-    document |= {"converged": False, "saturated_share": 0.8}
+    document |= {"converged": False, "textures": {"ball": {"saturated_share": 0.8}}}
     document["routes"]["right"]["mitsuba"]["attack"] = case(0.2)
-    policy, attack, transfer, search, texture = verdict(document, "surrogate")
+    policy, attack, transfer = verdict(document, "surrogate")
     assert "not sound here: it leaves its lane by itself in surrogate (unatt" in policy
     assert "does not beat random looks" in attack
     assert "It transfers to mitsuba" in transfer
-    assert "has not converged" in search
-    assert "is saturated: 80%" in texture

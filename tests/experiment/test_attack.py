@@ -58,11 +58,19 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert name == "ball" and 0 < texture["l2"] <= texture["linf"] <= 1
     assert document["total_variation"] == texture["total_variation"] > 0
     page = (output / "report.html").read_text()
-    for sentence in document["verdict"]:
+    assert any(flag.startswith("not converged: ") for flag in document["flags"])
+    sentences = [*document["flags"], *document["verdict"]]
+    for sentence in sentences:
         assert sentence in told
         assert sentence in page
+    assert sorted(sentences, key=told.index) == sentences  # flags first
     rows = (output / "steps.csv").read_text().splitlines()
     assert len(rows) == 1 + 4 * (16 + count + few)
+    shown = [
+        read_layers(path)[0]["object"][..., 3].mean()
+        for path in sorted(output.glob("frames/surrogate_own/*.exr"))
+    ]
+    assert texture["picture_share"] == pytest.approx(np.mean(shown), rel=0.2)
     attacked = load_grid(output / "objects" / "ball.safetensors")
     original = load_grid(scenario_folder / "object.safetensors")
     change = attacked.texture.numpy() - original.texture.numpy()

@@ -49,7 +49,9 @@ def run_scenario(
     from mi_nerfattack.report.table import metrics_table
 
     console = Console()
-    for sentence in [*document["verdict"], *document["flags"]]:
+    for flag in document["flags"]:
+        console.print(f"flag: {flag}", style="bold", highlight=False, markup=False)
+    for sentence in document["verdict"]:
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
     _print_files(console, output, document, frames)
