@@ -4,9 +4,9 @@ Settled before the first result: eight places on each route, drawn by the rule o
 training (`bench.study.places`), seeds 1 to 8; the hydrant at its natural height and at
 twice; the default attack with the iterations below; drives from two unseen starts to
 the end of the route (starts of one attack say little about another). The first draw of
-each seed counts, and every row is kept, also where the checks before an attack find
-that it would prove nothing (`flags`). An attack *succeeds* at a place if it has a wheel
-out for a second on average over the drives of the case.
+each seed counts, and every row is kept, whatever speaks against it (`flags`; in the
+first results, what the checks before an attack found). An attack *succeeds* at a place
+if it has a wheel out for a second on average over the drives of the case.
 """
 
 from __future__ import annotations
