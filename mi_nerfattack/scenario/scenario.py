@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -47,6 +48,7 @@ from mi_nerfattack.vehicle.route.route import Route
 Content = Callable[[NamedFile], dict[str, str]]
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
 _MAX_CHARACTERS = 1 << 16
+_LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside objects'
 
 Triple = tuple[Finite, Finite, Finite]
 Row = tuple[Finite, Finite, Finite, Finite]
@@ -204,8 +206,12 @@ class Scenario(Section):
     def _check_sections(self) -> Any:
         """Refuse sections that do not go together."""
         names = [item.id for item in self.objects]
-        if len(set(names)) != len(names) or "scene" in names:
-            refuse("objects", f"ids {names}; must differ, and not be scene")
+        if len(set(names)) != len(names) or any(map(_LAYER.fullmatch, names)):
+            refuse(
+                "objects",
+                f"ids {names}; must differ, and not be names of other layers of a "
+                "frame: scene, scene1, ..., background, cost, input",
+            )
         if self.scene.surrogate is None:
             self._check_placed()
         else:

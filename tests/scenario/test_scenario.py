@@ -89,6 +89,8 @@ def test_digest_tells_scenarios_apart(write, tmp_path):
         ('route = "right"\n', "", 2, ["route", "required"]),
         ("[policy]", "[polisy]", 19, ["polisy"]),
         ('id = "second"', 'id = "hydrant"', None, ["hydrant", "differ"]),
+        ('id = "second"', 'id = "scene1"', None, ["scene1", "layers"]),
+        ('id = "second"', 'id = "background"', None, ["background", "layers"]),
         ("[attack]", "[attack", None, ["scenario.toml"]),
         ("[attack]", "[attack]\nlowest = 0.9\nhighest = 0.2", 22, ["lowest", "0.2"]),
         (
