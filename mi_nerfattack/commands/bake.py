@@ -28,7 +28,7 @@ class Bake:
     cone: float = 1 / 64
     """Edge of a brick's parts over the distance to the nearest route; half takes up to
     six times the memory."""
-    passes: int = 2
+    passes: int = 4
     """Passes of the refinement."""
     views: int = 100
     """Views of a pass."""

@@ -58,7 +58,7 @@ class BakeOptions:
     """
 
     cone: Positive = 1 / 64
-    passes: Whole = 2
+    passes: Whole = 4
     views: Count = 100
     seed: Seed = 0
 
