@@ -23,6 +23,7 @@ from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
+from mi_nerfattack.commands.transfer import Transfer
 
 
 class Command(Protocol):
@@ -48,6 +49,7 @@ COMMANDS: dict[str, type[Command]] = {
     "check": Check,
     "attack": Attack,
     "sweep": Sweep,
+    "transfer": Transfer,
 }
 
 __all__ = ["COMMANDS", "Command"]

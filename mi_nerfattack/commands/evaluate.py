@@ -198,17 +198,11 @@ class Evaluate:
 
     def _workers(self, policy: AbstractPolicySection) -> AbstractWorkers:
         from mi_nerfattack.scenario.policy import HttpSection
-        from mi_nerfattack.system.workers import (
-            InThisProcess,
-            Processes,
-            available_cores,
-        )
+        from mi_nerfattack.system.workers import chosen_workers
 
         # a server that keeps a state would mix the drives of several processes
         alone = "carla" in self.environments or isinstance(policy, HttpSection)
-        default = 1 if alone else available_cores()
-        count = default if self.workers is None else self.workers
-        return InThisProcess() if count == 1 else Processes(count)
+        return chosen_workers(self.workers, alone)
 
 
 def _check_different(option: str, names: tuple[str, ...]) -> None:

@@ -27,5 +27,8 @@ from .sites import ANY_WEATHER as ANY_WEATHER
 from .sites import AbstractSite as AbstractSite
 from .sites import PlaceSite as PlaceSite
 from .sites import Weather as Weather
+from .stress.timing import DroppedFrames as DroppedFrames
+from .stress.timing import LateControls as LateControls
+from .stress.timing import LateFrames as LateFrames
 from .vehicle import AbstractVehicle as AbstractVehicle
 from .views.paste import paste_layers as paste_layers

@@ -13,7 +13,7 @@ import rich.table
 
 from mi_nerfattack.evaluation.metrics import lane_of
 from mi_nerfattack.io import files
-from mi_nerfattack.rollout.drive import Drive, Lane
+from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
 
 STEP_COLUMNS = (
     "environment",
@@ -121,8 +121,46 @@ def card_table(card: Mapping[str, Any]) -> rich.table.Table:
     return table
 
 
-def _distances() -> rich.table.Table:
-    title, box = "Distance from the lane centre", rich.box.SIMPLE_HEAD
+def transfer_table(document: Mapping[str, Any]) -> rich.table.Table:
+    """Return the summary of a transfer as a table that fits a terminal of 80 columns.
+
+    Args:
+        document: whole, of `transfer.figures.make_document`.
+
+    Returns:
+        A row per environment and condition: the mean error of each case over the
+        attacks; the attack's as a multiple of that in the surrogate; how many attacks
+        have a wheel out for a second, with Wilson's interval in per cent.
+    """
+    table = _distances("Mean distance from the lane centre (m)")
+    table.add_column("environment", overflow="fold", max_width=19)
+    for case in document["cases"]:
+        table.add_column(case.replace("_", "\n"), justify="right", no_wrap=True)
+    for name in ("to sur-\nrogate", "attacks\nout"):
+        table.add_column(name, justify="right", no_wrap=True)
+    last = ""
+    for column in document["columns"]:
+        if column["environment"] != last:
+            table.add_section()
+            last = column["environment"]
+            table.add_row(last)
+        condition = column["condition"].replace(",", ",\n ")
+        table.add_row(f" {condition}", *_transfer_cells(column))
+    return table
+
+
+def _transfer_cells(column: Mapping[str, Any]) -> list[str]:
+    cases, ratio = column["cases"], column["ratio_to_surrogate"]
+    means = [f"{figures['cross_track_mean_m']:.3f}" for figures in cases.values()]
+    attack, out = cases.get(ATTACK), ""
+    if attack is not None:
+        low, high = (round(100 * end) for end in attack["attacks_out_rate_ci95"])
+        out = f"{attack['attacks_out']}/{column['attacks']} [{low}, {high}]"
+    return [*means, "" if ratio is None else f"{ratio:.2f}", out]
+
+
+def _distances(title: str = "Distance from the lane centre") -> rich.table.Table:
+    box = rich.box.SIMPLE_HEAD
     return rich.table.Table(title=title, box=box, pad_edge=False, padding=(0, 1))
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
+from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.deploy.place import Place
+from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.simulated import SurrogateEnvironment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
@@ -61,7 +62,8 @@ class World:
         fields: grid fields of the objects, in the scenario's order.
         surrogate: sensor in the scene's field.
         optimised: sensor that attacks are made through; `surrogate`, or in bricks.
-        deployments: other environments, by label.
+        place: where other environments are.
+        deployments: those of the scenario, by label.
         policy: the policy under test.
         motion: of the vehicle.
         objective: what an attack makes smaller.
@@ -73,6 +75,7 @@ class World:
     fields: list[GridField]
     surrogate: FieldSensor
     optimised: FieldSensor
+    place: Place
     deployments: Mapping[str, Deployment]
     policy: AbstractPolicy
     motion: Motion
@@ -121,11 +124,8 @@ class World:
         objects = [] if empty else self.surrogate.objects
         if label != SURROGATE:
             return self.deployments[label].open(objects)
-        vehicle = self.scenario.vehicle
-        car = vehicle.car()
-        rest = vehicle.dt_s, car.max_control, car.control_unit
         sensor = self.surrogate.showing([]) if empty else self.surrogate
-        return SurrogateEnvironment(sensor, KinematicVehicle(self.motion, *rest))
+        return SurrogateEnvironment(sensor, kinematic_vehicle(self.place))
 
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
@@ -169,7 +169,6 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     if place.bricks is not None:
         bricks = _load_layer(scenario, place.bricks.file)
         optimised = surrogate.showing(surrogate.objects, bricks)
-    camera, mount = surrogate.camera, surrogate.mount
     motion = scenario.vehicle.motion()
     route = driven_route(scenario, motion)
     objective = scenario.objective.build(scenario, route, motion.dynamics)
@@ -178,8 +177,8 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         field=None,
         routes=place.routes.file,
         objects=(),
-        camera=camera,
-        mount=mount,
+        camera=surrogate.camera,
+        mount=surrogate.mount,
         period=scenario.vehicle.dt_s,
         car=scenario.vehicle.car(),
         motion=motion,
@@ -190,6 +189,7 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         surrogate.fields,
         surrogate,
         optimised,
+        where,
         deployments(scenario.deployment, where),
         policy,
         motion,
@@ -274,9 +274,7 @@ def build_rollout(world: World) -> tuple[Rollout, Any]:
         section.adjoint.build(),
         section.attached,
     )
-    poses = initial_states(scenario, world.route, section.poses, 2)
-    poses[0] = world.route.pose_at(scenario.drive.start_m)
-    return rollout, loop.initial(poses)
+    return rollout, loop.initial(optimised_states(scenario, world.route))
 
 
 def build_attack(world: World) -> AbstractAttack:
@@ -318,6 +316,13 @@ def _load_layer(scenario: Scenario, path: Path) -> Layer:
             "false, or fit a field to the scene"
         )
     return SplatBackground(read_splats(path), pose)
+
+
+def optimised_states(scenario: Scenario, route: Route) -> np.ndarray:
+    """Return the states (m, 3) that an attack starts from, the nominal one first."""
+    states = initial_states(scenario, route, scenario.attack.poses, 2)
+    states[0] = route.pose_at(scenario.drive.start_m)
+    return states
 
 
 def initial_states(

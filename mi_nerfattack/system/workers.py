@@ -244,6 +244,19 @@ class _Member:
         )
 
 
+def chosen_workers(count: int | None, alone: bool) -> AbstractWorkers:
+    """Return who does the work of a command.
+
+    Args:
+        count: of processes, as ``--workers`` says; 1 works in this one. None for one a
+            core.
+        alone: whether None stands for 1.
+    """
+    default = 1 if alone else available_cores()
+    count = default if count is None else count
+    return InThisProcess() if count == 1 else Processes(count)
+
+
 def available_cores() -> int:
     """Return the number of cores that this process may use, at most `MOST`."""
     return min(cores(), MOST)

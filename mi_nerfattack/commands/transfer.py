@@ -1,0 +1,117 @@
+"""``mi-nerfattack transfer``: found attacks in every environment and condition."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from mi_nerfattack.experiment.transfer.work import TransferWork
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Drive past found attacks, unchanged, in every environment and condition.
+
+    Drives start where the attacks were neither optimised nor evaluated: without
+    objects, past the objects as they were, past the best random look of each run and
+    past its attack. The folder has a table (transfer.json), which grows by a row at a
+    time, and a picture. Finished drives are kept: the same command continues after
+    Ctrl-C, and more runs, environments, conditions or starts add to them.
+    """
+
+    run_folders: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")
+    ]
+    """Folders of finished runs of attack."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for table, picture and drives; one of an earlier transfer goes on."""
+    environments: tuple[str, ...] = (
+        "surrogate",
+        "mitsuba",
+        "mitsuba_built_in",
+        "mujoco",
+        "mujoco_gl",
+    )
+    """Environments: surrogate, mitsuba, mujoco, mujoco_gl, which paste objects, and
+    mitsuba_built_in, mujoco_built_in, mujoco_gl_built_in."""
+    conditions: tuple[str, ...] = (
+        "day",
+        "morning",
+        "noon",
+        "evening",
+        "overcast",
+        "exposure:-1",
+        "exposure:+1",
+        "noise:0.03",
+        "blur:1",
+        "dropped:0.2",
+        "late:1",
+        "latency:1",
+        "placement:0.1",
+        "turn:10",
+        "pitch:1",
+    )
+    """Conditions: times of day, exposure (powers of two), noise (sRGB, of 1), blur
+    (pixels), dropped (share of frames), late (frames) and latency (controls) in control
+    periods, errors of placement (metres) and turn (degrees) of objects and of the
+    camera's pitch (degrees); several at once with commas: evening,noise:0.03."""
+    cases: tuple[str, ...] = ("no_object", "own", "best_random", "attack")
+    """What objects show."""
+    starts: int = 4
+    """Drives of each case, environment and condition."""
+    seed: int = 1
+    """Of starts, images and errors."""
+    spp: int = 16
+    """Samples per pixel of path-traced images."""
+    workers: int | None = None
+    """Processes that drive; one a core by default, 1 for policies behind a URL. 1
+    drives in this process."""
+    json: bool = False
+    """Print transfer.json in place of the table."""
+
+    def run(self) -> int:
+        """Drive, summarise, print and write."""
+        from rich.console import Console
+
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.experiment.transfer.run import check_output, run_transfer
+        from mi_nerfattack.report.table import transfer_table
+        from mi_nerfattack.scenario.policy import HttpSection
+        from mi_nerfattack.system.workers import chosen_workers
+
+        variant.ensure()
+        work = self._work()
+        policies = [found.scenario.policy for found in work.attacks]
+        alone = any(isinstance(policy, HttpSection) for policy in policies)
+        workers = chosen_workers(self.workers, alone)
+        check_output(self.output)
+        with StageBars() as bars:
+            count = self.starts * len(work.batches)
+            bars.say(f"{len(work.rows)} rows, {count} drives, kept in {work.folder}")
+            progress = bars.counter("driving", "step ")
+            document = run_transfer(work, self.output, workers, progress)
+        if self.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            console = Console()
+            console.print(transfer_table(document))
+            console.print(f"Written: {self.output.resolve()}", soft_wrap=True)
+        return 0
+
+    def _work(self) -> TransferWork:
+        """Check everything that can be checked before the first drive."""
+        from mi_nerfattack.experiment.transfer.columns import make_columns
+        from mi_nerfattack.experiment.transfer.found import read_found
+        from mi_nerfattack.experiment.transfer.run import DRIVES
+        from mi_nerfattack.experiment.transfer.work import TransferWork
+
+        columns = make_columns(self.environments, self.conditions, self.spp)
+        attacks, folder = read_found(self.run_folders), self.output / DRIVES
+        choices = self.cases, self.starts, self.seed
+        return TransferWork(attacks, columns, *choices, folder)

@@ -1,0 +1,1 @@
+"""What goes wrong between an environment and a policy, and where things stand."""

@@ -1,0 +1,1 @@
+"""Found attacks, unchanged, in every environment and under conditions."""

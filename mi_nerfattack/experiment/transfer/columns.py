@@ -1,0 +1,254 @@
+"""Where found attacks are driven: environments, and conditions by which they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from mi_nerfattack.deploy.environment import AbstractEnvironment
+from mi_nerfattack.deploy.place import Conditions
+from mi_nerfattack.deploy.registry import kinematic_vehicle
+from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.stress.pose_error import PoseError
+from mi_nerfattack.deploy.stress.timing import DroppedFrames, LateControls, LateFrames
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Finite, NonNegative, Share, Whole, checked
+from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenario.deployment import SURROGATE, Deployment
+from mi_nerfattack.scenario.scenario import Scenario
+from mi_nerfattack.scenario.vehicle import CustomSection
+from mi_nerfattack.scenario.world import World
+
+#: Where objects are pasted, and where they can also be built in.
+PASTED = (SURROGATE, "mitsuba", "mujoco", "mujoco_gl")
+BUILT_IN = "_built_in"
+ENVIRONMENTS = (*PASTED, *(f"{name}{BUILT_IN}" for name in PASTED[1:]))
+
+#: Fields of a condition by the words of the command line.
+_WORDS = {
+    "exposure": "exposure_ev",
+    "noise": "noise_sd",
+    "blur": "blur_px",
+    "dropped": "dropped_share",
+    "late": "late_periods",
+    "latency": "latency_periods",
+    "placement": "placement_m",
+    "turn": "turn_deg",
+    "pitch": "pitch_deg",
+}
+
+
+@dataclass(frozen=True)
+@checked("condition")
+class Condition:
+    """What differs from the drives of an attack; by default nothing.
+
+    Args:
+        sky: time of day, key of `DAYLIGHT`.
+        exposure_ev: of the camera, in powers of two.
+        noise_sd: of the camera, see `Conditions`.
+        blur_px: likewise.
+        dropped_share: of frames that are lost, see `DroppedFrames`.
+        late_periods: see `LateFrames`; what is lost is lost before it is late.
+        latency_periods: see `LateControls`.
+        placement_m: see `PoseError`, and so the next two.
+        turn_deg: likewise.
+        pitch_deg: likewise.
+    """
+
+    sky: str = "day"
+    exposure_ev: Finite = 0.0
+    noise_sd: NonNegative = 0.0
+    blur_px: NonNegative = 0.0
+    dropped_share: Share = 0.0
+    late_periods: Whole = 0
+    latency_periods: Whole = 0
+    placement_m: NonNegative = 0.0
+    turn_deg: NonNegative = 0.0
+    pitch_deg: NonNegative = 0.0
+
+    @property
+    def errors(self) -> PoseError:
+        """Of objects and camera."""
+        return PoseError(self.placement_m, self.turn_deg, self.pitch_deg)
+
+    @property
+    def is_light(self) -> bool:
+        """Whether it changes light or exposure, which a field cannot."""
+        return self.sky != "day" or self.exposure_ev != 0
+
+    @property
+    def label(self) -> str:
+        """As `parse_condition` reads it: ``day``, ``evening,noise:0.03``."""
+        parts = [] if self.sky == "day" else [self.sky]
+        for word, name in _WORDS.items():
+            if value := getattr(self, name):
+                sign = "+" * (word == "exposure" and value > 0)
+                parts.append(f"{word}:{sign}{value:g}")
+        return ",".join(parts) or "day"
+
+    def around(self, environment: AbstractEnvironment) -> AbstractEnvironment:
+        """Let frames and controls of an environment be late or lost."""
+        if self.dropped_share:
+            environment = DroppedFrames(environment, self.dropped_share)
+        if self.late_periods:
+            environment = LateFrames(environment, self.late_periods)
+        if self.latency_periods:
+            environment = LateControls(environment, self.latency_periods)
+        return environment
+
+
+def parse_condition(text: str) -> Condition:
+    """Read a condition.
+
+    Args:
+        text: a time of day, ``WORD:NUMBER``, or several of these with commas.
+
+    Raises:
+        InputError: an unknown word, one given twice, or a number out of its range.
+    """
+    kinds = {item.name: item.type for item in fields(Condition)}
+    values: dict[str, Any] = {}
+    for part in text.split(","):
+        word, colon, number = part.partition(":")
+        name = _WORDS.get(word) if colon else "sky" if word in DAYLIGHT else None
+        if name is None or name in values:
+            raise InputError(
+                f"--conditions: {text!r}: {part!r}; a time of day "
+                f"({', '.join(DAYLIGHT)}) or WORD:NUMBER with {', '.join(_WORDS)}, "
+                "each once, parted by commas"
+            )
+        try:
+            kind = int if kinds[name] == "Whole" else float
+            values[name] = word if name == "sky" else kind(number)
+        except ValueError as err:
+            raise InputError(f"--conditions: {text!r}: {word}: {err}") from err
+    try:
+        return Condition(**values)
+    except InputError as err:
+        raise InputError(f"--conditions: {text!r}: {err}") from err
+
+
+@dataclass(frozen=True)
+class Column:
+    """An environment under a condition.
+
+    Args:
+        environment: one of `ENVIRONMENTS`.
+        condition: see there.
+        spp: samples per pixel of path-traced images.
+    """
+
+    environment: str
+    condition: Condition
+    spp: int
+
+    @property
+    def name(self) -> str:
+        """Key of `deploy.registry.ENVIRONMENTS`."""
+        return self.environment.removesuffix(BUILT_IN)
+
+    @property
+    def builds_in(self) -> bool:
+        """Whether objects become geometry of the scene."""
+        return self.environment.endswith(BUILT_IN)
+
+    @property
+    def without_objects(self) -> Column:
+        """The column in which drives without objects are the same."""
+        condition = replace(self.condition, placement_m=0.0, turn_deg=0.0)
+        return replace(self, environment=self.name, condition=condition)
+
+    @property
+    def serves_one_start(self) -> bool:
+        """Whether each start needs an environment of its own."""
+        errors = self.condition.errors
+        return bool(errors.pitch_deg) or (self.builds_in and errors.moves_objects)
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that decides about its drives, as JSON."""
+        found = {"environment": self.environment, **asdict(self.condition)}
+        traced = self.name in ("mitsuba", "mujoco")
+        return found | ({"spp": self.spp} if traced else {})
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise InputError unless a scenario's vehicle can drive there."""
+        if isinstance(scenario.vehicle, CustomSection) and "mujoco" in self.name:
+            raise InputError(
+                f"--environments: {self.environment} drives a car with wheels, whose "
+                f"control is not that of the custom vehicle of {scenario.name!r}; "
+                "leave it out"
+            )
+
+    def open(
+        self, world: World, objects: Sequence[PosedField], seed: int
+    ) -> AbstractEnvironment:
+        """Make the environment, objects as they look and stand at present.
+
+        Args:
+            world: of the attack.
+            objects: its own, or none; where they are not built in, the environment
+                follows them when they change.
+            seed: of the drive.
+        """
+        condition = self.condition
+        mount = condition.errors.mount(world.place.mount, seed)
+        place = replace(world.place, mount=mount)
+        blur, noise = condition.blur_px, condition.noise_sd
+        if self.environment == SURROGATE:
+            sensor = world.surrogate.showing(list(objects))
+            sensor.mount = mount
+            found = SurrogateEnvironment(sensor, kinematic_vehicle(place))
+            found.blur_px, found.noise_sd = blur, noise
+            return condition.around(found)
+        light = Conditions(
+            condition.sky,
+            condition.exposure_ev,
+            self.spp,
+            blur_px=blur,
+            noise_sd=noise,
+        )
+        deployment = Deployment(self.name, place, light, self.builds_in)
+        return condition.around(deployment.open(objects))
+
+
+def make_columns(
+    environments: Sequence[str], conditions: Sequence[str], spp: int
+) -> tuple[Column, ...]:
+    """Return all environments under all conditions that have an effect there.
+
+    Args:
+        environments: of `ENVIRONMENTS`, each once.
+        conditions: see `parse_condition`, each once.
+        spp: samples per pixel of path-traced images, at least 1.
+
+    Raises:
+        InputError: an unknown environment, a condition that cannot be read, none of
+            either, one twice, or no condition with an effect.
+    """
+    for name in environments:
+        if name not in ENVIRONMENTS:
+            known = ", ".join(ENVIRONMENTS)
+            raise InputError(f"--environments: {name!r}; one of {known}")
+    parsed = [parse_condition(text) for text in conditions]
+    for option, given in (("environments", environments), ("conditions", parsed)):
+        if not given or len(set(given)) < len(given):
+            words = environments if option == "environments" else conditions
+            raise InputError(
+                f"--{option}: {' '.join(words)!r}; at least one, each once"
+            )
+    Conditions(spp=spp)  # checks it
+    found = tuple(
+        Column(name, condition, spp)
+        for name in environments
+        for condition in parsed
+        if name != SURROGATE or not condition.is_light
+    )
+    if not found:
+        raise InputError(
+            "--conditions: the surrogate has the light of its field; give a condition "
+            "of another kind, or further environments"
+        )
+    return found

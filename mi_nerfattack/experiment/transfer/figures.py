@@ -1,0 +1,166 @@
+"""The document ``transfer.json``: rows as they are finished, then their summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
+from mi_nerfattack.evaluation.metrics import summarise
+from mi_nerfattack.experiment.transfer.columns import Column
+from mi_nerfattack.experiment.transfer.found import FoundAttack, surrogate_of
+from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
+from mi_nerfattack.rollout.drive import ATTACK, Drive
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+SCHEMA = 1
+#: An attack succeeds where a wheel is out so long, in the mean over its drives.
+SUCCESS_S = 1.0
+
+#: Figures of a case by the digest of its batch.
+Figures = Mapping[str, dict[str, Any]]
+Row = dict[str, Any]
+
+
+def case_figures(
+    work: TransferWork, batch: Batch, drives: Sequence[Drive]
+) -> dict[str, Any]:
+    """Summarise the drives of a batch.
+
+    Returns:
+        the figures of `metrics.summarise`, and ``departure_rate_ci95`` (Wilson) of
+        the share of drives that left the lane.
+    """
+    found = work.attacks[batch.number]
+    lanes = {found.route.name: found.lane}
+    by_case = summarise(drives, lanes, work.seed)[found.route.name]
+    figures = by_case[batch.column.environment][batch.case]
+    left = share_interval(figures["drives_departed"], figures["n"])
+    return {**figures, "departure_rate_ci95": left}
+
+
+def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
+    """Return what ``transfer.json`` holds, of the rows that are whole.
+
+    Args:
+        work: all that is wanted.
+        figures: of the batches that are done.
+    """
+    rows = [
+        {
+            "attack": work.attacks[number].label,
+            "environment": column.environment,
+            "condition": column.condition.label,
+            "cases": {case: figures[batch.digest] for case, batch in row.items()},
+        }
+        for (number, column), row in work.rows.items()
+        if all(batch.digest in figures for batch in row.values())
+    ]
+    _compare(rows)
+    complete = len(rows) == len(work.rows)
+    return {
+        "schema": SCHEMA,
+        "complete": complete,
+        "seed": work.seed,
+        "starts": work.starts,
+        "cases": list(work.cases),
+        "success_s": SUCCESS_S,
+        "conditions": {
+            column.condition.label: asdict(column.condition)
+            for column in sorted(work.columns, key=lambda c: c.environment == SURROGATE)
+        },
+        "attacks": [_about(found) for found in work.attacks],
+        "rows": rows,
+        "columns": _columns(rows, work.columns, work.seed) if complete else [],
+    }
+
+
+def _about(found: FoundAttack) -> dict[str, Any]:
+    scenario = found.scenario
+    return {
+        "label": found.label,
+        "folder": str(found.folder),
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "route": found.route.name,
+        "policy": scenario.policy.source,
+        "objects": [item.id for item in scenario.objects],
+        "surrogate": surrogate_of(found),
+        "departure_limit_m": found.lane.wheel_m,
+        "found_sha256": found.digest,
+    }
+
+
+def _compare(rows: Sequence[Row]) -> None:
+    """Set each row's attack beside the same in the surrogate without a condition."""
+    bases = {
+        row["attack"]: row["cases"].get(ATTACK)
+        for row in rows
+        if (row["environment"], row["condition"]) == (SURROGATE, "day")
+    }
+    for row in rows:
+        here, base = row["cases"].get(ATTACK), bases.get(row["attack"])
+        ratio = None
+        if here and base and base["cross_track_mean_m"] > 0:
+            ratio = here["cross_track_mean_m"] / base["cross_track_mean_m"]
+        row["ratio_to_surrogate"] = ratio
+        row["succeeds"] = None if here is None else _is_out(here)
+        row["succeeds_in_surrogate"] = None if base is None else _is_out(base)
+
+
+def _columns(
+    rows: Sequence[Row], columns: Sequence[Column], seed: int
+) -> list[dict[str, Any]]:
+    """Summarise each column over the attacks."""
+    found = []
+    for column in columns:
+        key = column.environment, column.condition.label
+        own = [row for row in rows if (row["environment"], row["condition"]) == key]
+        ratios = [r for row in own if (r := row["ratio_to_surrogate"])]
+        mean = float(np.exp(np.log(ratios).mean())) if len(ratios) == len(own) else None
+        found.append(
+            {
+                "environment": key[0],
+                "condition": key[1],
+                "attacks": len(own),
+                "cases": {
+                    case: _over_attacks([row["cases"][case] for row in own], seed)
+                    for case in own[0]["cases"]
+                },
+                "ratio_to_surrogate": mean,
+                "transfer": _transfer(own),
+            }
+        )
+    return found
+
+
+def _over_attacks(cases: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
+    """Summarise a case of one column over the attacks, each of which counts once."""
+    means = np.array([case["cross_track_mean_m"] for case in cases])
+    out = sum(_is_out(case) for case in cases)
+    return {
+        "cross_track_mean_m": float(means.mean()),
+        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        "cross_track_max_m": max(case["cross_track_max_m"] for case in cases),
+        "drives": sum(case["n"] for case in cases),
+        "drives_departed": sum(case["drives_departed"] for case in cases),
+        "attacks_out": out,
+        "attacks_out_rate_ci95": share_interval(out, len(cases)),
+    }
+
+
+def _transfer(rows: Sequence[Row]) -> dict[str, Any] | None:
+    """Count how many of the attacks that succeed in the surrogate do so here."""
+    some = [row for row in rows if row["succeeds_in_surrogate"]]
+    if not some or some[0]["succeeds"] is None:
+        return None
+    kept = sum(row["succeeds"] for row in some)
+    ci95 = share_interval(kept, len(some))
+    return {"of": len(some), "kept": kept, "rate_ci95": ci95}
+
+
+def _is_out(case: dict[str, Any]) -> bool:
+    return case["wheel_out_s"] >= SUCCESS_S

@@ -1,0 +1,197 @@
+"""Attacks that were found: finished run folders, read back."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.attack.black_box.random_looks import RandomLooks
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import validate
+from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO
+from mi_nerfattack.fields import load_grid
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import differences, refuse
+from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, OWN, Lane
+from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.world import (
+    Appearance,
+    World,
+    driven_route,
+    initial_states,
+    optimised_states,
+)
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Streams of initial states from here on are of no run, which has 0 and 2.
+_FIRST_STREAM = 16
+_REMEDY = "put the files back that the attack was made with, or attack anew"
+
+
+@dataclass(frozen=True, eq=False)
+class FoundAttack:
+    """A finished run of ``mi-nerfattack attack``; picklable.
+
+    Attributes:
+        folder: of the run.
+        label: that tells it from the others.
+        scenario: of the run.
+        route: that it drives along, with the vehicle's speed.
+        offsets: (k, 6) of the attacked objects from where the scenario puts them.
+        best_random: number of the best of the run's random looks, None without any.
+        identity: of the scenario, see :meth:`Scenario.identity`.
+        digest: of attacked textures and offsets.
+    """
+
+    folder: Path
+    label: str
+    scenario: Scenario
+    route: Route
+    offsets: np.ndarray
+    best_random: int | None
+    identity: Mapping[str, str]
+    digest: str
+
+    @property
+    def horizon(self) -> int:
+        """Control periods of a drive."""
+        return self.scenario.drive.steps(self.route, self.scenario.vehicle.dt_s)
+
+    @property
+    def lane(self) -> Lane:
+        """Of the route."""
+        return Lane.of(self.route, self.scenario.vehicle.width_m)
+
+    def start(self, seed: int, number: int) -> tuple[np.ndarray, int]:
+        """Draw a start as the scenario draws its own, but another one.
+
+        Args:
+            seed: of all starts.
+            number: of the start.
+
+        Returns:
+            pose (3,), metres and radians; and the seed of a drive from there.
+        """
+        stream = _FIRST_STREAM + number
+        like = self.scenario.model_copy(update={"seed": seed})
+        pose = initial_states(like, self.route, 1, stream)[0]
+        sequence = np.random.SeedSequence([seed, stream])
+        return pose, int(sequence.generate_state(1)[0] >> 1)
+
+    def check_starts(self, seed: int, count: int) -> None:
+        """Raise InputError if the attack has seen one of the starts."""
+        scenario, route = self.scenario, self.route
+        evaluated = initial_states(scenario, route, scenario.drive.runs, 0)
+        seen = np.concatenate([evaluated, optimised_states(scenario, route)])
+        for number in range(count):
+            pose, _ = self.start(seed, number)
+            if np.isclose(seen, pose, rtol=0, atol=1e-6).all(1).any():
+                raise InputError(
+                    f"{self.folder}: start {number} is one of the run's own; drives "
+                    "from there tell nothing new. Its scenario's [drive] must let "
+                    "starts vary (lateral_sd_m, heading_sd_deg or covariance)"
+                )
+
+    def looks(self, world: World) -> dict[str, Appearance]:
+        """Load how the objects of a world look, and where they stand, by case."""
+        own = world.appearance()
+        attacked = []
+        for item, texture in zip(self.scenario.objects, own.textures, strict=True):
+            path = _field_path(self.folder, item.id)
+            attacked.append(load_grid(path).texture.numpy())
+            if attacked[-1].shape != texture.shape:
+                raise InputError(
+                    f"{path}: {len(attacked[-1])} vertices, the object of the scenario "
+                    f"has {len(texture)}; {_REMEDY}"
+                )
+        found = {OWN: own, ATTACK: Appearance(attacked, self.offsets)}
+        if self.best_random is not None:
+            freedom = self.scenario.attack.freedom.build()
+            kind, seed = self.scenario.baseline.kind, self.scenario.seed
+            looks = RandomLooks(world.fields, freedom, kind, seed)
+            textures = looks.textures(self.best_random)
+            offsets = looks.offsets(self.best_random)
+            found[BEST_RANDOM] = Appearance(
+                own.textures if textures is None else textures,
+                own.offsets if offsets is None else offsets,
+            )
+        return found
+
+
+def read_found(folders: Sequence[Path]) -> tuple[FoundAttack, ...]:
+    """Read run folders.
+
+    Raises:
+        InputError: none or one twice, a folder holds no finished attack, or a file
+            that its scenario names has changed since.
+    """
+    paths = [os.path.abspath(folder) for folder in folders]
+    if not paths or len(set(paths)) < len(paths):
+        raise InputError("RUN: at least one run folder, each once")
+    names = [Path(path).name for path in paths]
+    unique = len(set(names)) == len(names)
+    start = os.path.commonpath(paths) if len(paths) > 1 else ""
+    labels = names if unique else [os.path.relpath(path, start) for path in paths]
+    pairs = zip(folders, labels, strict=True)
+    return tuple(_read(Path(path), label) for path, label in pairs)
+
+
+def _read(folder: Path, label: str) -> FoundAttack:
+    metrics = folder / "metrics.json"
+    if not metrics.is_file():
+        raise InputError(
+            f"{folder}: holds no finished attack, {metrics.name} is missing; give run "
+            "folders of 'mi-nerfattack attack', which finishes one with --resume"
+        )
+    document = files.read_json(metrics)
+    validate(document)
+    scenario, _ = load_scenario(folder / SCENARIO)
+    identity = scenario.identity()
+    _check_unchanged(folder / CHECKPOINT, identity)
+    offsets = np.zeros((len(scenario.objects), 6))
+    for number, item in enumerate(scenario.objects):
+        pose = (document.get("object_poses") or {}).get(item.id)
+        if pose is not None:
+            offsets[number] = [*pose["shift_m"], *pose["rotation_vector"]]
+    sums = [files.sha256(_field_path(folder, item.id)) for item in scenario.objects]
+    about = json.dumps([sums, offsets.tolist()])
+    return FoundAttack(
+        folder,
+        label,
+        scenario,
+        driven_route(scenario, scenario.vehicle.motion()),
+        offsets,
+        (document.get("baseline") or {}).get("best"),
+        identity,
+        hashlib.sha256(about.encode()).hexdigest(),
+    )
+
+
+def _check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:
+    """Compare the scenario with what the run was made with."""
+    if not checkpoint.is_file():  # it takes much room, and may have been removed
+        return
+    _, metadata = files.read_safetensors(checkpoint, ())
+    kept = {key: value for key, value in metadata.items() if key in identity}
+    refuse(checkpoint, differences(kept, identity), _REMEDY)
+
+
+def _field_path(folder: Path, name: str) -> Path:
+    return folder / "objects" / f"{name}.safetensors"
+
+
+def surrogate_of(found: FoundAttack) -> dict[str, Any]:
+    """Say in which surrogate an attack was made, as JSON."""
+    scene = found.scenario.scene
+    named = scene.field or scene.surrogate
+    assert named is not None  # checked by the scenario
+    key = "field" if scene.field else "surrogate"
+    about = json.loads(found.identity[f"scenario.scene.{key}"])
+    return {"file": str(named), "sha256": about["sha256"]}

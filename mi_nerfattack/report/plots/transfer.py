@@ -1,0 +1,121 @@
+"""The matrix of a transfer: what attacks do in each environment, by condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from mi_nerfattack.report.plots.charts import GREY, chart
+from mi_nerfattack.rollout.drive import ATTACK
+
+#: Attacks that have lines of their own; of more there is the mean alone.
+_MOST = 6
+_LINE_IN, _MARGIN_IN = 0.26, 1.9
+_LIGHT = 0.6  # of the colours' range, from where text is black
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of the matrix: its label, and by condition its error and its text."""
+
+    label: str
+    cells: Mapping[str, tuple[float, str]]
+
+
+def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
+    """Draw the mean distance from the lane centre of every case.
+
+    A block an environment: the other cases in the mean over all attacks, the attacks
+    in the mean and, if there are few, each for itself; a column a condition. Of the
+    attacks, a cell tells below the mean how many have a wheel out for a second.
+    Nothing was driven where a cell is grey: light has no effect on a field.
+
+    Args:
+        path: PNG file.
+        document: whole, of `transfer.figures.make_document`.
+    """
+    environments = list(dict.fromkeys(c["environment"] for c in document["columns"]))
+    conditions = list(document["conditions"])
+    lines, names = [], []
+    for environment in environments:
+        own = _lines(document, environment)
+        names += [environment] + [""] * (len(own) - 1)
+        lines += own
+    values = [
+        [line.cells.get(c, (np.nan, ""))[0] for c in conditions] for line in lines
+    ]
+    with chart(path, _LINE_IN * len(lines) + _MARGIN_IN) as figure:
+        axis = figure.subplots()
+        most = max(np.nanmax(values), 1e-9)
+        axis.set_facecolor("#d9d9d9")
+        image = axis.imshow(values, cmap="inferno", vmin=0, vmax=most, aspect="auto")
+        for row, line in enumerate(lines):
+            for column, condition in enumerate(conditions):
+                value, text = line.cells.get(condition, (0.0, ""))
+                colour = "black" if value > _LIGHT * most else "white"
+                axis.text(column, row, text, color=colour, **_CENTRED)
+        _label(axis, conditions, [line.label for line in lines], names)
+        bar = figure.colorbar(image, ax=axis, shrink=0.6, pad=0.01)
+        bar.set_label("mean distance from the lane centre (m)")
+        axis.set_title(
+            f"attacks: {len(document['attacks'])}, from {document['starts']} unseen "
+            "starts each; below their error, how many have a wheel out for "
+            f"{document['success_s']:g} s",
+            loc="left",
+            fontsize=9,
+        )
+
+
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6}
+
+
+def _lines(document: Mapping[str, Any], environment: str) -> list[_Line]:
+    """Return the lines of an environment: other cases, mean of the attacks, attacks."""
+    columns = [c for c in document["columns"] if c["environment"] == environment]
+    found = []
+    for case in document["cases"]:
+        cells = {}
+        for column in columns:
+            figures = column["cases"][case]
+            value, text = figures["cross_track_mean_m"], ""
+            if case == ATTACK:
+                text = f"\n{figures['attacks_out']}/{column['attacks']}"
+            cells[column["condition"]] = value, f"{value:.2f}{text}"
+        found.append(_Line(case.replace("_", " "), cells))
+    attacks = [about["label"] for about in document["attacks"]]
+    if ATTACK not in document["cases"] or not 1 < len(attacks) <= _MOST:
+        return found
+    for attack in attacks:
+        rows = [
+            row
+            for row in document["rows"]
+            if (row["attack"], row["environment"]) == (attack, environment)
+        ]
+        means = {
+            row["condition"]: row["cases"][ATTACK]["cross_track_mean_m"] for row in rows
+        }
+        cells = {key: (value, f"{value:.2f}") for key, value in means.items()}
+        found.append(_Line(f"  {attack[-24:]}", cells))
+    return found
+
+
+def _label(
+    axis: Axes, conditions: list[str], labels: list[str], names: list[str]
+) -> None:
+    """Name lines and columns, and part the environments."""
+    shown = [c.replace(",", ",\n") for c in conditions]
+    axis.set_xticks(range(len(shown)), shown, rotation=45, ha="right", fontsize=7)
+    texts = [
+        f"{name}: {label}" if name else label
+        for name, label in zip(names, labels, strict=True)
+    ]
+    axis.set_yticks(range(len(texts)), texts, fontsize=7)
+    axis.tick_params(length=0)
+    for row, name in enumerate(names):
+        if name and row:
+            axis.axhline(row - 0.5, color=GREY, linewidth=2)
