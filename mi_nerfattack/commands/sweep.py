@@ -36,9 +36,14 @@ class Sweep:
     attacks; without, only what needs no drive is told."""
     workers: int | None = None
     """Cells that are done at a time, each by a process or job of its own; by default as
-    many as there are cores for, and 256 jobs."""
+    many as there are cores for, and 256 jobs. Of a Ray cluster of several machines, its
+    own matter."""
     cores: int = 1
     """Cores that each cell renders with."""
+    ray: str | None = None
+    """Ray cluster that does the cells in place of this machine alone: HOST:PORT,
+    ray://HOST:PORT, auto (the one that this machine is part of), or local (one that is
+    made of this machine, for as long as it takes)."""
     submitit: str | None = None
     """Partition of a SLURM cluster that does the cells, a job each, in place of this
     machine."""
@@ -74,14 +79,21 @@ class Sweep:
         return max(1, available_cores() // self.cores)
 
     def _workers(self) -> AbstractWorkers:
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.system.ray_tasks import RayTasks
         from mi_nerfattack.system.slurm import SlurmJobs
         from mi_nerfattack.system.workers import Processes
 
+        if self.ray is not None and self.submitit is not None:
+            raise InputError("--ray: stands beside --submitit; give one of them")
         alone = Processes(self._count(), pieces_each=1)  # checks the number, too
+        each = self.cores, self.memory_gb
+        if self.ray is not None:
+            return RayTasks(self.ray, *each, self.workers)
         if self.submitit is None:
             return alone
-        each = self.cores, self.memory_gb, self.minutes
-        return SlurmJobs(self.output / "slurm", self.submitit, *each, self._count())
+        jobs = self.output / "slurm", self.submitit, *each, self.minutes
+        return SlurmJobs(*jobs, self._count())
 
     def _check(self, cells: list[Cell]) -> int:
         import json

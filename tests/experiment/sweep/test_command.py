@@ -10,10 +10,13 @@ import pytest
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.sweep import Sweep
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import sweep as module
 from mi_nerfattack.experiment.sweep.forecast import sentences
 from mi_nerfattack.system import workers
-from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.system.ray_tasks import RayTasks
+from mi_nerfattack.system.slurm import SlurmJobs
+from mi_nerfattack.system.workers import InThisProcess, Processes
 from tests.experiment.sweep.conftest import finish
 
 pytest.importorskip(
@@ -115,3 +118,16 @@ def test_as_many_workers_as_cores_allow(monkeypatch):
     counts = [Sweep(grid, grid, cores=cores)._count() for cores in (1, 3, 9)]
     assert counts == [8, 2, 1]
     assert Sweep(grid, grid, workers=5, cores=3)._count() == 5
+
+
+def test_who_does_the_cells():
+    grid = Path("grid.toml")
+    there = {"cores": 2, "memory_gb": 3.0}
+    assert Sweep(grid, grid, workers=3)._workers() == Processes(3, pieces_each=1)
+    jobs = SlurmJobs(grid / "slurm", "gpu", 2, 3.0, 240, 256)
+    assert Sweep(grid, grid, submitit="gpu", **there)._workers() == jobs
+    assert Sweep(grid, grid, ray="a:1", **there)._workers() == RayTasks("a:1", 2, 3.0)
+    with pytest.raises(InputError, match="--ray: stands beside --submitit"):
+        Sweep(grid, grid, ray="a:1", submitit="gpu")._workers()
+    with pytest.raises(InputError, match="--memory-gb: 0; more than 0"):
+        Sweep(grid, grid, memory_gb=0).run()

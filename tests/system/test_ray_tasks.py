@@ -1,0 +1,55 @@
+"""Tasks on a Ray cluster of this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("ray", reason="needs the extra 'ray', which runs tasks")
+
+SCRIPT = """
+import json
+import os
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.system.ray_tasks import RayTasks
+from test_slurm import Pieces
+
+if __name__ == "__main__":
+    ended = {}
+    tasks = RayTasks("local", memory_gb=0.5, count=1)
+    tasks.run(Pieces(), range(4), print, ended.__setitem__)
+    told = {i: [type(error).__name__, str(error)] for i, error in ended.items()}
+    told["usage"] = os.environ["RAY_USAGE_STATS_ENABLED"]
+    try:
+        RayTasks("local", cores=2, count=1, memory_gb=1e4).run(Pieces(), [3], print)
+    except InputError as error:
+        told["refused"] = str(error)
+    print(json.dumps(told))
+"""
+
+
+@pytest.mark.slow
+def test_tasks_tell_what_became_of_them(tmp_path):
+    """In a process of its own: Ray leaves threads and files behind."""
+    (tmp_path / "run.py").write_text(SCRIPT)
+    here = os.path.dirname(__file__)
+    paths = os.pathsep.join([here, *sys.path])
+    result = subprocess.run(
+        [sys.executable, str(tmp_path / "run.py")],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout.splitlines()[-1])
+    assert told["3"] == ["NoneType", "None"] and told["usage"] == "0"
+    assert told["0"][0] == "RuntimeError" and "IndexError" in told["0"][1]
+    assert told["1"] == ["InputError", "piece one: is wrong; take another"]
+    assert told["2"][0] == "InputError" and "in piece 2" in told["2"][1]
+    assert "no machine has 2 cores and 10000 GB for a task" in told["refused"]
