@@ -56,11 +56,13 @@ class Baseline:
             original: how its objects look and stand by themselves.
             attack: finished.
             effort: tells the cost of a pass back; in a deterministic run, where no
-                clock may decide anything, it counts as one drive.
+                clock may decide anything, it counts as one drive, and of a search,
+                which makes none, as nothing.
         """
         scenario = world.scenario
         section, strict = scenario.baseline, scenario.attack.deterministic
-        multiple = 1.0 if strict else effort.backward_multiple
+        is_timed = attack.sweeps > 1 and not strict
+        multiple = effort.backward_multiple if is_timed else attack.sweeps - 1.0
         count = section.textures or equal_count(attack.iteration, multiple)
         deployed = min(count, section.deployment_textures)
         draws = world.fields, attack.freedom, section.kind, scenario.seed

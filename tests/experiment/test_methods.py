@@ -11,6 +11,8 @@ from helpers.attack_jobs import assert_same_drives, interrupt, job
 
 from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.baseline import Baseline
+from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import build_attack, build_world
 
@@ -46,6 +48,8 @@ def test_searches_spend_their_frames_and_keep_the_best(
     assert attack.iteration == 6
     objectives = [record.objective for record in attack.history]
     assert attack.best_objective == min(objectives) != before
+    looks = Baseline.of(world, original, attack, Effort())
+    assert looks.backward_multiple == 0  # six random looks cost as much
     texture = world.appearance().textures[0]
     assert not np.array_equal(texture, original.textures[0])
     seen = attack.rollout.measure(attack.initial).value
