@@ -128,7 +128,10 @@ def _noise_told(what: str, effect: float, noise: float, between: str) -> str:
 
 
 def _not_converged(curve: Curve | None) -> Iterator[str]:
-    text = "not converged: more iterations, or frames, would find more"
+    text = (
+        "not converged: the search had not settled when its iterations, or frames, ran "
+        "out; raise them"
+    )
     if curve is not None and (gain := curve["objective"][0] - curve["objective"][-1]):
         late = _reached(curve, 0.8 * curve["frames"][-1])
         if late is not None:
