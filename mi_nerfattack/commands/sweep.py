@@ -92,7 +92,7 @@ class Sweep:
             return RayTasks(self.ray, *each, self.workers)
         if self.submitit is None:
             return alone
-        jobs = self.output / "slurm", self.submitit, *each, self.minutes
+        jobs = self.output.resolve() / "slurm", self.submitit, *each, self.minutes
         return SlurmJobs(*jobs, self._count())
 
     def _check(self, cells: list[Cell]) -> int:
@@ -107,7 +107,7 @@ class Sweep:
             def show(stage: str, done: int, total: int, remark: str) -> None:
                 bars.show(stage, done, total, f"{done}/{total} {remark}")
 
-            forecast = Forecast(cells, self.output, show)
+            forecast = Forecast(cells, self.output.resolve(), show)
             forecast.run(self.drives)
         document = forecast.document()
         if self.json:
@@ -132,7 +132,7 @@ class Sweep:
                     state += f", {len(sweep.errors)} failed"
                 bars.show("cells", done, total, state, kept=done == sweep.kept)
 
-            sweep = Work(Cells(tuple(cells), self.output, self.cores), show)
+            sweep = Work(Cells(tuple(cells), self.output.resolve(), self.cores), show)
             sweep.run(workers)
         if self.json:
             failed = {cells[i].id: error for i, error in sweep.errors.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +51,7 @@ class Forecast:
                 what needs none is found.
         """
         first = {_kind(cell): cell for cell in reversed(self.cells)}
-        kinds = [kind for kind in dict.fromkeys(map(_kind, self.cells))]
+        kinds = list(dict.fromkeys(map(_kind, self.cells)))
         period_s: dict[Place, dict[str, float]] = {}
         for number, kind in enumerate(kinds):
             cell, place = first[kind], kind[:2]
@@ -104,6 +105,7 @@ class Forecast:
             "frames": sum(cost.frames for cost in known) if whole else None,
             "wall_s": sum(cost.wall_s for cost in known) if whole else None,
             "disk_mb": sum(cost.disk_mb for cost in known) if whole else None,
+            "disk_free_mb": _free_mb(self.folder),
             "memory_mb": max((c.memory_mb for c in known), default=None),
             "refused": {" ".join(p): lines for p, lines in self.refused.items()},
             "doubts": {" ".join(p): lines for p, lines in self.doubts.items()},
@@ -127,8 +129,8 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         lines[0] += (
             f": {document['frames']} frames, {duration(document['wall_s'] / workers)} "
             f"for {workers} at a time, as busy as this machine is, "
-            f"{document['disk_mb']:.0f} MB of disk, at most "
-            f"{document['memory_mb']:.0f} MB of memory each"
+            f"{document['disk_mb']:.0f} MB of disk ({document['disk_free_mb']:.0f} MB "
+            f"are free), at most {document['memory_mb']:.0f} MB of memory each"
         )
     for name, cost in document["costs"].items():
         if cost is not None and cost["period_s"]["backward"]:
@@ -140,6 +142,12 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         for place, told in document[word].items():
             lines += [f"{shown}: {place}: {line}" for line in told]
     return lines
+
+
+def _free_mb(folder: Path) -> float:
+    """Return what is free where a folder is, or will be."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    return shutil.disk_usage(there).free / 1e6
 
 
 def _kind(cell: Cell) -> tuple[Any, ...]:

@@ -124,7 +124,7 @@ def test_who_does_the_cells():
     grid = Path("grid.toml")
     there = {"cores": 2, "memory_gb": 3.0}
     assert Sweep(grid, grid, workers=3)._workers() == Processes(3, pieces_each=1)
-    jobs = SlurmJobs(grid / "slurm", "gpu", 2, 3.0, 240, 256)
+    jobs = SlurmJobs(grid.resolve() / "slurm", "gpu", 2, 3.0, 240, 256)
     assert Sweep(grid, grid, submitit="gpu", **there)._workers() == jobs
     assert Sweep(grid, grid, ray="a:1", **there)._workers() == RayTasks("a:1", 2, 3.0)
     with pytest.raises(InputError, match="--ray: stands beside --submitit"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -39,6 +40,18 @@ def test_a_grid_of_a_scenario_alone(scenario_folder):
     (cell,) = load_cells(path)
     assert cell.id.startswith("line-ball-gradient-0-")
     assert cell.scenario.attack.method.iterations(1) == 3
+
+
+def test_the_example_of_the_guide(tmp_path):
+    guide = Path(__file__).parents[3] / "docs" / "sweep.md"
+    example = guide.read_text("utf-8").split("```toml\n")[1].split("```")[0]
+    path = tmp_path / "grid.toml"
+    path.write_text(example)
+    cells = load_cells(path)
+    assert len(cells) == 2 * 2 * 5
+    # 60 and 80 periods an iteration, 2.9 times
+    lengths = [c.scenario.attack.method.iterations(1) for c in cells[::5]]
+    assert lengths == [34, 6000, 25, 6000]
 
 
 def test_another_content_of_a_file_is_another_cell(write_grid, scenario_folder):
