@@ -13,7 +13,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.evaluation.field_and_scene import CompareOptions
 from mi_nerfattack.ranges import Acute, Count, Finite, Fraction, Whole, checked
-from mi_nerfattack.training.collect import CollectSettings
+from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.train import TrainSettings
 
 

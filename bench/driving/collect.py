@@ -13,8 +13,8 @@ from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.system.workers import Processes
-from mi_nerfattack.training.collect import CollectSettings, collect
-from mi_nerfattack.training.settings import CLONING
+from mi_nerfattack.training.collect import collect
+from mi_nerfattack.training.settings import CLONING, CollectSettings
 from mi_nerfattack.vehicle.route.route import load_routes
 
 #: Called with a stage's name, units done and wanted, and a remark.

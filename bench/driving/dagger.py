@@ -21,9 +21,9 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.report.plots.charts import BLUE, ORANGE, chart
 from mi_nerfattack.rollout.drive import NO_OBJECT, departure_limit
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
-from mi_nerfattack.training.collect import CollectSettings, collect
+from mi_nerfattack.training.collect import collect
 from mi_nerfattack.training.dataset import FrameDataset
-from mi_nerfattack.training.settings import CLONING
+from mi_nerfattack.training.settings import CLONING, CollectSettings
 from mi_nerfattack.training.sources import PolicyDrives
 from mi_nerfattack.training.train import Progress, TrainSettings, fit_policy
 from mi_nerfattack.training.validation import LossAlone

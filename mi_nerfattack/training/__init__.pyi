@@ -1,11 +1,13 @@
-from .collect import CollectSettings as CollectSettings
 from .collect import find_shards as find_shards
 from .dataset import FrameDataset as FrameDataset
+from .settings import CollectSettings as CollectSettings
 from .settings import ImitationSettings as ImitationSettings
 from .sources import AbstractSource as AbstractSource
 from .sources import ExpertDrives as ExpertDrives
 from .sources import Mixture as Mixture
 from .sources import PolicyDrives as PolicyDrives
 from .sources import Scattered as Scattered
+from .staging import AbstractStaging as AbstractStaging
+from .staging import RandomObjects as RandomObjects
 from .train import TrainSettings as TrainSettings
 from .train import fit_policy as fit_policy

@@ -12,18 +12,15 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment
-from mi_nerfattack.deploy.roadside.rule import Roadside
-from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.random_textures import random_texture
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, flatten
-from mi_nerfattack.ranges import Count, Share, checked
-from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
 from mi_nerfattack.training.dataset import shard_columns
+from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.sources import AbstractSource, Labelled, Scenery
+from mi_nerfattack.training.staging import ROADSIDE, AbstractStage, AbstractStaging
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Called with frames done and frames wanted.
@@ -42,52 +39,6 @@ class ShardRecord(Record):
     objects: dict[str, int]
 
 
-@dataclass(frozen=True)
-@checked("CollectSettings")
-class CollectSettings:
-    """Choices of a collection; the same settings and site give the same frames.
-
-    Args:
-        frames: wanted.
-        seed: of everything random.
-        shard: frames that are written together, under the same conditions.
-        group: states that are drawn around one point, with the same objects.
-        objects: most of them at a time; each number from 1 is equally likely.
-        object_share: share of the groups with objects.
-        original_share: share of the textures that are an object's own; each object has
-            one texture a shard.
-        spread_m: states of a group lie within this arc length of their centre.
-        ahead_m: arc length from a group's centre to where the drive ends from which
-            its objects are in view; it begins `spread_m` before the centre.
-        margin_m: arc length before and after an open route, from where frames come
-            too.
-        scatter: deviations of the states from the route.
-        roadside: the rule by which the objects stand.
-    """
-
-    frames: Count = 9000
-    seed: int = 0
-    shard: Count = 64
-    group: Count = 8
-    objects: Count = 6
-    object_share: Share = 0.75
-    original_share: Share = 0.1
-    spread_m: float = 3.0
-    ahead_m: float = 8.0
-    margin_m: float = 2.0
-    scatter: Scatter = field(default_factory=Scatter)
-    roadside: Roadside = field(default_factory=Roadside)
-
-    @property
-    def shards(self) -> int:
-        """Number of shards."""
-        return -(-self.frames // self.shard)
-
-    def size(self, index: int) -> int:
-        """Return the number of frames of a shard; the last one may have fewer."""
-        return min(self.shard, self.frames - index * self.shard)
-
-
 def collect(
     site: AbstractSite,
     routes: Sequence[Route],
@@ -96,6 +47,7 @@ def collect(
     folder: str | Path,
     workers: AbstractWorkers,
     progress: OnFrames = lambda done, total: None,
+    staging: AbstractStaging = ROADSIDE,
 ) -> list[Path]:
     """Render what vehicles near the routes see, and label it by the expert.
 
@@ -104,19 +56,20 @@ def collect(
 
     Args:
         site: makes the environments, and gives objects and their surroundings.
-        routes: they take turns by chance, longer ones more often.
+        routes: that `staging` may choose.
         source: of the states.
         settings: see there.
         folder: gets `<site.name>/shard_0000.safetensors` and so on.
         workers: who renders.
         progress: called now and then; an exception from it stops the work.
+        staging: what stands beside which stretch; random objects by default.
 
     Returns:
         The shards, in order.
 
     Raises:
-        InputError: the folder holds frames of other settings, files, routes or states;
-            a file cannot be written; a worker ended.
+        InputError: the folder holds frames of other settings, files, routes, states or
+            objects; a file cannot be written; a worker ended.
     """
     root = files.make_folder(Path(folder) / site.name)
     experts = {route.name: probe_expert(site, route) for route in routes}
@@ -125,10 +78,11 @@ def collect(
         **flatten("settings", asdict(settings)),
         **flatten("site", site.describe()),
         **flatten("source", source.describe()),
+        **staging.identity(),
         "routes": _digest(routes),
         **flatten("expert", experts),
     }
-    work = _Shards(site, tuple(routes), source, settings, root, identity)
+    work = _Shards(site, tuple(routes), source, staging, settings, root, identity)
     present = sorted(root.glob(_SHARDS))
     for path in present:
         work.unit(path).read_record()  # refuses frames of something else
@@ -153,6 +107,7 @@ class _Shards(AbstractWork):
     site: AbstractSite
     routes: tuple[Route, ...]
     source: AbstractSource
+    staging: AbstractStaging
     settings: CollectSettings
     root: Path
     identity: Mapping[str, str]
@@ -166,8 +121,9 @@ class _Shards(AbstractWork):
         return Unit(path, self.identity, ShardRecord, _REMEDY)
 
     def open(self) -> _Opened:
-        """Load objects, surroundings and what the source needs."""
-        return _Opened(self.site, self.settings, self.source.prepare())
+        """Load what staging and source need."""
+        stage = self.staging.open(self.site, self.routes, self.settings)
+        return _Opened(self.site, stage, self.source.prepare())
 
     def do(self, opened: _Opened, index: int, report: OnUnits) -> None:
         """Render, label and write one shard."""
@@ -176,7 +132,8 @@ class _Shards(AbstractWork):
         )
         conditions = self.site.draw(rng)
         environment = opened.environment(conditions)
-        opened.paint(rng)
+        opened.stage.begin(rng)
+        opened.shown.clear()
         wanted, rows = self.settings.size(index), []
         images: list[np.ndarray] = []
         for goal, (image, control) in self._rows(opened, environment, rng):
@@ -207,35 +164,33 @@ class _Shards(AbstractWork):
     ) -> Iterator[tuple[int, Labelled]]:
         """Yield goals and labelled frames without end."""
         experts = {route.name: expert_of(self.site, route) for route in self.routes}
-        for route, arc, poses in _draw_states(self.routes, self.settings, rng):
-            opened.dress(environment, route, arc, rng)
+        for route, arc, poses in _draw_states(opened.stage, self.settings, rng):
+            objects = opened.stage.objects(route, arc, rng)
+            opened.shown.append(len(objects))
+            environment.show(objects)
             scenery = Scenery(environment, route, experts[route.name], poses, rng)
             for labelled in self.source.frames(opened.prepared, scenery):
                 yield route.goal, labelled
 
 
+@dataclass(eq=False)
 class _Opened:
-    """What a worker keeps from shard to shard: one environment, objects, surroundings.
+    """What a worker keeps from shard to shard: one environment, and a stage.
 
     Args:
         site: see `collect`.
-        settings: see `collect`.
+        stage: see `collect`.
         prepared: what the source needs.
 
     Attributes:
         shown: number of objects of each group of the shard.
     """
 
-    def __init__(
-        self, site: AbstractSite, settings: CollectSettings, prepared: Any
-    ) -> None:
-        self.site, self.settings, self.prepared = site, settings, prepared
-        wanted = settings.object_share > 0
-        self.objects = site.load_objects(settings.objects) if wanted else []
-        self.own = [item.texture.numpy().copy() for item in self.objects]
-        self.surroundings = site.load_surroundings() if self.objects else None
-        self.shown: list[int] = []
-        self._open: tuple[Any, AbstractEnvironment] | None = None
+    site: AbstractSite
+    stage: AbstractStage
+    prepared: Any
+    shown: list[int] = field(default_factory=list)
+    _open: tuple[Any, AbstractEnvironment] | None = None
 
     def environment(self, conditions: Any) -> AbstractEnvironment:
         """Return the environment under conditions; it is loaded where they differ."""
@@ -250,58 +205,6 @@ class _Opened:
             self._open[1].close()
         self._open = None
 
-    def paint(self, rng: np.random.Generator) -> None:
-        """Begin a shard: give each object a random texture, or its own."""
-        self.shown = []
-        for item, own in zip(self.objects, self.own, strict=True):
-            keep = rng.uniform() < self.settings.original_share
-            texture = random_texture(item, "mixed", int(rng.integers(2**31)))
-            item.set_parameter("texture", own if keep else texture)
-
-    def dress(
-        self,
-        environment: AbstractEnvironment,
-        route: Route,
-        arc: float,
-        rng: np.random.Generator,
-    ) -> None:
-        """Put objects beside the road, as many as find a place, or none.
-
-        Args:
-            environment: shows them.
-            route: beside which they stand.
-            arc: arc length of the group's centre, metres.
-            rng: source of all draws.
-        """
-        settings, posed = self.settings, []
-        if self.surroundings is not None and rng.uniform() < settings.object_share:
-            count = int(rng.integers(1, settings.objects + 1))
-            chosen = sorted(rng.permutation(len(self.objects))[:count].tolist())
-            fields = [self.objects[index] for index in chosen]
-            stretch = _stretch(route, arc, settings)
-            poses = settings.roadside.find(
-                fields, self.surroundings, route, stretch, rng, chosen
-            )
-            pairs = zip(fields, poses, strict=True)
-            posed = [PosedField(item, pose) for item, pose in pairs if pose is not None]
-        self.shown.append(len(posed))
-        environment.show(posed)
-
-
-def _stretch(
-    route: Route, arc: float, settings: CollectSettings
-) -> tuple[float, float]:
-    """Return the drive from which a group's objects are in view; no longer a route's.
-
-    At the ends of an open route it is as long, and ends where the frames do.
-    """
-    begin, end = arc - settings.spread_m, arc + settings.ahead_m
-    if route.closed:
-        return begin, end
-    least, most = -settings.margin_m, route.length + settings.margin_m
-    shift = max(least - begin, 0.0) + min(most - end, 0.0)
-    return max(begin + shift, least), min(end + shift, most)
-
 
 def _counts(values: Any) -> dict[str, int]:
     """Count equal integers."""
@@ -310,16 +213,14 @@ def _counts(values: Any) -> dict[str, int]:
 
 
 def _draw_states(
-    routes: Sequence[Route], settings: CollectSettings, rng: np.random.Generator
+    stage: AbstractStage, settings: CollectSettings, rng: np.random.Generator
 ) -> Iterator[tuple[Route, float, np.ndarray]]:
     """Draw groups without end: route, arc length of the centre, states (k, 3)."""
-    lengths = np.array([route.length for route in routes])
     while True:
-        route = routes[rng.choice(len(routes), p=lengths / lengths.sum())]
-        margin = 0.0 if route.closed else settings.margin_m
-        centre = float(rng.uniform(-margin, route.length + margin))
+        route, (begin, end) = stage.draw_stretch(rng)
+        centre = float(rng.uniform(begin, end))
         spread = rng.uniform(-settings.spread_m, settings.spread_m, settings.group)
-        arc = np.clip(centre + spread, -margin, route.length + margin)
+        arc = np.clip(centre + spread, begin, end)
         yield route, centre, settings.scatter.states(route, arc, rng)
 
 

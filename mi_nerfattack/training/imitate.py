@@ -22,6 +22,7 @@ from mi_nerfattack.training.collect import OnFrames, collect
 from mi_nerfattack.training.dataset import FrameDataset, divide_shards
 from mi_nerfattack.training.settings import ImitationSettings
 from mi_nerfattack.training.sources import AbstractSource, PolicyDrives
+from mi_nerfattack.training.staging import ROADSIDE, AbstractStaging
 from mi_nerfattack.training.train import Progress, check_labels, fit_policy
 from mi_nerfattack.training.validation import ClosedLoop, Epoch, rank
 from mi_nerfattack.vehicle.route.route import Route
@@ -57,6 +58,7 @@ def imitate(
     progress: OnStage = lambda stage, done, total, state: None,
     start: PilotNet | None = None,
     more: Sequence[Path] = (),
+    staging: AbstractStaging = ROADSIDE,
 ) -> Imitated:
     """Train a policy to follow the lane, and measure it in the closed loop.
 
@@ -72,6 +74,7 @@ def imitate(
         progress: called often; an exception from it stops the work.
         start: weights to begin with; None for random ones.
         more: shards of earlier collections to train on, too.
+        staging: of all collections, see `collect`.
 
     Raises:
         InputError: before the first frame, no frames wanted, an unknown site, one
@@ -92,7 +95,8 @@ def imitate(
         _check_frames(module, more)
     with exclusive(files.make_folder(folder)):
         remove_partial(folder)  # of killed writers
-        run = _Imitation(sites, routes, settings, Path(folder), workers, progress)
+        arguments = (settings, Path(folder), workers, progress, staging)
+        run = _Imitation(sites, routes, *arguments)
         return run.run(module, more)
 
 
@@ -107,9 +111,11 @@ class _Imitation:
         folder: Path,
         workers: AbstractWorkers,
         progress: OnStage,
+        staging: AbstractStaging,
     ) -> None:
         self.sites, self.routes, self.settings = sites, routes, settings
         self.folder, self.workers, self.progress = folder, workers, progress
+        self.staging = staging
         self.training: list[Path] = []
         self.held_out: list[Path] = []
         self._loop: ClosedLoop | None = None
@@ -187,7 +193,7 @@ class _Imitation:
             )
             arguments = (settings, self.folder / name, self.workers)
             show = self._frames(f"{name}, {site.name}")
-            shards += collect(site, self.routes, source, *arguments, show)
+            shards += collect(site, self.routes, source, *arguments, show, self.staging)
         return shards
 
     def take(self, shards: Sequence[Path]) -> None:

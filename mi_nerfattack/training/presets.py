@@ -13,7 +13,7 @@ from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.deploy.sites import ANY_WEATHER, Weather
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
-from mi_nerfattack.training.collect import CollectSettings
+from mi_nerfattack.training.settings import CollectSettings
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from mi_nerfattack.deploy.roadside.rule import Roadside
+from mi_nerfattack.deploy.scatter import Scatter
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.ranges import Count, Fraction, Share, Whole, checked
-from mi_nerfattack.training.collect import CollectSettings
 from mi_nerfattack.training.sources import (
     AbstractSource,
     ExpertDrives,
@@ -19,6 +20,52 @@ from mi_nerfattack.training.train import TrainSettings
 
 #: Scattered states and recoveries of the expert.
 CLONING = Mixture((Scattered(), ExpertDrives()), (0.7, 0.3))
+
+
+@dataclass(frozen=True)
+@checked("CollectSettings")
+class CollectSettings:
+    """Choices of a collection; the same settings and site give the same frames.
+
+    Args:
+        frames: wanted.
+        seed: of everything random.
+        shard: frames that are written together, under the same conditions.
+        group: states that are drawn around one point, with the same objects.
+        objects: most of them at a time; each number from 1 is equally likely.
+        object_share: share of the groups with objects.
+        original_share: share of the textures that are an object's own; each object has
+            one texture a shard.
+        spread_m: states of a group lie within this arc length of their centre.
+        ahead_m: arc length from a group's centre to where the drive ends from which
+            its objects are in view; it begins `spread_m` before the centre.
+        margin_m: arc length before and after an open route, from where frames come
+            too.
+        scatter: deviations of the states from the route.
+        roadside: the rule by which the objects stand.
+    """
+
+    frames: Count = 9000
+    seed: int = 0
+    shard: Count = 64
+    group: Count = 8
+    objects: Count = 6
+    object_share: Share = 0.75
+    original_share: Share = 0.1
+    spread_m: float = 3.0
+    ahead_m: float = 8.0
+    margin_m: float = 2.0
+    scatter: Scatter = field(default_factory=Scatter)
+    roadside: Roadside = field(default_factory=Roadside)
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.frames // self.shard)
+
+    def size(self, index: int) -> int:
+        """Return the number of frames of a shard; the last one may have fewer."""
+        return min(self.shard, self.frames - index * self.shard)
 
 
 @dataclass(frozen=True)

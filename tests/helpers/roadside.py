@@ -14,7 +14,7 @@ from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.fields.grid import GridField, GridLayout
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.training.collect import CollectSettings
+from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.vehicle.route.route import Route
 
 KERB_M = 0.12

@@ -17,7 +17,8 @@ from helpers.roadside import PaintedSite, bent, small, straight
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.system import workers
 from mi_nerfattack.system.workers import AbstractWork, InThisProcess, Processes
-from mi_nerfattack.training.collect import CollectSettings, collect
+from mi_nerfattack.training.collect import collect
+from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.sources import AbstractSource, Scattered
 
 pytestmark = pytest.mark.usefixtures("variant")

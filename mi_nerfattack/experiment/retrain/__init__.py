@@ -1,0 +1,1 @@
+"""Better policies by the attacks that were found on them."""

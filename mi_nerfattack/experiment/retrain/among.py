@@ -1,0 +1,155 @@
+"""Frames among found attacks: attacked objects where their scenarios put them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.deploy.place import Place
+from mi_nerfattack.deploy.sites import AbstractSite
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.identity import short_digest
+from mi_nerfattack.experiment.transfer.found import FoundAttack
+from mi_nerfattack.fields import load_grid
+from mi_nerfattack.io.resumable import differences, flatten, refuse
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.offset import offset_pose
+from mi_nerfattack.training.settings import CollectSettings
+from mi_nerfattack.training.staging import AbstractStage, AbstractStaging, Stretch
+from mi_nerfattack.vehicle.route.route import Route
+
+#: Parts of a scenario in which all runs must agree: the world, but for its routes.
+_SHARED = ("scene.field", "scene.surrogate", "scene.to_world", "scene.deployment")
+_SHARED += ("scene.routes", "camera", "vehicle")
+
+
+@dataclass(frozen=True, eq=False)
+class AmongFound(AbstractStaging):
+    """Each shard shows the attacked objects of one run, drawn at random.
+
+    Groups lie where the run's drive comes past them: from where it starts to the
+    farthest object, or to its end.
+
+    Args:
+        attacks: of one place, see :func:`found_place`.
+    """
+
+    attacks: tuple[FoundAttack, ...]
+
+    def identity(self) -> dict[str, str]:
+        """Return digests of what was found, and of its scenarios."""
+        runs = [(found.digest, short_digest(found.identity)) for found in self.attacks]
+        return flatten("staging.found", sorted(runs))
+
+    def open(
+        self, site: AbstractSite, routes: Sequence[Route], settings: CollectSettings
+    ) -> AbstractStage:
+        """Load nothing yet."""
+        del site, routes, settings
+        return _FoundStage(self.attacks)
+
+
+class _FoundStage(AbstractStage):
+    def __init__(self, attacks: Sequence[FoundAttack]) -> None:
+        self._attacks, self._number = attacks, -1
+        self._objects: list[PosedField] = []
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Draw a run, and load its objects."""
+        number = int(rng.integers(len(self._attacks)))
+        if number != self._number:
+            self._objects = attacked_objects(self._attacks[number])
+            self._number = number
+
+    def draw_stretch(self, rng: np.random.Generator) -> tuple[Route, Stretch]:
+        """Return the run's route, and the part from which it passes its objects."""
+        del rng
+        found = self._attacks[self._number]
+        return found.route, passed_stretch(found, self._objects)
+
+    def objects(
+        self, route: Route, arc: float, rng: np.random.Generator
+    ) -> list[PosedField]:
+        """Return the run's objects."""
+        del route, arc, rng
+        return self._objects
+
+
+def attacked_objects(found: FoundAttack) -> list[PosedField]:
+    """Load the objects of a run as it left them, where it left them.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    result = []
+    for item, offset in zip(found.scenario.objects, found.offsets, strict=True):
+        field = load_grid(found.folder / "objects" / f"{item.id}.safetensors")
+        field.refine(item.step_m or field.step_m)
+        result.append(PosedField(field, item.pose))
+        result[-1].move(*offset_pose(item.pose, offset))
+    return result
+
+
+def passed_stretch(found: FoundAttack, objects: Sequence[PosedField]) -> Stretch:
+    """Return the arc lengths from a drive's start to its farthest object or its end.
+
+    Args:
+        found: whose drive it is.
+        objects: its own.
+    """
+    route, start = found.route, found.scenario.drive.start_m
+    driven = found.horizon * route.speed_ms * found.scenario.vehicle.dt_s
+    if not route.closed:
+        driven = min(driven, route.length - start)
+    poses = [[*posed.placed.translation[:2], 0.0] for posed in objects]
+    ahead = route.project_numpy(np.array(poses))[0] - start
+    if route.closed:
+        ahead = ahead % route.length
+    farthest = float(ahead.max())
+    return start, start + (min(farthest, driven) if farthest > 0 else driven)
+
+
+def found_place(attacks: Sequence[FoundAttack]) -> Place:
+    """Return the place in which all runs were made.
+
+    Raises:
+        InputError: they differ in scene, camera or vehicle, or objects stand in a
+            Mitsuba scene of the surrogate.
+    """
+    first = attacks[0]
+    for found in attacks:
+        if found.scenario.scene.surrogate is not None:
+            raise InputError(
+                f"{found.folder}: its objects stand in {found.scenario.scene.surrogate}"
+                ", a Mitsuba scene; frames are taken among objects of a scenario with "
+                "scene.field: leave this run out"
+            )
+        here, there = (_shared(run) for run in (found, first))
+        remedy = f"it is compared with {first.folder}; retrain in one place at a time"
+        refuse(found.folder, differences(here, there), remedy)
+    scenario = first.scenario
+    scene, (camera, mount) = scenario.scene, scenario.camera.build()
+    assert scene.field is not None  # checked by SceneSection
+    plain = scene.to_world is None and scene.field.file.suffix.lower() != ".ply"
+    return Place(
+        scene=scene.deployment.file,
+        field=scene.field.file if plain else None,
+        routes=scene.routes.file,
+        objects=(),
+        camera=camera,
+        mount=mount,
+        period=scenario.vehicle.dt_s,
+        car=scenario.vehicle.car(),
+        motion=scenario.vehicle.motion(),
+    )
+
+
+def _shared(found: FoundAttack) -> dict[str, str]:
+    starts = tuple(f"scenario.{name}" for name in _SHARED)
+    return {
+        key: value
+        for key, value in found.identity.items()
+        if any(key == s or key.startswith((f"{s}.", f"{s}[")) for s in starts)
+    }

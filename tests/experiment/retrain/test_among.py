@@ -1,0 +1,158 @@
+"""Frames among found attacks: what they show, and where they are taken."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import attack_jobs
+from helpers import toy_loop as toy
+from helpers.roadside import PaintedSite, small
+
+from mi_nerfattack.deploy.sites import PlaceSite, Weather
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.retrain.among import (
+    AmongFound,
+    attacked_objects,
+    found_place,
+)
+from mi_nerfattack.experiment.transfer.found import FoundAttack
+from mi_nerfattack.fields import GridField, load_grid, save_field
+from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.scenario.world import build_world, driven_route
+from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.training.collect import collect
+from mi_nerfattack.training.sources import Scattered
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+CHANGES = {
+    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
+    "horizon = 2": "horizon = 200",
+    "[7.0, 4.2, 1.6]": "[-5.0, 2.6, 1.6]",
+}
+LABELS = {"surrogate": "surrogate", "mitsuba": "deployment"}
+SHIFT = np.array([0.5, 0.2, 0.0, 0.0, 0.0, 0.7])
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory) -> tuple[FoundAttack, ...]:
+    """Two attacks on one object: here, and 17 m on, shifted and turned."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), CHANGES)
+    path = folder / "scenario.toml"
+    text = path.read_text()
+    item = load_grid(folder / "object.safetensors")
+    item.set_parameter("density", np.full(item.n_vertices, 3.0, np.float32))
+    save_field(folder / "object.safetensors", item)
+    runs = []
+    for number, (x, offset) in enumerate(((-5.0, 0 * SHIFT), (12.0, SHIFT))):
+        path.write_text(text.replace("[-5.0,", f"[{x},"))
+        run = folder / f"run{number}"
+        item = load_grid(folder / "object.safetensors")
+        item.set_parameter("texture", item.texture.numpy() + np.float32(number + 1))
+        (run / "objects").mkdir(parents=True)
+        save_field(run / "objects" / "ball.safetensors", item)
+        runs.append(read(path, run, offset, number))
+    return tuple(runs)
+
+
+def read(path: Path, run: Path, offset: np.ndarray, number: int) -> FoundAttack:
+    scenario, _ = load_scenario(path)
+    route = driven_route(scenario, scenario.vehicle.motion())
+    rest = offset[None], None, scenario.identity(), f"digest {number}"
+    return FoundAttack(run, run.name, scenario, route, *rest)
+
+
+def take(found, folder: Path, site=None, **changes):
+    site = site or PaintedSite()
+    routes = [found[0].route]
+    settings = small(**({"frames": 96, "margin_m": 0.0} | changes))
+    here, staging = InThisProcess(), AmongFound(tuple(found))
+    source = Scattered()
+    collect(site, routes, source, settings, folder, here, staging=staging)
+    return site
+
+
+def test_a_shard_shows_one_runs_objects_where_its_attack_left_them(found, tmp_path):
+    site = take(found, tmp_path)
+    objects = [items for item in site.opened for items in item.seen]
+    states = [state for item in site.opened for state in item.states]
+    assert len(objects) == len(states) == 96
+    seen = set()
+    for (posed,), state in zip(objects, states, strict=True):
+        number = int(posed.pose.translation[0] == 12)
+        run, pose = found[number], posed.placed
+        item = run.scenario.objects[0]
+        moved = np.array(item.position_m) + run.offsets[0, :3]
+        np.testing.assert_allclose(pose.translation, moved)
+        assert pose.scale == item.scale
+        turn = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
+        assert turn == pytest.approx(run.offsets[0, 5])
+        kept = load_grid(run.folder / "objects" / "ball.safetensors")
+        assert isinstance(posed.field, GridField)
+        np.testing.assert_array_equal(posed.field.texture.numpy(), kept.texture.numpy())
+        # from the drive's start to where it passes the object
+        assert run.route.pose_at(0.0)[0] - 1e-6 <= state[0] <= moved[0] + 1e-6
+        seen.add(number)
+    assert seen == {0, 1}
+
+
+def test_frames_are_those_of_the_attack(found):
+    """A vehicle of the collection sees what it sees in a drive of the run."""
+    place = found_place(found)
+    for name in LABELS:
+        site = PlaceSite(name, place, Weather(spp=1))
+        taken = site.open(site.typical())
+        for run in found:
+            x = run.scenario.objects[0].position_m[0]
+            pose = run.route.pose_at(x - run.route.points[0, 0] - 6.0)
+            empty = taken_image(taken, run, pose, [])
+            image = taken_image(taken, run, pose, attacked_objects(run))
+            world = build_world(run.scenario, run.scenario.policy.build())
+            world.show(run.looks(world)[ATTACK])
+            environment = world.open(LABELS[name])
+            driven = environment.reset(run.route, pose, 3).image
+            environment.close()
+            assert np.abs(image.astype(int) - empty).max() > 20
+            assert np.abs(image.astype(int) - driven).max() <= 1
+        taken.close()
+
+
+def taken_image(environment, run, pose, objects):
+    environment.show(objects)
+    return environment.reset(run.route, pose, 3).image
+
+
+def test_frames_among_other_attacks_are_refused(found, tmp_path):
+    take(found, tmp_path, frames=12)
+    with pytest.raises(InputError, match=r"here\)\n  staging.found"):
+        take(found[:1], tmp_path, frames=12)
+    with pytest.raises(InputError, match=r"  staging.found"):
+        collect(
+            PaintedSite(objects=False),
+            [found[0].route],
+            Scattered(),
+            small(frames=12, margin_m=0.0),
+            tmp_path,
+            InThisProcess(),
+        )
+    other = dataclasses.replace(found[0], digest="another")
+    with pytest.raises(InputError, match=r"  staging.found"):
+        take([other, found[1]], tmp_path, frames=12)
+
+
+def test_runs_of_other_places_are_refused(found, tmp_path):
+    path = tmp_path / "scenario.toml"
+    shutil.copytree(found[0].folder.parent, tmp_path, dirs_exist_ok=True)
+    path.write_text(
+        path.read_text().replace("[drive]", "[vehicle]\ndt_s = 0.2\n[drive]")
+    )
+    other = read(path, tmp_path / "run0", 0 * SHIFT, 3)
+    with pytest.raises(InputError, match=r"vehicle.dt_s: 0.2 -> 0.1\n.*one place at a"):
+        found_place([found[0], other])
