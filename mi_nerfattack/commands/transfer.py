@@ -81,7 +81,8 @@ class Transfer:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.transfer.run import check_output, run_transfer
-        from mi_nerfattack.report.table import transfer_table
+        from mi_nerfattack.report.plots.transfer import quality_condition
+        from mi_nerfattack.report.table import quality_table, transfer_table
         from mi_nerfattack.scenario.policy import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
@@ -101,6 +102,9 @@ class Transfer:
         else:
             console = Console()
             console.print(transfer_table(document))
+            if document["surrogates"]:
+                condition = quality_condition(document)
+                console.print(quality_table(document, condition))
             console.print(f"Written: {self.output.resolve()}", soft_wrap=True)
         return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,14 +149,57 @@ def transfer_table(document: Mapping[str, Any]) -> rich.table.Table:
     return table
 
 
+def quality_table(document: Mapping[str, Any], condition: str) -> rich.table.Table:
+    """Return how attacks transfer by the surrogate that they were made in.
+
+    Args:
+        document: whole, of `transfer.figures.make_document`.
+        condition: the one that is told of.
+
+    Returns:
+        A row per surrogate and environment: PSNR on held-out views and steps of the
+        fit, the attacks' mean error, and how many of those that succeed in their
+        surrogate do there, with Wilson's interval in per cent.
+    """
+    table = _distances(f"Surrogates ({condition})")
+    table.add_column("surrogate", overflow="fold", max_width=18)
+    for name in ("PSNR\n(dB)", "steps"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("environment", overflow="fold", max_width=16)
+    for name in ("attack\n(m)", "transfer"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for surrogate in document["surrogates"]:
+        psnr, steps = surrogate["psnr_heldout_db"], surrogate["steps"]
+        quality = "" if psnr is None else f"{psnr:.1f}"
+        about = [Path(surrogate["file"]).stem, quality, f"{steps or ''}"]
+        for column in surrogate["columns"]:
+            if column["condition"] == condition:
+                attack, kept = column["cases"].get(ATTACK), column["transfer"]
+                mean = "" if attack is None else f"{attack['cross_track_mean_m']:.3f}"
+                share = (
+                    ""
+                    if kept is None
+                    else _share(kept["kept"], kept["of"], kept["rate_ci95"])
+                )
+                table.add_row(*about, column["environment"], mean, share)
+                about = ["", "", ""]
+        table.add_section()
+    return table
+
+
 def _transfer_cells(column: Mapping[str, Any]) -> list[str]:
     cases, ratio = column["cases"], column["ratio_to_surrogate"]
     means = [f"{figures['cross_track_mean_m']:.3f}" for figures in cases.values()]
     attack, out = cases.get(ATTACK), ""
     if attack is not None:
-        low, high = (round(100 * end) for end in attack["attacks_out_rate_ci95"])
-        out = f"{attack['attacks_out']}/{column['attacks']} [{low}, {high}]"
+        rate = attack["attacks_out_rate_ci95"]
+        out = _share(attack["attacks_out"], column["attacks"], rate)
     return [*means, "" if ratio is None else f"{ratio:.2f}", out]
+
+
+def _share(count: int, total: int, interval: Sequence[float]) -> str:
+    low, high = (round(100 * end) for end in interval)
+    return f"{count}/{total} [{low}, {high}]"
 
 
 def _distances(title: str = "Distance from the lane centre") -> rich.table.Table:

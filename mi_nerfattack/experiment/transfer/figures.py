@@ -11,7 +11,7 @@ import numpy as np
 from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
 from mi_nerfattack.evaluation.metrics import summarise
 from mi_nerfattack.experiment.transfer.columns import Column
-from mi_nerfattack.experiment.transfer.found import FoundAttack, surrogate_of
+from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
 from mi_nerfattack.rollout.drive import ATTACK, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -75,6 +75,7 @@ def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
         "attacks": [_about(found) for found in work.attacks],
         "rows": rows,
         "columns": _columns(rows, work.columns, work.seed) if complete else [],
+        "surrogates": _surrogates(work, rows) if complete else [],
     }
 
 
@@ -88,7 +89,7 @@ def _about(found: FoundAttack) -> dict[str, Any]:
         "route": found.route.name,
         "policy": scenario.policy.source,
         "objects": [item.id for item in scenario.objects],
-        "surrogate": surrogate_of(found),
+        "surrogate": dict(found.surrogate),
         "departure_limit_m": found.lane.wheel_m,
         "found_sha256": found.digest,
     }
@@ -135,6 +136,27 @@ def _columns(
             }
         )
     return found
+
+
+def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Summarise attacks by surrogate, the worst first; none if there is one."""
+    groups: dict[str, list[FoundAttack]] = {}
+    for found in work.attacks:
+        groups.setdefault(found.surrogate["sha256"], []).append(found)
+    if len(groups) < 2:
+        return []
+    summaries = []
+    for group in groups.values():
+        labels = [found.label for found in group]
+        own = [row for row in rows if row["attack"] in labels]
+        columns = _columns(own, work.columns, work.seed)
+        about = dict(group[0].surrogate)
+        summaries.append({**about, "attacks": labels, "columns": columns})
+    unknown = float("inf")
+    return sorted(
+        summaries,
+        key=lambda s: unknown if s["psnr_heldout_db"] is None else s["psnr_heldout_db"],
+    )
 
 
 def _over_attacks(cases: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:

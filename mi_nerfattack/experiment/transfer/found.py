@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import differences, refuse
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, OWN, Lane
-from mi_nerfattack.scenario.scenario import Scenario, load_scenario
+from mi_nerfattack.scenario.scenario import Scenario, SceneSection, load_scenario
 from mi_nerfattack.scenario.world import (
     Appearance,
     World,
@@ -48,6 +50,8 @@ class FoundAttack:
         best_random: number of the best of the run's random looks, None without any.
         identity: of the scenario, see :meth:`Scenario.identity`.
         digest: of attacked textures and offsets.
+        surrogate: in which it was found: ``file``, ``sha256``, ``psnr_heldout_db`` and
+            ``steps`` of its fit, which may be None.
     """
 
     folder: Path
@@ -58,6 +62,7 @@ class FoundAttack:
     best_random: int | None
     identity: Mapping[str, str]
     digest: str
+    surrogate: Mapping[str, Any]
 
     @property
     def horizon(self) -> int:
@@ -171,6 +176,7 @@ def _read(folder: Path, label: str) -> FoundAttack:
         (document.get("baseline") or {}).get("best"),
         identity,
         hashlib.sha256(about.encode()).hexdigest(),
+        _surrogate(scenario.scene, identity),
     )
 
 
@@ -187,11 +193,22 @@ def _field_path(folder: Path, name: str) -> Path:
     return folder / "objects" / f"{name}.safetensors"
 
 
-def surrogate_of(found: FoundAttack) -> dict[str, Any]:
-    """Say in which surrogate an attack was made, as JSON."""
-    scene = found.scenario.scene
-    named = scene.field or scene.surrogate
-    assert named is not None  # checked by the scenario
-    key = "field" if scene.field else "surrogate"
-    about = json.loads(found.identity[f"scenario.scene.{key}"])
-    return {"file": str(named), "sha256": about["sha256"]}
+def _surrogate(scene: SceneSection, identity: Mapping[str, str]) -> dict[str, Any]:
+    """Say in what an attack was made, and how well that shows what was photographed.
+
+    Returns:
+        ``file`` and ``sha256``; ``psnr_heldout_db`` and ``steps`` of its fit, None
+        where its header does not tell.
+    """
+    key = "surrogate" if scene.field is None else "field"
+    named = getattr(scene, key)
+    header: dict[str, str] = {}
+    if named.file.suffix.lower() == ".safetensors":
+        _, header = files.read_safetensors(named.file, ())
+    numbers = {"psnr_heldout_db": None, "steps": None}
+    for name, kind in {"psnr_heldout_db": float, "steps": int}.items():
+        with suppress(KeyError, ValueError):  # written by somebody else
+            number = kind(header[f"fit.{name}"])
+            numbers[name] = number if math.isfinite(number) else None
+    about = json.loads(identity[f"scenario.scene.{key}"])
+    return {"file": str(named), "sha256": about["sha256"], **numbers}

@@ -11,11 +11,12 @@ from mi_nerfattack.experiment.run_folder import SCENARIO
 from mi_nerfattack.experiment.transfer.figures import case_figures, make_document
 from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
 from mi_nerfattack.io import files, locks
-from mi_nerfattack.report.plots.transfer import plot_transfer
+from mi_nerfattack.report.plots.transfer import plot_quality, plot_transfer
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.system.workers import AbstractWorkers, raise_failure
 
 DOCUMENT, PICTURE, DRIVES = "transfer.json", "transfer.png", "drives"
+QUALITY = "quality.png"
 
 
 def check_output(folder: Path) -> None:
@@ -90,6 +91,9 @@ def _run(
     files.write_json(output / DOCUMENT, document)
     workers.run(work, left, on_units, on_end)
     plot_transfer(output / PICTURE, document)
+    known = [s for s in document["surrogates"] if s["psnr_heldout_db"] is not None]
+    if len(known) > 1:
+        plot_quality(output / QUALITY, document)
     return document
 
 

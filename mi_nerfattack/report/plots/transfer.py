@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from mi_nerfattack.report.plots.charts import GREY, chart
 from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 #: Attacks that have lines of their own; of more there is the mean alone.
 _MOST = 6
@@ -69,6 +70,73 @@ def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
             loc="left",
             fontsize=9,
         )
+
+
+def plot_quality(path: str | Path, document: Mapping[str, Any]) -> None:
+    """Draw transfer against the quality of the surrogate that attacks were made in.
+
+    Above, of the attacks that succeed in their surrogate, the share that do elsewhere,
+    with Wilson's intervals; below, their mean error, in the surrogate, too, with its
+    interval over attacks. A point a surrogate with a known quality, of the condition
+    `quality_condition`.
+
+    Args:
+        path: PNG file.
+        document: whole, of attacks in several surrogates.
+    """
+    condition = quality_condition(document)
+    points: dict[str, list[tuple[float, Mapping[str, Any]]]] = {}
+    for surrogate in document["surrogates"]:
+        for column in surrogate["columns"]:
+            psnr, known = surrogate["psnr_heldout_db"], ATTACK in column["cases"]
+            if psnr is not None and known and column["condition"] == condition:
+                points.setdefault(column["environment"], []).append((psnr, column))
+    with chart(path, 6.0) as figure:
+        shares, errors = figure.subplots(2, sharex=True)
+        for number, (environment, some) in enumerate(points.items()):
+            style = {"color": f"C{number}", "marker": "o", "label": environment}
+            ends = [
+                (psnr, transfer["kept"] / transfer["of"], transfer["rate_ci95"])
+                for psnr, column in some
+                if (transfer := column["transfer"])
+            ]
+            if environment != SURROGATE:  # 1 by definition
+                _curve(shares, ends, style)
+            means = [(psnr, column["cases"][ATTACK]) for psnr, column in some]
+            _curve(errors, [(x, *_mean(case)) for x, case in means], style)
+        shares.set_ylim(-0.05, 1.05)
+        shares.set_ylabel("attacks that transfer (share)")
+        errors.set_ylim(bottom=0)
+        errors.set_ylabel("mean distance\nfrom the lane centre (m)")
+        errors.set_xlabel("PSNR of the surrogate on held-out views (dB)")
+        for axis in (shares, errors):
+            axis.grid(alpha=0.25)
+        shares.set_title(f"{condition}; attacks of each surrogate", loc="left")
+        handles = errors.get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=4)
+
+
+def quality_condition(document: Mapping[str, Any]) -> str:
+    """Return the condition by which surrogates are compared: day, or the first."""
+    conditions = list(document["conditions"])
+    return "day" if "day" in conditions else conditions[0]
+
+
+def _mean(case: Mapping[str, Any]) -> tuple[float, list[float]]:
+    mean = case["cross_track_mean_m"]
+    return mean, case["cross_track_mean_ci95_m"] or [mean, mean]
+
+
+def _curve(
+    axis: Axes,
+    points: list[tuple[float, float, list[float]]],
+    style: Mapping[str, Any],
+) -> None:
+    """Draw points (x, y, ends of y's interval)."""
+    if points:
+        x, y, ends = (np.array(values) for values in zip(*points, strict=True))
+        bars = np.maximum(np.abs(ends.T - y), 0)
+        axis.errorbar(x, y, bars, capsize=3, linewidth=1, **style)
 
 
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6}

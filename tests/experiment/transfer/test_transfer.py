@@ -30,7 +30,8 @@ from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.experiment.transfer.work import CASES, Batch, Opened, TransferWork
 from mi_nerfattack.fields import load_grid, save_field
 from mi_nerfattack.io import files
-from mi_nerfattack.report.table import transfer_table
+from mi_nerfattack.report.plots.transfer import plot_quality, quality_condition
+from mi_nerfattack.report.table import quality_table, transfer_table
 from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -197,12 +198,7 @@ def test_conditions_change_drives_and_own_objects_differ(found_run, tmp_path):
 
 
 def test_drives_without_what_was_found_are_shared(found_run, tmp_path):
-    other = tmp_path / "other"
-    shutil.copytree(found_run, other)
-    path = other / "objects" / "ball.safetensors"
-    item = load_grid(path)
-    item.set_parameter("texture", item.texture.numpy() + np.float32(1))
-    save_field(path, item)
+    other = another(found_run, tmp_path / "other", 2.0)
     columns = make_columns(("surrogate", "mitsuba"), ("day",), 1)
     attacks = read_found([found_run, other])
     work = TransferWork(attacks, columns, CASES, 2, 1, tmp_path / "drives")
@@ -233,6 +229,16 @@ def test_without_objects_it_does_not_matter_how_they_stand(found_run, tmp_path):
     assert empty.column == columns[0]
 
 
+def another(run: Path, folder: Path, factor: float) -> Path:
+    """Copy a run as if it had found other textures."""
+    shutil.copytree(run, folder)
+    path = folder / "objects" / "ball.safetensors"
+    item = load_grid(path)
+    item.set_parameter("texture", item.texture.numpy() * np.float32(factor))
+    save_field(path, item)
+    return folder
+
+
 def made_figures(out_s: float, mean_m: float) -> dict:
     return {
         "n": 2,
@@ -245,14 +251,9 @@ def made_figures(out_s: float, mean_m: float) -> dict:
 
 def test_ratios_and_rates_count_attacks(found_run, tmp_path):
     """Three attacks: two succeed in the surrogate, one of these in deployment."""
-    for name in ("two", "three"):
-        shutil.copytree(found_run, tmp_path / name)
-        path = tmp_path / name / "objects" / "ball.safetensors"
-        item = load_grid(path)
-        item.set_parameter("texture", item.texture.numpy() * np.float32(len(name)))
-        save_field(path, item)
+    others = [another(found_run, tmp_path / f"{k}", float(k)) for k in (2, 3)]
     columns = make_columns(("surrogate", "mitsuba"), ("day",), 1)
-    attacks = read_found([found_run, tmp_path / "two", tmp_path / "three"])
+    attacks = read_found([found_run, *others])
     work = TransferWork(attacks, columns, ("attack",), 2, 1, tmp_path / "drives")
     surrogate, deployed = (
         [(2.0, 0.4), (1.0, 0.8), (0.9, 0.1)],
@@ -277,6 +278,51 @@ def test_ratios_and_rates_count_attacks(found_run, tmp_path):
     figures.popitem()
     grown = make_document(work, figures)
     assert len(grown["rows"]) == 5 and not grown["columns"]
+
+
+def test_attacks_in_several_surrogates_are_grouped_by_them(found_run, tmp_path):
+    """The better surrogate's attack transfers, the worse one's does not."""
+    folders = [with_surrogate(found_run, tmp_path, "good", 28.5)]
+    folders += [with_surrogate(found_run, tmp_path, "bad", 15.25)]
+    columns = make_columns(("surrogate", "mitsuba"), ("day", "late:1"), 1)
+    attacks = read_found(folders)
+    work = TransferWork(attacks, columns, ("attack",), 2, 1, tmp_path / "drives")
+    figures = {}
+    for (number, column), row in work.rows.items():
+        lost = number == 1 and column.environment != "surrogate"
+        made = made_figures(0.2, 0.1) if lost else made_figures(2.0, 0.6)
+        figures[row["attack"].digest] = made
+    document = make_document(work, figures)
+    bad, good = document["surrogates"]
+    assert (bad["psnr_heldout_db"], good["psnr_heldout_db"]) == (15.25, 28.5)
+    assert bad["steps"] == good["steps"] == 40
+    assert (bad["attacks"], good["attacks"]) == (["bad"], ["good"])
+    kept = [s["columns"][2]["transfer"]["kept"] for s in (bad, good)]
+    assert kept == [0, 1]
+    assert bad["columns"][2]["environment"] == "mitsuba"
+    plot_quality(tmp_path / "quality.png", document)
+    assert files.read_image(tmp_path / "quality.png").std() > 5
+    condition = quality_condition(document)
+    assert quality_table(document, condition).row_count == 2 * 2
+    # one surrogate is no curve
+    single = TransferWork(attacks[:1], columns, ("attack",), 2, 1, tmp_path / "drives")
+    assert make_document(single, figures)["surrogates"] == []
+
+
+def with_surrogate(run: Path, folder: Path, name: str, psnr: float) -> Path:
+    """Copy a run as if it had been made in another field."""
+    copied = another(run, folder / name, psnr / 10)
+    (copied / "checkpoint.safetensors").unlink()
+    scenario, _ = load_scenario(run / "scenario.toml")
+    field = load_grid(scenario.scene.field.file)
+    field.info.update({"fit.psnr_heldout_db": f"{psnr:.3f}", "fit.steps": "40"})
+    save_field(folder / f"{name}.safetensors", field)
+    path = copied / "scenario.toml"
+    text = path.read_text().replace(
+        str(scenario.scene.field.file), f"../{name}.safetensors"
+    )
+    path.write_text(text)
+    return copied
 
 
 def test_starts_are_unseen_and_do_not_depend_on_their_number(found_run, tmp_path):
