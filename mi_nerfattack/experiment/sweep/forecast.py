@@ -55,7 +55,7 @@ class Forecast:
         period_s: dict[Place, dict[str, float]] = {}
         for number, kind in enumerate(kinds):
             cell, place = first[kind], kind[:2]
-            self.on_progress("checking", number, len(kinds), " ".join(map(str, kind)))
+            self.on_progress("checking", number, len(kinds), _words(kind))
             if place not in self.refused:
                 self._check(cell, place, drives)
                 if cost := self.costs[kind]:
@@ -77,7 +77,8 @@ class Forecast:
             return
         if drives:
             check.price()
-        self.refused[place] += check.refused
+        kept = self.doubts if cell.anyway else self.refused
+        kept[place] += check.refused
         self.doubts[place] += check.doubts
         self.costs[_kind(cell)] = check.cost
 
@@ -96,7 +97,7 @@ class Forecast:
         known = [cost for cost in costs if cost is not None]
         whole = len(known) == len(left)
         told = {
-            " ".join(map(str, kind)): None if cost is None else cost.document()
+            _words(kind): None if cost is None else cost.document()
             for kind, cost in self.costs.items()
         }
         return {
@@ -121,17 +122,20 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         workers: cells that are done at a time.
     """
     cells, complete = document["cells"], document["complete"]
-    left = f"; {complete} are complete, the rest" if complete else ""
-    lines = [f"{cells} cells{left}"]
+    head, rest = f"{cells} cells", ": "
+    if complete:
+        head, rest = f"{head}, {complete} complete", "; the rest: "
     if document["wall_s"] is None:
-        lines[0] += "; not all of them could be timed"
-    else:
-        lines[0] += (
-            f": {document['frames']} frames, {duration(document['wall_s'] / workers)} "
-            f"for {workers} at a time, as busy as this machine is, "
-            f"{document['disk_mb']:.0f} MB of disk ({document['disk_free_mb']:.0f} MB "
-            f"are free), at most {document['memory_mb']:.0f} MB of memory each"
+        head += "; not all of them could be timed"
+    elif complete < cells:
+        head += (
+            f"{rest}{document['frames']} frames, "
+            f"{duration(document['wall_s'] / workers)} for {workers} at a time, as "
+            f"busy as this machine is, {document['disk_mb']:.0f} MB of disk "
+            f"({document['disk_free_mb']:.0f} MB are free), at most "
+            f"{document['memory_mb']:.0f} MB of memory each"
         )
+    lines = [head]
     for name, cost in document["costs"].items():
         if cost is not None and cost["period_s"]["backward"]:
             times = cost["period_s"]
@@ -142,6 +146,10 @@ def sentences(document: dict[str, Any], workers: int) -> list[str]:
         for place, told in document[word].items():
             lines += [f"{shown}: {place}: {line}" for line in told]
     return lines
+
+
+def _words(kind: tuple[Any, ...]) -> str:
+    return " ".join(str(part) for part in kind if part is not None)
 
 
 def _free_mb(folder: Path) -> float:

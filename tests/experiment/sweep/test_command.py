@@ -90,6 +90,8 @@ def test_what_would_be_refused(command, tmp_path):
     assert first == "6 cells; not all of them could be timed"
     assert "refused: line aloft: ball is in the air of deployment.xml" in rest[0]
     assert not (tmp_path / "out").exists()
+    code, out, _ = command("anyway = true\n" + GRID + ALOFT, "--check", "--no-drives")
+    assert code == 0 and "look at: line aloft: ball is in the air" in out
 
 
 def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
@@ -106,10 +108,13 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     assert table == f"4 of 6 cells: {tmp_path / 'out' / 'results.parquet'}"
     assert [line.split("-")[2] for line in failed] == ["gradient", "blocks"]
     assert all(line.endswith(": in two lines") for line in failed)
-    code, out, _ = command(GRID.replace("4, ", ""), "--json")
+    rest = GRID.replace("4, ", "")
+    code, out, _ = command(rest, "--json")
     found = json.loads(out)
     assert code == 0 and found["complete"] == found["cells"] == 4
     assert not found["failed"]
+    code, out, _ = command(rest, "--check", "--no-drives")
+    assert out.splitlines()[0] == "4 cells, 4 complete"
 
 
 def test_as_many_workers_as_cores_allow(monkeypatch):
