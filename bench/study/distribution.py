@@ -21,6 +21,7 @@ import rich.table
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
 from bench.study.tables import markdown, mean_m
+from mi_nerfattack.experiment.transfer.figures import SUCCESS_S
 from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -28,7 +29,6 @@ SEEDS = tuple(range(1, 9))
 HEIGHTS_M = (NATURAL_M, 2 * NATURAL_M)
 #: Training's distances from the lane centre, and all of a route but its ends, metres.
 LATERAL_M, ARC_M = (2.0, 5.0), (8.0, 36.0)
-SUCCESS_S = 1.0
 ENVIRONMENTS = (SURROGATE, "deployment")
 _STYLES: dict[str, dict[str, Any]] = {
     "own": {"color": GREY, "marker": ".", "linestyle": ""},

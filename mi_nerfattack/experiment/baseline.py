@@ -71,12 +71,7 @@ class Baseline:
 
     def look(self, number: int) -> Appearance:
         """Return a random look; what the attack may not change is the objects' own."""
-        textures, offsets = self.looks.textures(number), self.looks.offsets(number)
-        own = self.original
-        return Appearance(
-            own.textures if textures is None else textures,
-            own.offsets if offsets is None else offsets,
-        )
+        return random_appearance(self.looks, number, self.original)
 
     def drive(self, stages: Stages) -> None:
         """Judge and drive all looks in the surrogate, and find the best."""
@@ -105,3 +100,18 @@ class Baseline:
             "objectives": self.objectives,
             "attack_objective": float(self.attack.best_objective),
         }
+
+
+def random_appearance(looks: RandomLooks, number: int, own: Appearance) -> Appearance:
+    """Return a random look.
+
+    Args:
+        looks: draws.
+        number: of the look.
+        own: the objects' own; what an attack may not change stays like that.
+    """
+    textures, offsets = looks.textures(number), looks.offsets(number)
+    return Appearance(
+        own.textures if textures is None else textures,
+        own.offsets if offsets is None else offsets,
+    )

@@ -17,6 +17,7 @@ import numpy as np
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
+from mi_nerfattack.experiment.baseline import random_appearance
 from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
@@ -121,12 +122,7 @@ class FoundAttack:
             freedom = self.scenario.attack.freedom.build()
             kind, seed = self.scenario.baseline.kind, self.scenario.seed
             looks = RandomLooks(world.fields, freedom, kind, seed)
-            textures = looks.textures(self.best_random)
-            offsets = looks.offsets(self.best_random)
-            found[BEST_RANDOM] = Appearance(
-                own.textures if textures is None else textures,
-                own.offsets if offsets is None else offsets,
-            )
+            found[BEST_RANDOM] = random_appearance(looks, self.best_random, own)
         return found
 
 

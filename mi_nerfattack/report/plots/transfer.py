@@ -94,7 +94,7 @@ def plot_quality(path: str | Path, document: Mapping[str, Any]) -> None:
     with chart(path, 6.0) as figure:
         shares, errors = figure.subplots(2, sharex=True)
         for number, (environment, some) in enumerate(points.items()):
-            style = {"color": f"C{number}", "marker": "o", "label": environment}
+            style = {**_STYLES[number % len(_STYLES)], "label": environment}
             ends = [
                 (psnr, transfer["kept"] / transfer["of"], transfer["rate_ci95"])
                 for psnr, column in some
@@ -139,6 +139,15 @@ def _curve(
         axis.errorbar(x, y, bars, capsize=3, linewidth=1, **style)
 
 
+#: Of environments; colours after Okabe and Ito 2008.
+_STYLES: list[dict[str, Any]] = [
+    {"color": color, "marker": marker}
+    for color, marker in zip(
+        ("#7f7f7f", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
+        "osD^vP*",
+        strict=True,
+    )
+]
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6}
 
 
