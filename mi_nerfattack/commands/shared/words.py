@@ -14,8 +14,9 @@ def command_line(name: str, options: Any) -> str:
 
     Args:
         name: of the sub-command.
-        options: the dataclass of its arguments; `policy` is positional. Of absolute
-            paths, which tell about the machine alone, the last part is written.
+        options: the dataclass of its arguments; `policy` and `run_folders` are
+            positional. Of absolute paths, which tell about the machine alone, the last
+            part is written.
     """
     return " ".join(["mi-nerfattack", name, *_words(options)])
 
@@ -28,8 +29,8 @@ def _words(options: Any) -> list[str]:
             found += _words(value)
         elif item.default is not MISSING and value == item.default:
             continue
-        elif item.name == "policy":
-            found.insert(0, _word(value))
+        elif item.name in ("policy", "run_folders"):
+            found[:0] = map(_word, _parts(value))
         else:
             found.append("--" + item.name.replace("_", "-"))
             found += [_word(part) for part in _parts(value) if part is not True]

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.identity import short_digest
+from mi_nerfattack.evaluation.identity import policy_content, short_digest
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.offset import offset_pose
+from mi_nerfattack.scenario.policy import PilotNetSection
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.staging import AbstractStage, AbstractStaging, Stretch
 from mi_nerfattack.vehicle.route.route import Route
@@ -23,6 +25,8 @@ from mi_nerfattack.vehicle.route.route import Route
 #: Parts of a scenario in which all runs must agree: the world, but for its routes.
 _SHARED = ("scene.field", "scene.surrogate", "scene.to_world", "scene.deployment")
 _SHARED += ("scene.routes", "camera", "vehicle")
+#: Keys that say no more of a policy than its weights.
+_PLAIN = {"kind", "file_sha256"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,3 +157,30 @@ def _shared(found: FoundAttack) -> dict[str, str]:
         for key, value in found.identity.items()
         if any(key == s or key.startswith((f"{s}.", f"{s}[")) for s in starts)
     }
+
+
+def attacked_policy(attacks: Sequence[FoundAttack]) -> Path:
+    """Return the weights that all runs attacked.
+
+    Raises:
+        InputError: they attacked different policies, or one that is not PilotNet alone.
+    """
+    first = attacks[0]
+    for found in attacks:
+        policy = found.scenario.policy
+        about = policy_content(policy)
+        if not isinstance(policy, PilotNetSection) or set(about) - _PLAIN:
+            raise InputError(
+                f"{found.folder}: attacked {policy.source}; only PilotNet of "
+                "'mi-nerfattack train', without further keys of [policy], can be "
+                "retrained; train another one yourself, on frames that "
+                "experiment.retrain.among collects"
+            )
+        if about != policy_content(first.scenario.policy):
+            raise InputError(
+                f"{found.folder}: attacked {policy.source}, {first.folder} "
+                f"{first.scenario.policy.source}, of other content; retrain one policy "
+                "at a time"
+            )
+    assert isinstance(first.scenario.policy, PilotNetSection)
+    return first.scenario.policy.file.file

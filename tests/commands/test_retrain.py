@@ -1,0 +1,145 @@
+"""The command that retrains among found attacks: what it makes, counts and refuses."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+from helpers import attack_jobs
+
+from mi_nerfattack import cli
+from mi_nerfattack.experiment.job import Job
+from mi_nerfattack.experiment.retrain.among import found_place
+from mi_nerfattack.experiment.retrain.solvable import drive_expert
+from mi_nerfattack.experiment.transfer.found import read_found
+from mi_nerfattack.io import files
+from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.scenario.scenario import load_scenario
+from mi_nerfattack.training.collect import find_shards
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+CHANGES = {
+    "horizon = 2": "horizon = 16",
+    "max_iterations = 30": "max_iterations = 1",
+    "textures = 4": "textures = 1",
+    "runs = 2": "runs = 1",
+    "[7.0, 4.2, 1.6]": "[-13.0, 3.4, 1.6]",
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The folder of a finished attack on PilotNet, without pictures."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), CHANGES)
+    routes = files.read_json(folder / "routes.json")
+    routes["line"]["points_m"] = [[-20.0, 0.0], [-8.0, 0.0]]
+    files.write_json(folder / "routes.json", routes)
+    scenario, text = load_scenario(folder / "scenario.toml")
+    job = Job(scenario, text, scenario.build_policy(), folder / "run", frames=None)
+    job.run(anyway=True)
+    return folder / "run"
+
+
+def changed(run: Path, folder: Path, *changes: tuple[str, str]) -> Path:
+    """Copy a run, with a changed scenario that no checkpoint contradicts."""
+    shutil.copytree(run, folder)
+    (folder / "checkpoint.safetensors").unlink()
+    path = folder / "scenario.toml"
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return folder
+
+
+def retrain(folder: Path, *arguments: object) -> int:
+    words = ["retrain", "-o", folder / "new.safetensors", "--data", folder / "data"]
+    words += ["--workers", 1, "--epochs", 1, "--runs", 1, *arguments]
+    return cli.main([str(word) for word in words])
+
+
+def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
+    """What is there is taken up; a scenario with a blocked lane does not count."""
+    blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
+    frames = ["--frames", "surrogate", 64, "--exposures-ev", 0]
+    assert retrain(tmp_path, run, blocked, *frames) == 0
+    told = capsys.readouterr()
+    assert "blocked: left out: an object stands" in told.out
+    assert "no --more" in told.err
+    old = PilotNet.load(run.parent / "policy.safetensors")
+    new = PilotNet.load(tmp_path / "new.safetensors")
+    assert (new.goals, new.max_control) == (old.goals, old.max_control)
+    pairs = zip(new.parameters(), old.parameters(), strict=True)
+    steps = [float((a - b).abs().max().detach()) for a, b in pairs]
+    assert 0 < max(steps) < 0.01  # a training of its own would be far away
+    about = files.read_json(tmp_path / "new-retrain.json")
+    assert [item["label"] for item in about["runs"]] == ["run"]
+    assert list(about["left_out"]) == ["blocked"]
+    assert about["policy"]["sha256"] == files.sha256(run.parent / "policy.safetensors")
+    record = files.read_json(tmp_path / "new.json")
+    assert record["data"] == {"round_0/surrogate": 64}
+    shards = find_shards(tmp_path / "data")
+    written = [path.stat().st_mtime_ns for path in shards]
+    weights = (tmp_path / "new.safetensors").read_bytes()
+    # the same command takes up what is there; other runs are other frames
+    assert retrain(tmp_path, run, blocked, *frames) == 0
+    assert [path.stat().st_mtime_ns for path in shards] == written
+    assert (tmp_path / "new.safetensors").read_bytes() == weights
+    near = changed(run, tmp_path / "near", ("-13.0, 3.4", "-12.0, 3.4"))
+    capsys.readouterr()
+    assert retrain(tmp_path, run, near, *frames) == 2
+    assert "staging.found" in capsys.readouterr().err
+    # old frames are trained on, too
+    other = tmp_path / "other"
+    other.mkdir()
+    assert retrain(other, near, *frames, "--more", tmp_path / "data") == 0
+    record = files.read_json(other / "new.json")
+    assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
+
+
+def test_the_expert_decides_what_can_be_driven(run, tmp_path):
+    (found,) = read_found([run])
+    place = found_place([found])
+    driven = drive_expert(found, place)
+    assert driven.trouble == ""
+    # a box 3 m wide around y = 3.4 m, and a car 1.8 m wide within 0.3 m of y = 0
+    assert driven.gap_m == pytest.approx(3.4 - 1.5 - 0.9, abs=0.3)
+    late = changed(run, tmp_path / "late", ("[drive]", "[drive]\nlateral_sd_m = 5.0"))
+    (found,) = read_found([late])
+    assert "leaves its lane" in drive_expert(found, place).trouble
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[policy]", "[policy]\ncontrol_scale = 0.5"), "only PilotNet of"),
+        (("policy.safetensors", "other.safetensors"), "retrain one policy at a time"),
+        (("[drive]", "[vehicle]\nwidth_m = 1.5\n[drive]"), "one place at a time"),
+    ],
+)
+def test_runs_that_do_not_go_together_are_refused(
+    run, tmp_path, change, message, capsys
+):
+    PilotNet(4).save(run.parent / "other.safetensors")
+    other = changed(run, tmp_path / "other", change)
+    assert retrain(tmp_path, run, other) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
+def test_options_that_do_not_fit_are_told(run, tmp_path, capsys):
+    assert retrain(tmp_path, run, "--frames", "carla", 8) == 2
+    assert "--frames: 'carla'; of surrogate" in capsys.readouterr().err
+    policy = run.parent / "policy.safetensors"
+    before = policy.read_bytes()
+    assert retrain(tmp_path, run, "-o", policy) == 2
+    assert "is the policy that was attacked" in capsys.readouterr().err
+    assert policy.read_bytes() == before
+    blocked = changed(run, tmp_path / "blocked", ("-13.0, 3.4", "-13.0, 0.4"))
+    assert retrain(tmp_path, blocked) == 2
+    assert "none can be driven by the expert" in capsys.readouterr().err
