@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -24,11 +25,12 @@ FRAMES = {"surrogate": 384, "mitsuba": 640}
 class Retrain:
     """Fine-tune the policy that found attacks are on, among them.
 
-    Collects frames among the attacked objects, labelled by the expert, and trains the
-    policy further on them and on those that it was trained on (--more). Only runs count
-    whose scenario the expert itself can drive. Stopped, it continues from DATA. Beside
-    the policy come its program, its record as 'train' writes it, and which runs it was
-    retrained on (NAME-retrain.json).
+    Drives past the attacks, and past those held out; collects frames among the
+    attacked objects, labelled by the expert; trains the policy further on them and on
+    those that it was trained on (--more); and drives again. Only runs count whose
+    scenario the expert itself can drive. Stopped, it continues from DATA. Beside the
+    policy come its program, its record as 'train' writes it, and NAME-retrain.json: the
+    runs, and errors before and after.
     """
 
     run_folders: Annotated[
@@ -41,6 +43,8 @@ class Retrain:
     """Folder of new frames and checkpoints; made if missing."""
     more: tuple[Path, ...] = ()
     """Folders of frames that the policy was trained on; without them it forgets."""
+    held_out: tuple[Path, ...] = ()
+    """Runs on the same policy to drive before and after, and not to train on."""
     frames: dict[str, int] | None = None
     """New frames by environment; surrogate 384 mitsuba 640 by default, a tenth of the
     preset laptop of 'train'."""
@@ -58,8 +62,12 @@ class Retrain:
     """Largest learning rate."""
     runs: int = 2
     """Drives of each route and environment, without objects, at the end."""
+    environments: tuple[str, ...] = ("surrogate", "mitsuba")
+    """Environments of the drives before and after, as of 'transfer'."""
+    starts: int = 4
+    """Drives before and after: of each run, past its attack and without objects."""
     workers: int | None = None
-    """Processes that collect; one a core by default, 1 collects in this process."""
+    """Processes that collect and drive; one a core by default, 1 works in this one."""
     seed: int = 0
     """Of all random numbers."""
 
@@ -71,17 +79,19 @@ class Retrain:
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.deploy.sites import PlaceSite, Weather
-        from mi_nerfattack.experiment.retrain.among import (
-            AmongFound,
-            attacked_policy,
-            found_place,
+        from mi_nerfattack.experiment.retrain.among import AmongFound, attacked_policy
+        from mi_nerfattack.experiment.retrain.compare import (
+            AFTER,
+            BEFORE,
+            OLD,
+            Comparison,
+            table_rows,
         )
-        from mi_nerfattack.experiment.retrain.solvable import divide_solvable
         from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.io import files
         from mi_nerfattack.policy.exported.program import SUFFIX
         from mi_nerfattack.policy.pilotnet import PilotNet
-        from mi_nerfattack.report.table import card_table
+        from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
         from mi_nerfattack.training.collect import find_shards
         from mi_nerfattack.training.imitate import imitate
@@ -92,44 +102,67 @@ class Retrain:
         for path in (*map(self.output.with_suffix, (SUFFIX, ".json")), about):
             files.check_writable(path)
         variant.ensure()
-        attacks = read_found(self.run_folders)
-        policy, place = attacked_policy(attacks), found_place(attacks)
+        attacks = read_found([*self.run_folders, *self.held_out])
+        policy, place = attacked_policy(attacks), self._place(attacks)
+        self._check_apart(policy)
+        more = [shard for folder in self.more for shard in find_shards(folder)]
+        groups, others = self._groups(attacks)
+        settings = self._settings(policy, place)
+        weather = Weather(self.skies, self.exposures_ev, self.spp)
+        sites = [PlaceSite(name, place, weather) for name in settings.sites]
+        old = groups[OLD]
+        routes = list({found.route.name: found.route for found in old}.values())
+        names, workers = self.environments, chosen_workers(self.workers, False)
+        drives = Comparison(groups, names, self.starts, self.spp, self.data)
+        with StageBars() as bars:
+            if not more:
+                bars.say("no --more: trained on new frames alone, it may forget others")
+            before = drives.drive(BEFORE, workers, bars.counter)
+            arguments = (settings, self.data, workers, bars.show)
+            start, staging = PilotNet.load(policy), AmongFound(tuple(old))
+            result = imitate(sites, routes, *arguments, start, more, staging)
+            command = command_line("retrain", self)
+            record = training_record(settings, sites, self.data, result, command)
+            write_trained(self.output, result.module, record)
+            after = drives.drive(AFTER, workers, bars.counter, self.output)
+        document = _describe(policy, groups, others)
+        document["table"] = table_rows(before, after)
+        files.write_json(about, document)
+        Console().print(card_table(result.card))
+        Console().print(retrain_table(document))
+        print(f"{self.output}: written; program, record and table are beside it")
+        return 0
+
+    def _place(self, attacks: Sequence[FoundAttack]) -> Place:
+        from mi_nerfattack.experiment.retrain.among import found_place
+
+        return found_place(attacks[: len(self.run_folders)])
+
+    def _check_apart(self, policy: Path) -> None:
         if self.output.resolve() == policy.resolve():
             raise InputError(
                 f"{self.output}: is the policy that was attacked, which its runs "
                 "still need; choose another file with -o"
             )
-        more = [shard for folder in self.more for shard in find_shards(folder)]
-        solvable, others = divide_solvable(attacks, place)
+
+    def _groups(
+        self, attacks: Sequence[FoundAttack]
+    ) -> tuple[dict[str, list[FoundAttack]], dict[str, str]]:
+        """Divide what was read, and say what does not count."""
+        from mi_nerfattack.experiment.retrain.compare import HELD_OUT, OLD
+        from mi_nerfattack.experiment.retrain.solvable import divide_solvable
+
+        solvable, others = divide_solvable(attacks)
         for label, trouble in others.items():
             print(f"{label}: left out: {trouble}")
-        if not solvable:
+        trained = attacks[: len(self.run_folders)]
+        groups = {
+            OLD: [found for found in solvable if found in trained],
+            HELD_OUT: [found for found in solvable if found not in trained],
+        }
+        if not groups[OLD]:
             raise InputError("RUN: none can be driven by the expert; give other runs")
-        settings = self._settings(policy, place)
-        weather = Weather(self.skies, self.exposures_ev, self.spp)
-        sites = [PlaceSite(name, place, weather) for name in settings.sites]
-        routes = list({found.route.name: found.route for found in solvable}.values())
-        with StageBars() as bars:
-            if not more:
-                bars.say("no --more: trained on new frames alone, it may forget others")
-            result = imitate(
-                sites,
-                routes,
-                settings,
-                self.data,
-                chosen_workers(self.workers, False),
-                bars.show,
-                PilotNet.load(policy),
-                more,
-                AmongFound(tuple(solvable)),
-            )
-        command = command_line("retrain", self)
-        record = training_record(settings, sites, self.data, result, command)
-        write_trained(self.output, result.module, record)
-        files.write_json(about, _describe(policy, solvable, others))
-        Console().print(card_table(result.card))
-        print(f"{self.output}: written; program, record and runs are beside it")
-        return 0
+        return {name: some for name, some in groups.items() if some}, others
 
     def _settings(self, policy: Path, place: Place) -> ImitationSettings:
         from dataclasses import replace
@@ -168,23 +201,26 @@ class Retrain:
 
 
 def _describe(
-    policy: Path, solvable: list[FoundAttack], others: dict[str, str]
-) -> dict[str, object]:
+    policy: Path, groups: Mapping[str, Sequence[FoundAttack]], others: dict[str, str]
+) -> dict[str, Any]:
+    from mi_nerfattack.experiment.retrain.compare import HELD_OUT, OLD
     from mi_nerfattack.io import files
 
     return {
         "schema": 1,
         "policy": {"file": policy.name, "sha256": files.sha256(policy)},
-        "runs": [
-            {
-                "label": found.label,
-                "scenario": found.scenario.name,
-                "seed": found.scenario.seed,
-                "route": found.route.name,
-                "objects": [item.id for item in found.scenario.objects],
-                "found_sha256": found.digest,
-            }
-            for found in solvable
-        ],
+        "runs": [_about(found) for found in groups[OLD]],
+        "held_out": [_about(found) for found in groups.get(HELD_OUT, ())],
         "left_out": others,
+    }
+
+
+def _about(found: FoundAttack) -> dict[str, Any]:
+    return {
+        "label": found.label,
+        "scenario": found.scenario.name,
+        "seed": found.scenario.seed,
+        "route": found.route.name,
+        "objects": [item.id for item in found.scenario.objects],
+        "found_sha256": found.digest,
     }

@@ -187,6 +187,39 @@ def quality_table(document: Mapping[str, Any], condition: str) -> rich.table.Tab
     return table
 
 
+def retrain_table(document: Mapping[str, Any]) -> rich.table.Table:
+    """Return what retraining came to as a table that fits a terminal of 80 columns.
+
+    Args:
+        document: with `table`, of `retrain.compare.table_rows`.
+
+    Returns:
+        A row per group of attacks, environment and stage: mean errors without objects
+        and past attacks, their ratio, drives that left the lane past attacks, and how
+        many attacks have a wheel out for a second.
+    """
+    table = _distances("Before and after, mean distance from the lane centre (m)")
+    for name in ("attacks", "environment", "policy"):
+        table.add_column(name, overflow="fold", max_width=19)
+    for name in ("no\nobject", "attack", "ratio", "drives\ndeparted", "attacks\nout"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in document["table"]:
+        labels = [row["group"].replace("_", " "), row["environment"]]
+        for stage in ("before", "after"):
+            clean, attack = (row[stage][case] for case in ("no_object", ATTACK))
+            table.add_row(
+                *labels,
+                stage,
+                *(f"{case['cross_track_mean_m']:.3f}" for case in (clean, attack)),
+                f"{row['attack_to_clean'][stage]:.2f}",
+                f"{attack['drives_departed']}/{attack['drives']}",
+                f"{attack['attacks_out']}/{row['attacks']}",
+            )
+            labels = ["", ""]
+        table.add_section()
+    return table
+
+
 def _transfer_cells(column: Mapping[str, Any]) -> list[str]:
     cases, ratio = column["cases"], column["ratio_to_surrogate"]
     means = [f"{figures['cross_track_mean_m']:.3f}" for figures in cases.values()]

@@ -11,7 +11,6 @@ from helpers import attack_jobs
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.job import Job
-from mi_nerfattack.experiment.retrain.among import found_place
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
 from mi_nerfattack.experiment.transfer.found import read_found
 from mi_nerfattack.io import files
@@ -59,7 +58,8 @@ def changed(run: Path, folder: Path, *changes: tuple[str, str]) -> Path:
 
 def retrain(folder: Path, *arguments: object) -> int:
     words = ["retrain", "-o", folder / "new.safetensors", "--data", folder / "data"]
-    words += ["--workers", 1, "--epochs", 1, "--runs", 1, *arguments]
+    words += ["--workers", 1, "--epochs", 1, "--runs", 1, "--starts", 1]
+    words += [*arguments, "--environments", "surrogate"]
     return cli.main([str(word) for word in words])
 
 
@@ -94,24 +94,47 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     capsys.readouterr()
     assert retrain(tmp_path, run, near, *frames) == 2
     assert "staging.found" in capsys.readouterr().err
-    # old frames are trained on, too
+    # old frames are trained on, too, and attacks driven that nothing was trained on
     other = tmp_path / "other"
     other.mkdir()
-    assert retrain(other, near, *frames, "--more", tmp_path / "data") == 0
+    more = ["--more", tmp_path / "data", "--held-out", run]
+    assert retrain(other, near, *frames, *more) == 0
+    check_table(files.read_json(other / "new-retrain.json"), other)
     record = files.read_json(other / "new.json")
     assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
 
 
+def check_table(about: dict, folder: Path) -> None:
+    """Before and after are the drives of a transfer of each group by each policy."""
+    rows = about["table"]
+    assert [row["group"] for row in rows] == ["old", "held_out"]
+    assert [item["label"] for item in about["held_out"]] == ["run"]
+    for row in rows:
+        for stage in ("before", "after"):
+            kept = folder / "data" / f"{row['group']}_{stage}" / "transfer.json"
+            (column,) = files.read_json(kept)["columns"]
+            assert row[stage] == column["cases"]
+            figures = row[stage]["attack"]
+            clean = row[stage]["no_object"]["cross_track_mean_m"]
+            assert figures["drives"] == 1
+            assert row["attack_to_clean"][stage] * clean == pytest.approx(
+                figures["cross_track_mean_m"]
+            )
+        before, after = (row[s]["no_object"] for s in ("before", "after"))
+        assert before["cross_track_mean_m"] != after["cross_track_mean_m"]
+        ratio = after["cross_track_mean_m"] / before["cross_track_mean_m"]
+        assert row["clean_ratio"] == pytest.approx(ratio)
+
+
 def test_the_expert_decides_what_can_be_driven(run, tmp_path):
     (found,) = read_found([run])
-    place = found_place([found])
-    driven = drive_expert(found, place)
+    driven = drive_expert(found)
     assert driven.trouble == ""
     # a box 3 m wide around y = 3.4 m, and a car 1.8 m wide within 0.3 m of y = 0
     assert driven.gap_m == pytest.approx(3.4 - 1.5 - 0.9, abs=0.3)
     late = changed(run, tmp_path / "late", ("[drive]", "[drive]\nlateral_sd_m = 5.0"))
     (found,) = read_found([late])
-    assert "leaves its lane" in drive_expert(found, place).trouble
+    assert "leaves its lane" in drive_expert(found).trouble
 
 
 @pytest.mark.parametrize(
@@ -135,6 +158,8 @@ def test_runs_that_do_not_go_together_are_refused(
 def test_options_that_do_not_fit_are_told(run, tmp_path, capsys):
     assert retrain(tmp_path, run, "--frames", "carla", 8) == 2
     assert "--frames: 'carla'; of surrogate" in capsys.readouterr().err
+    assert retrain(tmp_path, run, "--held-out", run) == 2
+    assert "each once" in capsys.readouterr().err
     policy = run.parent / "policy.safetensors"
     before = policy.read_bytes()
     assert retrain(tmp_path, run, "-o", policy) == 2

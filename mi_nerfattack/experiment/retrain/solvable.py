@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.roadside.footprint import Shape
-from mi_nerfattack.experiment.retrain.among import attacked_objects
+from mi_nerfattack.experiment.retrain.among import attacked_objects, found_place
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.posed import PosedField
@@ -47,13 +46,13 @@ class Driven:
         return ""
 
 
-def drive_expert(found: FoundAttack, place: Place) -> Driven:
+def drive_expert(found: FoundAttack) -> Driven:
     """Let the expert drive a run's scenario; nothing is rendered.
 
-    Args:
-        found: the run.
-        place: of the run, see :func:`among.found_place`.
+    Raises:
+        InputError: see :func:`among.found_place`.
     """
+    place = found_place([found])
     scenario, route, car = found.scenario, found.route, place.car
     vehicle = kinematic_vehicle(place)
     expert = expert_for(
@@ -100,7 +99,7 @@ def _distance(path: np.ndarray, points: np.ndarray) -> float:
 
 
 def divide_solvable(
-    attacks: Sequence[FoundAttack], place: Place
+    attacks: Sequence[FoundAttack],
 ) -> tuple[list[FoundAttack], dict[str, str]]:
     """Divide runs into those that the expert can drive, and others.
 
@@ -109,7 +108,7 @@ def divide_solvable(
     """
     solvable, others = [], {}
     for found in attacks:
-        if trouble := drive_expert(found, place).trouble:
+        if trouble := drive_expert(found).trouble:
             others[found.label] = trouble
         else:
             solvable.append(found)

@@ -1,0 +1,122 @@
+"""Before and after: attacks on a policy driven again with the one retrained on some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mi_nerfattack.experiment.transfer.columns import make_columns
+from mi_nerfattack.experiment.transfer.found import FoundAttack
+from mi_nerfattack.experiment.transfer.run import DRIVES, check_output, run_transfer
+from mi_nerfattack.experiment.transfer.work import TransferWork
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+from mi_nerfattack.scenario.named_file import NamedFile
+from mi_nerfattack.system.workers import AbstractWorkers
+
+OLD, HELD_OUT = "old", "held_out"
+BEFORE, AFTER = "before", "after"
+_CASES = (NO_OBJECT, ATTACK)
+_SEED = 1
+
+#: Called with control periods done and wanted.
+OnSteps = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Drives past attacks and without objects, from starts that no run has seen.
+
+    Args:
+        groups: attacks by `OLD` and `HELD_OUT`.
+        environments: see `transfer.columns.ENVIRONMENTS`.
+        starts: drives of each attack, case and environment.
+        spp: samples per pixel of path-traced images.
+        folder: gets a folder of `mi-nerfattack transfer` for each group and stage.
+    """
+
+    groups: Mapping[str, Sequence[FoundAttack]]
+    environments: tuple[str, ...]
+    starts: int
+    spp: int
+    folder: Path
+
+    def work(self, group: str, stage: str, policy: Path | None = None) -> TransferWork:
+        """Describe the drives of a group; InputError for starts that a run has seen.
+
+        Args:
+            group: of attacks.
+            stage: `BEFORE` or `AFTER`.
+            policy: weights that drive; those that were attacked by default.
+        """
+        attacks = [
+            found if policy is None else with_policy(found, policy)
+            for found in self.groups[group]
+        ]
+        columns = make_columns(self.environments, ("day",), self.spp)
+        drives = self._output(group, stage) / DRIVES
+        return TransferWork(tuple(attacks), columns, _CASES, self.starts, _SEED, drives)
+
+    def drive(
+        self,
+        stage: str,
+        workers: AbstractWorkers,
+        progress: Callable[[str], OnSteps],
+        policy: Path | None = None,
+    ) -> dict[str, dict[str, Any]]:
+        """Do the drives that are not there yet; return `transfer.json` by group."""
+        found = {}
+        for group in self.groups:
+            output = self._output(group, stage)
+            check_output(output)
+            work = self.work(group, stage, policy)
+            show = progress(f"{stage}, {group}")
+            found[group] = run_transfer(work, output, workers, show)
+        return found
+
+    def _output(self, group: str, stage: str) -> Path:
+        return self.folder / f"{group}_{stage}"
+
+
+def with_policy(found: FoundAttack, policy: Path) -> FoundAttack:
+    """Let another PilotNet drive past what was found."""
+    section = found.scenario.policy.model_copy(
+        update={"file": NamedFile(str(policy), policy.resolve())}
+    )
+    scenario = found.scenario.model_copy(update={"policy": section})
+    return replace(found, scenario=scenario, identity=scenario.identity())
+
+
+def table_rows(
+    before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Set both stages side by side.
+
+    Args:
+        before: `transfer.json` by group.
+        after: likewise.
+
+    Returns:
+        a row for each group and environment: figures by stage and case, as of the
+        columns of `transfer.json`; ``attack_to_clean``, by stage, the mean error past
+        attacks as a multiple of that without objects; ``clean_ratio``, the latter
+        after as a multiple of before.
+    """
+    rows = []
+    for group, first in before.items():
+        pairs = zip(first["columns"], after[group]["columns"], strict=True)
+        for old, new in pairs:
+            stages = {BEFORE: old["cases"], AFTER: new["cases"]}
+            means = {
+                stage: [cases[case]["cross_track_mean_m"] for case in _CASES]
+                for stage, cases in stages.items()
+            }
+            row = {"group": group, "environment": old["environment"]}
+            row |= {"attacks": old["attacks"], **stages}
+            row["attack_to_clean"] = {
+                stage: attack / clean for stage, (clean, attack) in means.items()
+            }
+            row["clean_ratio"] = means[AFTER][0] / means[BEFORE][0]
+            rows.append(row)
+    return rows
