@@ -14,6 +14,7 @@ from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
+    from mi_nerfattack.deploy.sites import PlaceSite
     from mi_nerfattack.experiment.transfer.found import FoundAttack
     from mi_nerfattack.training.settings import ImitationSettings
 
@@ -78,7 +79,6 @@ class Retrain:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.deploy.sites import PlaceSite, Weather
         from mi_nerfattack.experiment.retrain.among import AmongFound, attacked_policy
         from mi_nerfattack.experiment.retrain.compare import (
             AFTER,
@@ -108,9 +108,7 @@ class Retrain:
         more = [shard for folder in self.more for shard in find_shards(folder)]
         groups, others = self._groups(attacks)
         settings = self._settings(policy, place)
-        weather = Weather(self.skies, self.exposures_ev, self.spp)
-        sites = [PlaceSite(name, place, weather) for name in settings.sites]
-        old = groups[OLD]
+        sites, old = self._sites(place, settings), groups[OLD]
         routes = list({found.route.name: found.route for found in old}.values())
         names, workers = self.environments, chosen_workers(self.workers, False)
         drives = Comparison(groups, names, self.starts, self.spp, self.data)
@@ -137,6 +135,12 @@ class Retrain:
         from mi_nerfattack.experiment.retrain.among import found_place
 
         return found_place(attacks[: len(self.run_folders)])
+
+    def _sites(self, place: Place, settings: ImitationSettings) -> list[PlaceSite]:
+        from mi_nerfattack.deploy.sites import PlaceSite, Weather
+
+        weather = Weather(self.skies, self.exposures_ev, self.spp)
+        return [PlaceSite(name, place, weather) for name in settings.sites]
 
     def _check_apart(self, policy: Path) -> None:
         if self.output.resolve() == policy.resolve():
