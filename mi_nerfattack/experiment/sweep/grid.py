@@ -17,6 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import Cell
+from mi_nerfattack.experiment.sweep.places import DrawSection, Places
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.ranges import Count, NonNegative, Seed
@@ -47,6 +48,26 @@ class ObjectsChoice(AbstractChoice):
     """Objects, which stand somewhere beside some routes."""
 
     routes: tuple[str, ...] | None = None  # by name; all
+    draw: DrawSection | None = None  # in place of set.objects
+
+    @property
+    def places(self) -> tuple[tuple[str, int | None], ...]:
+        """Names in the table, one for each seed of a draw, with that seed."""
+        if self.draw is None:
+            return ((self.name, None),)
+        return tuple((f"{self.name}.{seed}", seed) for seed in self.draw.seeds)
+
+    @model_validator(mode="after")
+    def _check_draw(self) -> Any:
+        """Refuse objects that are drawn and given, and seeds that stand twice."""
+        if self.draw is None:
+            return self
+        if "objects" in self.set:
+            refuse("draw", "stands beside set.objects; give one of them")
+        seeds = self.draw.seeds
+        if len(set(seeds)) < len(seeds):
+            refuse("draw.seeds", f"{list(seeds)}; give each once")
+        return self
 
 
 class Grid(Section):
@@ -78,14 +99,15 @@ class Grid(Section):
             for name in choice.routes or ():
                 if name not in known:
                     refuse(f"objects.{index}.routes", f"{name!r}; one of {known}")
-            for name in choice.routes or known or [""]:
-                if (name, choice.name) in taken:
+            here = [own for own, _ in choice.places]
+            for place in itertools.product(choice.routes or known or [""], here):
+                if place in taken:
                     refuse(
                         f"objects.{index}.name",
-                        f"{choice.name!r} is there twice at one route; names differ, "
+                        f"{place[1]!r} is there twice at one route; names differ, "
                         "or their routes do",
                     )
-                taken.add((name, choice.name))
+                taken.add(place)
         if self.budgets:
             for index, choice in enumerate(self.methods):
                 for key in _LENGTHS:
@@ -121,29 +143,62 @@ class GridReader:
         portable = portable_text(self.base, self.base_text)
         self.values = parse_toml(self.base_path, portable)
         self._content = functools.cache(NamedFile.content)
+        self._draws = Places()
 
     def cells(self) -> Iterator[Cell]:
-        """Yield the cells, in the order of the table."""
+        """Yield the cells, in the order of the table.
+
+        Raises:
+            InputError: a key of a cell is wrong, or objects that are to be drawn find
+                no place.
+        """
+        grid = self.grid
+        methods = grid.methods or (Choice(name=self.base.attack.method.method),)
+        budgets = grid.budgets or (None,)
+        for route, objects, layers in self._places_of():
+            for (k, method), budget, seed in itertools.product(
+                enumerate(methods), budgets, grid.seeds
+            ):
+                made = self._scenario(
+                    layers | {("methods", k, "set"): method.set}, budget, seed
+                )
+                labels = route, objects, method.name, budget, seed
+                yield Cell(*labels, *made, grid.anyway, grid.pictures)
+
+    def _places_of(self) -> Iterator[tuple[str, str, dict[Location, Any]]]:
+        """Yield routes, objects beside them, and what these set."""
         grid, base = self.grid, self.base
         ids = "+".join(item.id for item in base.objects)
         routes = grid.routes or (Choice(name=_label(base.scene.route)),)
         objects = grid.objects or (ObjectsChoice(name=_label(ids)),)
-        methods = grid.methods or (Choice(name=base.attack.method.method),)
-        for (i, route), (j, these), (k, method) in itertools.product(
-            enumerate(routes), enumerate(objects), enumerate(methods)
+        for (i, route), (j, these) in itertools.product(
+            enumerate(routes), enumerate(objects)
         ):
             if these.routes is not None and route.name not in these.routes:
                 continue
-            layers: dict[Location, Any] = {
-                ("routes", i, "set"): route.set,
-                ("objects", j, "set"): these.set,
-                ("methods", k, "set"): method.set,
-            }
-            names = route.name, these.name, method.name
-            budgets = grid.budgets or (None,)
-            for budget, seed in itertools.product(budgets, grid.seeds):
-                made = self._scenario(layers, budget, seed)
-                yield Cell(*names, budget, seed, *made, grid.anyway, grid.pictures)
+            where = "objects", j, "set"
+            layers: dict[Location, Any] = {("routes", i, "set"): route.set}
+            layers[where] = these.set
+            for name, seed in these.places:
+                if seed is not None:
+                    drawn = self._drawn(layers, j, seed)
+                    layers[where] = these.set | {"objects": drawn}
+                yield route.name, name, layers
+
+    def _drawn(
+        self, layers: Mapping[Location, Any], index: int, seed: int
+    ) -> list[dict[str, Any]]:
+        """Draw the objects of a choice beside a route."""
+        section = self.grid.objects[index].draw
+        assert section is not None
+        values = functools.reduce(_merged, layers.values(), self.values)
+        scenario = self._read(values, layers)
+        try:
+            return self._draws.draw(section, seed, scenario)
+        except InputError as err:
+            raise InputError(
+                f"{self.path}: objects.{index}.draw, seed {seed}: {err}"
+            ) from err
 
     def _scenario(
         self, layers: Mapping[Location, Any], budget: int | None, seed: int

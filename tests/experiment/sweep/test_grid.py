@@ -10,6 +10,7 @@ import pytest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import grid as module
 from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -52,6 +53,62 @@ def test_the_example_of_the_guide(tmp_path):
     # 60 and 80 periods an iteration, 2.9 times
     lengths = [c.scenario.attack.method.iterations(1) for c in cells[::5]]
     assert lengths == [34, 6000, 25, 6000]
+
+
+DRAWN = """\
+scenario = "bundled:demo.toml"
+routes = [{name = "right"}, {name = "left", set.scene.route = "left"}]
+
+[[objects]]
+name = "two"
+draw.fields = ["bundled:hydrant/field.safetensors", "bundled:cube/field.safetensors"]
+draw.scales = [[1.0, 2.0], [0.5, 0.5]]
+draw.seeds = [1, 2]
+"""
+
+
+def test_objects_are_drawn_by_the_rule(tmp_path):
+    path = tmp_path / "grid.toml"
+    path.write_text(DRAWN)
+    cells = load_cells(path)
+    assert [(c.route, c.objects) for c in cells] == [
+        (route, name) for route in ("right", "left") for name in ("two.1", "two.2")
+    ]
+    assert load_cells(path) == cells
+    places = set()
+    for cell in cells:
+        hydrant, cube = cell.scenario.objects
+        assert 1 <= hydrant.scale <= 2 and cube.scale == 0.5
+        assert str(cube.field) == "bundled:cube/field.safetensors"
+        lane = Route.from_file(cell.scenario.scene.routes.file, cell.route)
+        for item in (hydrant, cube):
+            x, y, z = item.position_m
+            assert abs(lane.cross_track_numpy([[x, y, 0.0]])[0]) > lane.lane_width_m / 2
+            assert z == pytest.approx(0.12, abs=1e-3)  # the pavement's height
+            places.add(item.position_m)
+    assert len(places) == 8
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[1, 2]", "[1, 1]", r"grid.toml:\d+: objects.0.draw.seeds: .*give each once"),
+        (
+            "[0.5, 0.5]",
+            "[60, 60]",
+            r"grid.toml: objects.0.draw, seed 1: .*places for 1",
+        ),
+        ("[0.5, 0.5]", "[2, 1]", r"objects.0.draw, seed 1: Roadside: 2.0 to 1.0"),
+        ("draw.seeds", "set.objects = []\ndraw.seeds", r"draw: stands beside set.obj"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told(tmp_path, old, new, message):
+    path = tmp_path / "grid.toml"
+    assert old in DRAWN
+    path.write_text(DRAWN.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        load_cells(path)
+    assert re.search(message, str(error.value)), error.value
 
 
 def test_another_content_of_a_file_is_another_cell(write_grid, scenario_folder):
