@@ -37,7 +37,14 @@ def test_a_reader_written_from_the_page_sees_the_same_field(name, rng, tmp_path)
     there = reader.cells[tuple((unit * reader.cells.shape).astype(int).T)]
     expected = np.where(there, reader.density(points.astype(float)), 0)
     limit = 1e-6 * expected.max()  # where it is about to vanish
-    np.testing.assert_allclose(density, expected, rtol=2e-3, atol=limit)
+    rounding = 8 * np.spacing(np.abs(points)).astype(float)  # of places in the box
+    near = points + rounding * np.vstack([np.eye(3), -np.eye(3)])[:, None]
+    around = [np.where(there, reader.density(place), 0) for place in near]
+    spread = np.abs(np.array(around) - expected).max(0)
+    seen = expected > 100 * limit
+    assert np.median(spread[seen] / expected[seen]) < 1e-3
+    limit = limit + spread
+    assert (np.abs(np.array(density) - expected) <= limit + 2e-3 * expected).all()
     expected = reader.radiance(points.astype(float), directions.astype(float))
     if name != "intersection":  # where nothing can be there is no colour
         radiance, expected = np.array(radiance)[:, there], expected[there]

@@ -65,7 +65,7 @@ def found(tmp_path_factory) -> tuple[FoundAttack, ...]:
 def read(path: Path, run: Path, offset: np.ndarray, number: int) -> FoundAttack:
     scenario, _ = load_scenario(path)
     route = driven_route(scenario, scenario.vehicle.motion())
-    rest = offset[None], None, scenario.identity(), f"digest {number}"
+    rest = offset[None], None, scenario.identity(), f"digest {number}", {}
     return FoundAttack(run, run.name, scenario, route, *rest)
 
 
