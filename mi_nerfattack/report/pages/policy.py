@@ -173,5 +173,7 @@ def _flat(name: str, value: Any) -> list[list[str]]:
         return [row for key in value for row in _flat(f"{name}: {key}", value[key])]
     if value is None:
         return [[name, NOT_RECORDED]]
-    text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-    return [[name, text]]
+    if not isinstance(value, list | tuple):
+        return [[name, str(value)]]
+    texts = (str(list(v) if isinstance(v, tuple) else v) for v in value)
+    return [[name, ", ".join(texts)]]

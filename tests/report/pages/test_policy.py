@@ -19,6 +19,14 @@ def test_the_bundled_page_is_that_of_its_card():
     assert record is not None and training_facts(record) == CARD["training"]
 
 
+def test_the_page_is_the_same_before_and_after_its_card_is_written():
+    settings = CARD["settings"]
+    scales = tuple(map(tuple, settings["roadside"]["scales"]))
+    unwritten = {**settings, "roadside": {**settings["roadside"], "scales": scales}}
+    card = {**CARD, "settings": unwritten}
+    assert page_text("pilotnet", card) == page_text("pilotnet", CARD)
+
+
 def test_names_neither_end_a_cell_nor_begin_an_element():
     card = copy.deepcopy(CARD)
     card["environments"]["a|b\n<script>"] = card["environments"].pop("mujoco")
