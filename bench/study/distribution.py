@@ -21,7 +21,7 @@ import rich.table
 from bench.study import jobs, rows
 from bench.study.places import NATURAL_M, ROUTES, Place
 from bench.study.tables import markdown, mean_m
-from mi_nerfattack.experiment.transfer.figures import SUCCESS_S
+from mi_nerfattack.evaluation.pairs import DEPARTED_S
 from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -87,7 +87,7 @@ def table(found: Sequence[rows.Row]) -> rich.table.Table:
             for row in found
             if row["height_m"] == height
         ]
-        count = sum(seconds >= SUCCESS_S for seconds in out)
+        count = sum(seconds >= DEPARTED_S for seconds in out)
         parts.append(f"{height:.2f} m, {name}: {count} of {len(out)}")
     table.caption = f"places where the attack succeeds: {'; '.join(parts)}"
     return table

@@ -60,13 +60,12 @@ class Place:
             seed: of the attack.
         """
         pose = self.pose(height_m)
-        yaw = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
         path = folder / "scenario.toml"
         position = [round(float(v), 4) for v in pose.translation]
         head = _HEAD.format(
             route=self.route,
             position=position,
-            yaw=yaw,
+            yaw=np.degrees(pose.yaw),
             scale=pose.scale,
             seed=seed,
         )

@@ -16,6 +16,7 @@ from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.pictures.write import write_images
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
+from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.stages import OnProgress
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
@@ -79,12 +80,13 @@ def _write_tables(output: Path, done: Finished, history: list[dict[str, Any]]) -
     write_steps(output / "steps.csv", done.driven, {world.route.name: done.lane})
     files.write_json(output / "attack.json", history)
     write_control_changes(output, done.replayed)
-    files.make_folder(output / "objects")
     for grid, item, texture in zip(
         world.fields, world.scenario.objects, texture_of, strict=True
     ):
         grid.set_parameter("texture", texture)
-        save_field(output / "objects" / f"{item.id}.safetensors", grid)
+        path = object_path(output, item.id)
+        files.make_folder(path.parent)
+        save_field(path, grid)
 
 
 def _describe(done: Finished, effort: Callable[[], Effort]) -> dict[str, Any]:

@@ -17,6 +17,11 @@ DRIVES = "drives"
 SCENARIO = "scenario.toml"
 
 
+def object_path(folder: Path, name: str) -> Path:
+    """Return the file of an attacked object, by its id, in a run folder."""
+    return folder / "objects" / f"{name}.safetensors"
+
+
 class RunFolder:
     """A folder that this process has claimed, see :func:`claim.claimed`.
 

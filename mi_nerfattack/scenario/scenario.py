@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -139,6 +139,16 @@ class DriveSection(Section):
         rest = route.length if route.closed else route.length - self.start_m
         length = rest if self.length_m is None else self.length_m
         return max(1, int(length / (route.speed_ms * period) + 1e-6))
+
+    def stretch(self, route: Route, period: float) -> tuple[float, float]:
+        """Return the arc lengths, metres, from which and to which is driven.
+
+        Args:
+            route: as of :meth:`steps`; unless it is closed, nothing lies beyond it.
+            period: seconds between two controls.
+        """
+        end = self.start_m + self.steps(route, period) * route.speed_ms * period
+        return self.start_m, end if route.closed else min(end, route.length)
 
     @model_validator(mode="after")
     def _check_end(self) -> Any:
@@ -306,6 +316,17 @@ class Scenario(Section):
         own = hashlib.sha256(text.encode()).hexdigest()[:16]
         found = {key[len("scenario.") :]: v["sha256"] for key, v in named.items()}
         return {"scenario": own, **found}
+
+
+def is_within(key: str, names: Sequence[str]) -> bool:
+    """Whether a key of :meth:`Scenario.identity` is of these parts of a scenario.
+
+    Args:
+        key: such as ``scenario.scene.field``.
+        names: of the parts, such as ``scene`` or ``scene.field``.
+    """
+    parts = [f"scenario.{name}" for name in names]
+    return any(key == p or key.startswith((f"{p}.", f"{p}[")) for p in parts)
 
 
 def load_scenario(

@@ -21,6 +21,7 @@ from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.fields.splats import read_splats
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
+from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.pathtrace.load import load_scene
@@ -172,17 +173,7 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     motion = scenario.vehicle.motion()
     route = driven_route(scenario, motion)
     objective = scenario.objective.build(scenario, route, motion.dynamics)
-    where = Place(
-        scene=place.deployment.file,
-        field=None,
-        routes=place.routes.file,
-        objects=(),
-        camera=surrogate.camera,
-        mount=surrogate.mount,
-        period=scenario.vehicle.dt_s,
-        car=scenario.vehicle.car(),
-        motion=motion,
-    )
+    where = place_of(scenario, surrogate.camera, motion)
     return World(
         scenario,
         route,
@@ -195,6 +186,28 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
         motion,
         objective,
         initial_states(scenario, route, scenario.drive.runs, 0),
+    )
+
+
+def place_of(scenario: Scenario, camera: Camera, motion: Motion) -> Place:
+    """Describe where a scenario is driven, without the scene's field.
+
+    Args:
+        scenario: names the files.
+        camera: of the vehicle; a Mitsuba scene of the surrogate may bring its own.
+        motion: of the vehicle.
+    """
+    _, mount = scenario.camera.build()
+    return Place(
+        scene=scenario.scene.deployment.file,
+        field=None,
+        routes=scenario.scene.routes.file,
+        objects=(),
+        camera=camera,
+        mount=mount,
+        period=scenario.vehicle.dt_s,
+        car=scenario.vehicle.car(),
+        motion=motion,
     )
 
 

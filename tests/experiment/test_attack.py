@@ -35,6 +35,38 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert "attack" in told and str(output) in told
     document = json.loads((output / "metrics.json").read_text())
     validate(document)
+    assert_counts(document)
+    [(name, texture)] = document["textures"].items()
+    assert name == "ball" and 0 < texture["l2"] <= texture["linf"] <= 1
+    assert document["total_variation"] == texture["total_variation"] > 0
+    page = (output / "report.html").read_text()
+    assert any(flag.startswith("not converged: ") for flag in document["flags"])
+    sentences = [*document["flags"], *document["verdict"]]
+    for sentence in sentences:
+        assert sentence in told
+        assert sentence in page
+    assert sorted(sentences, key=told.index) == sentences  # flags first
+    shown = [
+        read_layers(path)[0]["object"][..., 3].mean()
+        for path in sorted(output.glob("frames/surrogate_own/*.exr"))
+    ]
+    assert texture["picture_share"] == pytest.approx(np.mean(shown), rel=0.2)
+    assert_files(output, document["baseline"])
+    attacked = load_grid(output / "objects" / "ball.safetensors")
+    original = load_grid(scenario_folder / "object.safetensors")
+    change = attacked.texture.numpy() - original.texture.numpy()
+    assert np.abs(change).max() > 0.1
+    density = attacked.parameters()["density"].numpy()
+    assert np.array_equal(density, original.parameters()["density"].numpy())
+    # a second run into the same folder is refused and changes nothing
+    before = (output / "metrics.json").read_bytes()
+    assert cli.main(words) == 2
+    assert "not an empty folder" in capsys.readouterr().err
+    assert (output / "metrics.json").read_bytes() == before
+
+
+def assert_counts(document):
+    """Check drives, random looks and rendered frames against each other."""
     route = document["routes"]["line"]
     baseline, cost = document["baseline"], document["cost"]
     count, few = baseline["textures"], baseline["deployment_textures"]
@@ -54,29 +86,13 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert curve["objective"][-1] == baseline["attack_objective"]
     assert curve["objective"] == sorted(curve["objective"], reverse=True)
     assert document["converged"] is False  # in 3 iterations
-    [(name, texture)] = document["textures"].items()
-    assert name == "ball" and 0 < texture["l2"] <= texture["linf"] <= 1
-    assert document["total_variation"] == texture["total_variation"] > 0
-    page = (output / "report.html").read_text()
-    assert any(flag.startswith("not converged: ") for flag in document["flags"])
-    sentences = [*document["flags"], *document["verdict"]]
-    for sentence in sentences:
-        assert sentence in told
-        assert sentence in page
-    assert sorted(sentences, key=told.index) == sentences  # flags first
+
+
+def assert_files(output, baseline):
+    """Check the table of steps, frames, plots and page."""
     rows = (output / "steps.csv").read_text().splitlines()
-    assert len(rows) == 1 + 4 * (16 + count + few)
-    shown = [
-        read_layers(path)[0]["object"][..., 3].mean()
-        for path in sorted(output.glob("frames/surrogate_own/*.exr"))
-    ]
-    assert texture["picture_share"] == pytest.approx(np.mean(shown), rel=0.2)
-    attacked = load_grid(output / "objects" / "ball.safetensors")
-    original = load_grid(scenario_folder / "object.safetensors")
-    change = attacked.texture.numpy() - original.texture.numpy()
-    assert np.abs(change).max() > 0.1
-    density = attacked.parameters()["density"].numpy()
-    assert np.array_equal(density, original.parameters()["density"].numpy())
+    drawn = baseline["textures"] + baseline["deployment_textures"]
+    assert len(rows) == 1 + 4 * (16 + drawn)
     for environment in ("surrogate", "deployment"):
         layers, metadata = read_layers(
             output / "frames" / f"{environment}_attack" / "0000.exr"
@@ -89,11 +105,6 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     for name in (*plots, "attribution", "attribution_object"):
         assert (output / f"{name}.png").stat().st_size > 5000
     assert "<title>kill</title>" in (output / "report.html").read_text()
-    # a second run into the same folder is refused and changes nothing
-    before = (output / "metrics.json").read_bytes()
-    assert cli.main(words) == 2
-    assert "not an empty folder" in capsys.readouterr().err
-    assert (output / "metrics.json").read_bytes() == before
 
 
 @pytest.mark.slow

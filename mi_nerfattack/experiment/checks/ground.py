@@ -29,11 +29,8 @@ _FEWEST = 100  # pixels, of which something is said
 
 def driven_points(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Return arc lengths (n,) and points (n, 2), metres, of the driven lane centre."""
-    route, period = world.route, world.scenario.vehicle.dt_s
-    start = world.scenario.drive.start_m
-    end = start + world.horizon * period * route.speed_ms
-    if not route.closed:
-        end = min(end, route.length)
+    route, scenario = world.route, world.scenario
+    start, end = scenario.drive.stretch(route, scenario.vehicle.dt_s)
     arc = np.linspace(start, end, max(2, int((end - start) / _EVERY_M) + 1))
     return arc, route.pose_at(arc)[:, :2]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,15 @@ from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.identity import policy_content, short_digest
+from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.offset import offset_pose
 from mi_nerfattack.scenario.policy import PilotNetSection
+from mi_nerfattack.scenario.scenario import is_within
+from mi_nerfattack.scenario.world import place_of
 from mi_nerfattack.training.settings import CollectSettings
 from mi_nerfattack.training.staging import AbstractStage, AbstractStaging, Stretch
 from mi_nerfattack.vehicle.route.route import Route
@@ -89,7 +92,7 @@ def attacked_objects(found: FoundAttack) -> list[PosedField]:
     """
     result = []
     for item, offset in zip(found.scenario.objects, found.offsets, strict=True):
-        field = load_grid(found.folder / "objects" / f"{item.id}.safetensors")
+        field = load_grid(object_path(found.folder, item.id))
         field.refine(item.step_m or field.step_m)
         result.append(PosedField(field, item.pose))
         result[-1].move(*offset_pose(item.pose, offset))
@@ -103,16 +106,14 @@ def passed_stretch(found: FoundAttack, objects: Sequence[PosedField]) -> Stretch
         found: whose drive it is.
         objects: its own.
     """
-    route, start = found.route, found.scenario.drive.start_m
-    driven = found.horizon * route.speed_ms * found.scenario.vehicle.dt_s
-    if not route.closed:
-        driven = min(driven, route.length - start)
+    route, scenario = found.route, found.scenario
+    start, end = scenario.drive.stretch(route, scenario.vehicle.dt_s)
     poses = [[*posed.placed.translation[:2], 0.0] for posed in objects]
     ahead = route.project_numpy(np.array(poses))[0] - start
     if route.closed:
         ahead = ahead % route.length
     farthest = float(ahead.max())
-    return start, start + (min(farthest, driven) if farthest > 0 else driven)
+    return start, min(start + farthest, end) if farthest > 0 else end
 
 
 def found_place(attacks: Sequence[FoundAttack]) -> Place:
@@ -134,29 +135,16 @@ def found_place(attacks: Sequence[FoundAttack]) -> Place:
         remedy = f"it is compared with {first.folder}; retrain in one place at a time"
         refuse(found.folder, differences(here, there), remedy)
     scenario = first.scenario
-    scene, (camera, mount) = scenario.scene, scenario.camera.build()
+    scene, (camera, _) = scenario.scene, scenario.camera.build()
     assert scene.field is not None  # checked by SceneSection
     plain = scene.to_world is None and scene.field.file.suffix.lower() != ".ply"
-    return Place(
-        scene=scene.deployment.file,
-        field=scene.field.file if plain else None,
-        routes=scene.routes.file,
-        objects=(),
-        camera=camera,
-        mount=mount,
-        period=scenario.vehicle.dt_s,
-        car=scenario.vehicle.car(),
-        motion=scenario.vehicle.motion(),
-    )
+    place = place_of(scenario, camera, scenario.vehicle.motion())
+    return replace(place, field=scene.field.file) if plain else place
 
 
 def _shared(found: FoundAttack) -> dict[str, str]:
-    starts = tuple(f"scenario.{name}" for name in _SHARED)
-    return {
-        key: value
-        for key, value in found.identity.items()
-        if any(key == s or key.startswith((f"{s}.", f"{s}[")) for s in starts)
-    }
+    identity = found.identity.items()
+    return {key: value for key, value in identity if is_within(key, _SHARED)}
 
 
 def attacked_policy(attacks: Sequence[FoundAttack]) -> Path:

@@ -64,9 +64,7 @@ class ObjectsChoice(AbstractChoice):
             return self
         if "objects" in self.set:
             refuse("draw", "stands beside set.objects; give one of them")
-        seeds = self.draw.seeds
-        if len(set(seeds)) < len(seeds):
-            refuse("draw.seeds", f"{list(seeds)}; give each once")
+        _check_distinct("draw.seeds", self.draw.seeds)
         return self
 
 
@@ -87,13 +85,9 @@ class Grid(Section):
     def _check_names(self) -> Any:
         """Refuse what stands twice, and routes that there are none of."""
         for key in ("budgets", "seeds"):
-            values = getattr(self, key)
-            if len(set(values)) < len(values):
-                refuse(key, f"{list(values)}; give each once")
+            _check_distinct(key, getattr(self, key))
         for axis in ("routes", "methods"):
-            names = [choice.name for choice in getattr(self, axis)]
-            if len(set(names)) < len(names):
-                refuse(axis, f"names {names}; must differ")
+            _check_distinct(axis, [choice.name for choice in getattr(self, axis)])
         known, taken = [route.name for route in self.routes], set()
         for index, choice in enumerate(self.objects):
             for name in choice.routes or ():
@@ -278,6 +272,12 @@ def load_cells(path: Path) -> list[Cell]:
     if not cells:
         raise InputError(f"{path}: no cell; no objects stand at any of the routes")
     return cells
+
+
+def _check_distinct(key: str, values: Sequence[Any]) -> None:
+    """Refuse values, or names, that stand twice."""
+    if len(set(values)) < len(values):
+        refuse(key, f"{list(values)}; give each once")
 
 
 def _label(text: str) -> str:

@@ -67,9 +67,6 @@ class Places:
         """
         vehicle, scene = scenario.vehicle, scenario.scene
         route = driven_route(scenario, vehicle.motion())
-        begin = scenario.drive.start_m
-        steps = scenario.drive.steps(route, vehicle.dt_s)
-        end = begin + steps * route.speed_ms * vehicle.dt_s
         around = self._surroundings(
             scene.deployment.file,
             scene.routes.file,
@@ -80,7 +77,7 @@ class Places:
             [self._field(item.file) for item in section.fields],
             around,
             route,
-            (begin, end if route.closed else min(end, route.length)),
+            scenario.drive.stretch(route, vehicle.dt_s),
             np.random.default_rng([seed, *route.name.encode()]),
         )
         return [
@@ -88,17 +85,13 @@ class Places:
                 "id": f"object{number}",
                 "field": item.portable,
                 "position_m": [round(float(x), 4) for x in pose.translation],
-                "yaw_deg": round(float(np.degrees(_yaw(pose.rotation))), 4),
+                "yaw_deg": round(float(np.degrees(pose.yaw)), 4),
                 "scale": round(float(pose.scale), 6),
             }
             for number, (item, pose) in enumerate(
                 zip(section.fields, poses, strict=True), start=1
             )
         ]
-
-
-def _yaw(rotation: np.ndarray) -> float:
-    return np.arctan2(rotation[1, 0], rotation[0, 0])
 
 
 def _surroundings(

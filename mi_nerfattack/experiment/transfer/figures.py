@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
 from mi_nerfattack.evaluation.metrics import summarise
+from mi_nerfattack.evaluation.pairs import DEPARTED_S
 from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
@@ -17,8 +18,6 @@ from mi_nerfattack.rollout.drive import ATTACK, Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
 
 SCHEMA = 1
-#: An attack succeeds where a wheel is out so long, in the mean over its drives.
-SUCCESS_S = 1.0
 
 #: Figures of a case by the digest of its batch.
 Figures = Mapping[str, dict[str, Any]]
@@ -67,7 +66,7 @@ def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
         "seed": work.seed,
         "starts": work.starts,
         "cases": list(work.cases),
-        "success_s": SUCCESS_S,
+        "success_s": DEPARTED_S,
         "conditions": {
             column.condition.label: asdict(column.condition)
             for column in sorted(work.columns, key=lambda c: c.environment == SURROGATE)
@@ -185,4 +184,4 @@ def _transfer(rows: Sequence[Row]) -> dict[str, Any] | None:
 
 
 def _is_out(case: dict[str, Any]) -> bool:
-    return case["wheel_out_s"] >= SUCCESS_S
+    return case["wheel_out_s"] >= DEPARTED_S

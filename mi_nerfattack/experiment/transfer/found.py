@@ -18,7 +18,7 @@ from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.baseline import random_appearance
-from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO
+from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO, object_path
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import differences, refuse
@@ -110,7 +110,7 @@ class FoundAttack:
         own = world.appearance()
         attacked = []
         for item, texture in zip(self.scenario.objects, own.textures, strict=True):
-            path = _field_path(self.folder, item.id)
+            path = object_path(self.folder, item.id)
             attacked.append(load_grid(path).texture.numpy())
             if attacked[-1].shape != texture.shape:
                 raise InputError(
@@ -161,7 +161,7 @@ def _read(folder: Path, label: str) -> FoundAttack:
         pose = (document.get("object_poses") or {}).get(item.id)
         if pose is not None:
             offsets[number] = [*pose["shift_m"], *pose["rotation_vector"]]
-    sums = [files.sha256(_field_path(folder, item.id)) for item in scenario.objects]
+    sums = [files.sha256(object_path(folder, item.id)) for item in scenario.objects]
     about = json.dumps([sums, offsets.tolist()])
     return FoundAttack(
         folder,
@@ -183,10 +183,6 @@ def _check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:
     _, metadata = files.read_safetensors(checkpoint, ())
     kept = {key: value for key, value in metadata.items() if key in identity}
     refuse(checkpoint, differences(kept, identity), _REMEDY)
-
-
-def _field_path(folder: Path, name: str) -> Path:
-    return folder / "objects" / f"{name}.safetensors"
 
 
 def _surrogate(scene: SceneSection, identity: Mapping[str, str]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from mi_nerfattack.rollout.drive import (
     Drive,
 )
 from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import Appearance, World, build_world
 from mi_nerfattack.system.workers import AbstractWork, OnUnits
 
@@ -269,9 +270,5 @@ def _decisive(found: FoundAttack, column: Column, case: str) -> dict[str, str]:
         scenario = found.scenario
         look = scenario.seed, scenario.baseline.kind, found.best_random
         named["look"] = json.dumps(look)
-    starts = tuple(f"scenario.{name}" for name in inert)
-    return named | {
-        key: value
-        for key, value in found.identity.items()
-        if not any(key == s or key.startswith((f"{s}.", f"{s}[")) for s in starts)
-    }
+    identity = found.identity.items()
+    return named | {k: value for k, value in identity if not is_within(k, inert)}

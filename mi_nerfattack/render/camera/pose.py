@@ -66,6 +66,11 @@ class Pose:
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Pose(rotation, np.asarray(position, float), scale)
 
+    @property
+    def yaw(self) -> float:
+        """Angle about the world's z axis from its x axis to the field's, radians."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
 
 def check_rigid(matrix: np.ndarray, where: str) -> None:
     """Check that a (4, 4) matrix is a rotation and a translation.

@@ -23,7 +23,6 @@ from mi_nerfattack.experiment.transfer.columns import (
     Column,
     Condition,
     make_columns,
-    parse_condition,
 )
 from mi_nerfattack.experiment.transfer.figures import make_document
 from mi_nerfattack.experiment.transfer.found import read_found
@@ -255,14 +254,8 @@ def test_ratios_and_rates_count_attacks(found_run, tmp_path):
     columns = make_columns(("surrogate", "mitsuba"), ("day",), 1)
     attacks = read_found([found_run, *others])
     work = TransferWork(attacks, columns, ("attack",), 2, 1, tmp_path / "drives")
-    surrogate, deployed = (
-        [(2.0, 0.4), (1.0, 0.8), (0.9, 0.1)],
-        [
-            (1.0, 0.2),
-            (0.5, 0.2),
-            (3.0, 0.1),
-        ],
-    )
+    surrogate = [(2.0, 0.4), (1.0, 0.8), (0.9, 0.1)]
+    deployed = [(1.0, 0.2), (0.5, 0.2), (3.0, 0.1)]
     figures = {}
     for (number, column), row in work.rows.items():
         made = surrogate if column.environment == "surrogate" else deployed
@@ -391,18 +384,3 @@ def test_a_light_that_no_sun_makes_is_told_before_the_first_drive(
     with pytest.raises(InputError, match="sunsky"):
         transfer_run.run_transfer(work, tmp_path, InThisProcess())
     assert not list(tmp_path.rglob("*.safetensors"))
-
-
-@pytest.mark.parametrize(
-    "label",
-    [
-        "day",
-        "evening,exposure:+0.5,noise:0.03",
-        "exposure:-1",
-        "blur:1,dropped:0.2,late:1,latency:2,placement:0.1,turn:5,pitch:1",
-    ],
-)
-def test_labels_read_back(label):
-    condition = parse_condition(label)
-    assert condition.label == label
-    assert parse_condition(condition.label) == condition
