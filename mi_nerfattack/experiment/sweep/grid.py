@@ -52,8 +52,8 @@ class ObjectsChoice(AbstractChoice):
 
     @property
     def places(self) -> tuple[tuple[str, int | None], ...]:
-        """Names in the table, one for each seed of a draw, with that seed."""
-        if self.draw is None:
+        """Names in the table, one for each seed that a draw names, with that seed."""
+        if self.draw is None or self.draw.seeds is None:
             return ((self.name, None),)
         return tuple((f"{self.name}.{seed}", seed) for seed in self.draw.seeds)
 
@@ -64,7 +64,7 @@ class ObjectsChoice(AbstractChoice):
             return self
         if "objects" in self.set:
             refuse("draw", "stands beside set.objects; give one of them")
-        _check_distinct("draw.seeds", self.draw.seeds)
+        _check_distinct("draw.seeds", self.draw.seeds or ())
         return self
 
 
@@ -138,6 +138,7 @@ class GridReader:
         self.values = parse_toml(self.base_path, portable)
         self._content = functools.cache(NamedFile.content)
         self._draws = Places()
+        self._drawn = functools.cache(self._draw)
 
     def cells(self) -> Iterator[Cell]:
         """Yield the cells, in the order of the table.
@@ -149,41 +150,47 @@ class GridReader:
         grid = self.grid
         methods = grid.methods or (Choice(name=self.base.attack.method.method),)
         budgets = grid.budgets or (None,)
-        for route, objects, layers in self._places_of():
-            for (k, method), budget, seed in itertools.product(
-                enumerate(methods), budgets, grid.seeds
+        for i, j in self._places_of():
+            route, these = self._routes[i], self._objects[j]
+            for (name, place), (k, method), budget, seed in itertools.product(
+                these.places, enumerate(methods), budgets, grid.seeds
             ):
-                made = self._scenario(
-                    layers | {("methods", k, "set"): method.set}, budget, seed
-                )
-                labels = route, objects, method.name, budget, seed
+                layers = self._layers(i, j)
+                if these.draw is not None:
+                    drawn = self._drawn(i, j, seed if place is None else place)
+                    layers["objects", j, "set"] = these.set | {"objects": drawn}
+                layers["methods", k, "set"] = method.set
+                labels = route.name, name, method.name, budget, seed
+                made = self._scenario(layers, budget, seed)
                 yield Cell(*labels, *made, grid.anyway, grid.pictures)
 
-    def _places_of(self) -> Iterator[tuple[str, str, dict[Location, Any]]]:
-        """Yield routes, objects beside them, and what these set."""
-        grid, base = self.grid, self.base
-        ids = "+".join(item.id for item in base.objects)
-        routes = grid.routes or (Choice(name=_label(base.scene.route)),)
-        objects = grid.objects or (ObjectsChoice(name=_label(ids)),)
-        for (i, route), (j, these) in itertools.product(
-            enumerate(routes), enumerate(objects)
-        ):
-            if these.routes is not None and route.name not in these.routes:
-                continue
-            where = "objects", j, "set"
-            layers: dict[Location, Any] = {("routes", i, "set"): route.set}
-            layers[where] = these.set
-            for name, seed in these.places:
-                if seed is not None:
-                    drawn = self._drawn(layers, j, seed)
-                    layers[where] = these.set | {"objects": drawn}
-                yield route.name, name, layers
+    @functools.cached_property
+    def _routes(self) -> tuple[Choice, ...]:
+        return self.grid.routes or (Choice(name=_label(self.base.scene.route)),)
 
-    def _drawn(
-        self, layers: Mapping[Location, Any], index: int, seed: int
-    ) -> list[dict[str, Any]]:
+    @functools.cached_property
+    def _objects(self) -> tuple[ObjectsChoice, ...]:
+        ids = "+".join(item.id for item in self.base.objects)
+        return self.grid.objects or (ObjectsChoice(name=_label(ids)),)
+
+    def _places_of(self) -> Iterator[tuple[int, int]]:
+        """Yield the indices of routes, and of objects beside them."""
+        for (i, route), (j, these) in itertools.product(
+            enumerate(self._routes), enumerate(self._objects)
+        ):
+            if these.routes is None or route.name in these.routes:
+                yield i, j
+
+    def _layers(self, route: int, objects: int) -> dict[Location, Any]:
+        """Return what a route and the objects beside it set."""
+        return {
+            ("routes", route, "set"): self._routes[route].set,
+            ("objects", objects, "set"): self._objects[objects].set,
+        }
+
+    def _draw(self, route: int, objects: int, seed: int) -> list[dict[str, Any]]:
         """Draw the objects of a choice beside a route."""
-        section = self.grid.objects[index].draw
+        section, layers = self._objects[objects].draw, self._layers(route, objects)
         assert section is not None
         values = functools.reduce(_merged, layers.values(), self.values)
         scenario = self._read(values, layers)
@@ -191,7 +198,7 @@ class GridReader:
             return self._draws.draw(section, seed, scenario)
         except InputError as err:
             raise InputError(
-                f"{self.path}: objects.{index}.draw, seed {seed}: {err}"
+                f"{self.path}: objects.{objects}.draw, seed {seed}: {err}"
             ) from err
 
     def _scenario(

@@ -28,7 +28,7 @@ class DrawSection(Section):
     """Objects where such things stand, see `Roadside`, anew by each seed."""
 
     fields: Annotated[tuple[File, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] | None = None  # the cell's
     scales: tuple[tuple[Positive, Positive], ...] = _RULE.scales
     gap_m: tuple[NonNegative, NonNegative] = _RULE.gap_m
     clearance_m: NonNegative = _RULE.clearance_m

@@ -89,6 +89,18 @@ def test_objects_are_drawn_by_the_rule(tmp_path):
     assert len(places) == 8
 
 
+def test_places_without_seeds_are_of_the_cells_seed(tmp_path):
+    path = tmp_path / "grid.toml"
+    path.write_text("seeds = [1, 2]\n" + DRAWN)
+    given = {(c.route, c.objects, c.seed): c.scenario for c in load_cells(path)}
+    path.write_text("seeds = [2, 1]\n" + DRAWN.replace("draw.seeds = [1, 2]", ""))
+    own = load_cells(path)
+    assert [(c.objects, c.seed) for c in own] == [("two", 2), ("two", 1)] * 2
+    for cell in own:
+        same = given[cell.route, f"two.{cell.seed}", cell.seed]
+        assert cell.scenario.objects == same.objects
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
