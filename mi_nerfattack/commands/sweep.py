@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 class Sweep:
     """Attack in every cell of a grid: routes, objects, methods, budgets and seeds.
 
-    Writes a run folder a cell and one table of all drives, results.parquet. Stopped, or
-    killed, the same command continues; complete cells are never done again, failed
-    ones are. Ends with 0, or with 1 if cells failed (with --check, if some would be
-    refused).
+    Writes a run folder a cell, one table of all drives, results.parquet, and what they
+    came to, summary.json, whose flags are told first. Stopped, or killed, the same
+    command continues; complete cells are never done again, failed ones are. Ends with
+    0, or with 1 if cells failed (with --check, if some would be refused).
     """
 
     grid: tyro.conf.Positional[Path]
@@ -119,9 +119,13 @@ class Sweep:
     def _run(self, cells: list[Cell], workers: AbstractWorkers) -> int:
         import json
 
+        from rich.console import Console
+
         from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.experiment.sweep.summary import write_summary
         from mi_nerfattack.experiment.sweep.sweep import Cells
         from mi_nerfattack.experiment.sweep.sweep import Sweep as Work
+        from mi_nerfattack.report.table import sweep_table
 
         with StageBars() as bars:
 
@@ -134,11 +138,18 @@ class Sweep:
 
             sweep = Work(Cells(tuple(cells), self.output.resolve(), self.cores), show)
             sweep.run(workers)
+            document = write_summary(sweep.work.folder)
         if self.json:
             failed = {cells[i].id: error for i, error in sweep.errors.items()}
             found = {"cells": len(cells), "complete": len(sweep.complete)}
-            print(json.dumps({**found, "failed": failed, "table": str(sweep.table)}))
+            found |= {"failed": failed, "flags": document["flags"]}
+            print(json.dumps({**found, "table": str(sweep.table)}))
         else:
+            console = Console()
+            for flag in document["flags"]:
+                line = f"flag: {flag}"
+                console.print(line, style="bold", highlight=False, markup=False)
+            console.print(sweep_table(document))
             print(f"{len(sweep.complete)} of {len(cells)} cells: {sweep.table}")
             for index, error in sorted(sweep.errors.items()):
                 print(f"failed: {cells[index].id}: {error.splitlines()[-1]}")

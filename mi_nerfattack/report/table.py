@@ -220,6 +220,47 @@ def retrain_table(document: Mapping[str, Any]) -> rich.table.Table:
     return table
 
 
+def sweep_table(document: Mapping[str, Any]) -> rich.table.Table:
+    """Return the summary of a sweep as a table that fits a terminal of 80 columns.
+
+    Args:
+        document: whole, of `sweep.summary.summarise`.
+
+    Returns:
+        A row per route, method, budget, environment and case: mean error over the
+        attacks, each of which counts once, its standard deviation and BCa interval;
+        drives that left the lane; how many attacks have a wheel out for a second, with
+        Wilson's interval in per cent.
+    """
+    table = _distances("Mean distance from the lane centre (m)")
+    table.add_column("case", overflow="fold", max_width=22)
+    for name in ("mean", "± sd", "95 % interval", "drives\ndeparted", "attacks\nout"):
+        table.add_column(name, justify="right", no_wrap=True)
+    last = ""
+    for group in document["groups"]:
+        route = "all routes" if group["route"] is None else group["route"]
+        labels = route, group["method"], group["budget"], group["environment"]
+        title = " ".join(str(label) for label in labels if label is not None)
+        if title != last:
+            table.add_section()
+            last = title
+            table.add_row(title)
+        table.add_row(f" {group['case']}", *_sweep_cells(group))
+    return table
+
+
+def _sweep_cells(group: Mapping[str, Any]) -> list[str]:
+    spread, interval = group["cross_track_sd_m"], group["cross_track_mean_ci95_m"]
+    out = group["attacks_out"], group["attacks"], group["attacks_out_rate_ci95"]
+    return [
+        f"{group['cross_track_mean_m']:.3f}",
+        "" if spread is None else f"{spread:.3f}",
+        "" if interval is None else f"[{interval[0]:.3f}, {interval[1]:.3f}]",
+        f"{group['drives_departed']}/{group['drives']}",
+        _share(*out),
+    ]
+
+
 def _transfer_cells(column: Mapping[str, Any]) -> list[str]:
     cases, ratio = column["cases"], column["ratio_to_surrogate"]
     means = [f"{figures['cross_track_mean_m']:.3f}" for figures in cases.values()]

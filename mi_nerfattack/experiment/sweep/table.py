@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import PROVENANCE, Cell, folder_of
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
@@ -17,6 +18,8 @@ from mi_nerfattack.system.extras import load_extra
 
 FORMAT = "mi_nerfattack sweep 1"
 RESULTS = "results.parquet"
+MAX_TABLE_BYTES = 1 << 30
+MAX_ROWS = 1 << 24
 #: Columns and their Arrow types; docs/sweep.md says what they mean.
 SCHEMA = {
     "cell": "string",
@@ -29,6 +32,7 @@ SCHEMA = {
     "case": "string",
     "run": "int64",
     "frames": "int64",
+    "steps": "int64",
     "cross_track_mean_m": "float64",
     "wheel_out_s": "float64",
     "departed": "bool_",
@@ -36,6 +40,7 @@ SCHEMA = {
     "error": "string",
     "digests": "string",
     "versions": "string",
+    "scenario": "category",
 }
 Row = dict[str, Any]
 
@@ -67,6 +72,7 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
             "case": case,
             "run": drive["run"],
             "frames": frames.get(case, 0),
+            "steps": drive["steps"],
             "cross_track_mean_m": drive["cross_track_mean_m"],
             "wheel_out_s": drive["wheel_out_s"],
             "departed": drive["steps_departed"] > 0,
@@ -97,11 +103,65 @@ def write_table(path: Path, rows: Iterable[Row]) -> None:
     """
     pa = load_extra("pyarrow", "sweep", "a sweep's table")
     parquet = load_extra("pyarrow.parquet", "sweep", "a sweep's table")
-    types = [(name, getattr(pa, kind)()) for name, kind in SCHEMA.items()]
-    schema = pa.schema(types, metadata={"format": FORMAT})
     buffer = io.BytesIO()
-    parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer)
+    table = pa.Table.from_pylist(list(rows), schema=_schema(pa))
+    parquet.write_table(table, buffer)
     files.write_bytes(path, buffer.getvalue())
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None) -> list[Row]:
+    """Read a table, row by row.
+
+    Args:
+        path: of the file.
+        columns: names; by default all but the scenarios, which are long.
+
+    Raises:
+        InputError: there is none, or it is damaged, too large, or not a sweep's table.
+        SetupError: pyarrow is not installed.
+    """
+    pa = load_extra("pyarrow", "sweep", "a sweep's table")
+    parquet = load_extra("pyarrow.parquet", "sweep", "a sweep's table")
+    raw = files.read_bytes(path, MAX_TABLE_BYTES)
+    try:
+        with parquet.ParquetFile(io.BytesIO(raw)) as file:
+            _check(path, file.schema_arrow, file.metadata.num_rows, _schema(pa))
+            names = [name for name in SCHEMA if name != "scenario"]
+            return file.read(columns=columns or names).to_pylist()
+    except (pa.ArrowException, OSError, ValueError) as err:
+        if isinstance(err, InputError):
+            raise
+        raise InputError(
+            f"{path}: no Parquet file, or a damaged one ({err}); give the sweep's "
+            "command again, which makes it anew"
+        ) from err
+
+
+def _schema(pa: Any) -> Any:
+    """Return the table's Arrow schema; equal scenarios are kept once."""
+    category = pa.dictionary(pa.int32(), pa.string())
+    types = [
+        (name, category if kind == "category" else getattr(pa, kind)())
+        for name, kind in SCHEMA.items()
+    ]
+    return pa.schema(types, metadata={"format": FORMAT})
+
+
+def _check(path: Path, found: Any, rows: int, wanted: Any) -> None:
+    """Refuse other tables, and larger ones than are read."""
+    told = (found.metadata or {}).get(b"format", b"").decode(errors="replace")
+    if told != FORMAT:
+        raise InputError(
+            f"{path}: not a sweep's table (format {told!r}, not {FORMAT!r})"
+        )
+    here, there = (set(zip(s.names, s.types, strict=True)) for s in (found, wanted))
+    if wrong := sorted({name for name, _ in here ^ there}):
+        raise InputError(
+            f"{path}: columns {', '.join(wrong)} are missing or others than ours; "
+            "give the sweep's command again, which makes the table anew"
+        )
+    if rows > MAX_ROWS:
+        raise InputError(f"{path}: {rows} rows; at most {MAX_ROWS} are read")
 
 
 def _labels(cell: Cell) -> Row:
@@ -113,6 +173,7 @@ def _labels(cell: Cell) -> Row:
         "budget": cell.budget,
         "seed": cell.seed,
         "digests": json.dumps(cell.digests),
+        "scenario": cell.text,
     }
 
 

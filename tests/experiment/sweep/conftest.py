@@ -75,11 +75,14 @@ def finish(cell, sweep):
     output = folder_of(sweep, cell)
     output.mkdir(parents=True, exist_ok=True)
     drive = {"run": 0, "cross_track_mean_m": 0.1 * cell.seed, "wheel_out_s": 1.5}
-    drive["steps_departed"] = 15
+    drive |= {"steps": 30, "steps_departed": 15}
     document = {
         "routes": {"line": {"surrogate": {"attack": {"per_run": [drive]}}}},
         "baseline": {"textures": 2},
-        "curve": {"frames": [4, 16, 28, 40]},
+        "curve": {"frames": [4, 16, 28, 40], "objective": [0, -1, -2, -3]},
+        "scenario": {"attack": {"method": cell.method}},
+        "converged": True,
+        "flags": [],
     }
     (output / "metrics.json").write_text(json.dumps(document))
     (output / PROVENANCE).write_text(json.dumps({"versions": {"numpy": "2"}}))

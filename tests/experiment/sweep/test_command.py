@@ -103,8 +103,13 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "Cells", partial(module.Cells, task=task))
     monkeypatch.setattr(Sweep, "_workers", lambda self: InThisProcess())
     code, out, err = command(GRID)
-    table, *failed = out.splitlines()
+    told, table, *failed = out.splitlines()[-4:]
     assert code == 1 and "cells: 0/6, 0 control periods" in err
+    assert not told.strip() and "line blocks 30 " in out
+    [row, *_] = [line.split() for line in out.splitlines() if "attack " in line][1:]
+    assert row[:3] == ["attack", "0.400", "0.141"] and row[5:7] == ["2/2", "2/2"]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [failed["seed"] for failed in summary["failed"]] == [4, 4]
     assert table == f"4 of 6 cells: {tmp_path / 'out' / 'results.parquet'}"
     assert [line.split("-")[2] for line in failed] == ["gradient", "blocks"]
     assert all(line.endswith(": in two lines") for line in failed)

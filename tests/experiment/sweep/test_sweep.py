@@ -9,7 +9,7 @@ import pytest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import folder_of, is_complete, run_cell
 from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
-from mi_nerfattack.experiment.sweep.table import SCHEMA
+from mi_nerfattack.experiment.sweep.table import SCHEMA, read_table
 from mi_nerfattack.io import files
 from mi_nerfattack.system.workers import InThisProcess
 from tests.experiment.sweep.conftest import finish
@@ -59,6 +59,7 @@ def test_the_table(cells, tmp_path):
     for cell, row in zip(cells, rows, strict=True):
         assert json.loads(row.pop("digests")) == cell.scenario.digests()
         assert json.loads(row.pop("versions")) == {"numpy": "2"}
+        assert row.pop("scenario") == cell.text
         assert row == {
             "cell": cell.id,
             "route": "line",
@@ -70,12 +71,35 @@ def test_the_table(cells, tmp_path):
             "case": "attack",
             "run": 0,
             "frames": 40,
+            "steps": 30,
             "cross_track_mean_m": 0.1 * cell.seed,
             "wheel_out_s": 1.5,
             "departed": True,
             "status": "complete",
             "error": None,
         }
+
+
+def test_a_table_is_read_and_others_refused(cells, tmp_path):
+    sweep(cells[:1], tmp_path, Tasks())
+    path, other = tmp_path / "results.parquet", tmp_path / "other.parquet"
+    whole = table(tmp_path)
+    assert read_table(path, ["cell", "scenario"]) == [
+        {name: row[name] for name in ("cell", "scenario")} for row in whole
+    ]
+    assert "scenario" not in read_table(path)[0]
+    raw = path.read_bytes()
+    for damaged in (raw[:-300], b"PAR1" + bytes(100), b""):
+        other.write_bytes(damaged)
+        with pytest.raises(InputError, match="no Parquet file, or a damaged one"):
+            read_table(other)
+    stored = parquet.read_table(path)
+    parquet.write_table(stored.replace_schema_metadata({}), other)
+    with pytest.raises(InputError, match="not a sweep's table"):
+        read_table(other)
+    parquet.write_table(stored.drop_columns(["run"]), other)
+    with pytest.raises(InputError, match="columns run are missing or others"):
+        read_table(other)
 
 
 def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
