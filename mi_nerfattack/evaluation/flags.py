@@ -5,6 +5,7 @@ A flag is a sentence that begins with its name: what was found, and what to do.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -60,7 +61,7 @@ def black_box_better(gradient: Curve, others: Mapping[str, Curve]) -> Iterator[s
     """Tell of methods that find more without derivatives, at equal frames.
 
     An alarm on the gradient itself. Curves are compared at the largest number of frames
-    that both reach.
+    that both reach, if the gradient has ended an iteration by then.
 
     Args:
         gradient: its curve.
@@ -70,6 +71,8 @@ def black_box_better(gradient: Curve, others: Mapping[str, Curve]) -> Iterator[s
     """
     for name, other in others.items():
         frames = min(gradient["frames"][-1], other["frames"][-1])
+        if frames < min(gradient["frames"][1:], default=math.inf):
+            continue
         ours, theirs = _reached(gradient, frames), _reached(other, frames)
         if ours is not None and theirs is not None and theirs < ours:
             yield (

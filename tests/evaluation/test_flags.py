@@ -65,8 +65,10 @@ def test_methods_are_compared_at_frames_that_both_reach():
     [flag] = black_box_better(gradient, {"blocks": blocks, "cma_es": gradient})
     assert "after 40 frames, blocks had come to an objective of -9, " in flag
     assert "gradient to -3 " in flag
-    shorter = curve([10, 20], [-1.0, -2.0])  # the gradient's last then is 0
+    shorter = curve([10, 30], [-1.0, -3.5])  # the gradient's last then is -3
     assert len(list(black_box_better(gradient, {"blocks": shorter}))) == 1
+    soon = curve([10, 20], [-1.0, -2.0])  # before its first iteration has ended
+    assert list(black_box_better(gradient, {"blocks": soon})) == []
     assert list(black_box_better(blocks, {"cma_es": gradient})) == []
     late = curve([60], [-99.0])  # none of it with 50 frames
     assert list(black_box_better(gradient, {"blocks": late})) == []
