@@ -21,6 +21,7 @@ from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
+from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
@@ -50,6 +51,7 @@ COMMANDS: dict[str, type[Command]] = {
     "check": Check,
     "attack": Attack,
     "sweep": Sweep,
+    "replay": Replay,
     "transfer": Transfer,
     "retrain": Retrain,
 }

@@ -10,7 +10,6 @@ import tyro
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
-    from mi_nerfattack.experiment.sweep.sweep import Sweep as Done
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
@@ -121,24 +120,12 @@ class Sweep:
 
         from rich.console import Console
 
-        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.commands.shared.cells import do_cells
         from mi_nerfattack.experiment.sweep.summary import write_summary
-        from mi_nerfattack.experiment.sweep.sweep import Cells
-        from mi_nerfattack.experiment.sweep.sweep import Sweep as Work
         from mi_nerfattack.report.table import sweep_table
 
-        with StageBars() as bars:
-
-            def show(sweep: Done) -> None:
-                done, total = len(sweep.complete), len(cells)
-                state = f"{done}/{total}, {sweep.steps} control periods"
-                if sweep.errors:
-                    state += f", {len(sweep.errors)} failed"
-                bars.show("cells", done, total, state, kept=done == sweep.kept)
-
-            sweep = Work(Cells(tuple(cells), self.output.resolve(), self.cores), show)
-            sweep.run(workers)
-            document = write_summary(sweep.work.folder)
+        sweep = do_cells(cells, self.output, self.cores, workers)
+        document = write_summary(sweep.work.folder)
         if self.json:
             failed = {cells[i].id: error for i, error in sweep.errors.items()}
             found = {"cells": len(cells), "complete": len(sweep.complete)}

@@ -80,6 +80,16 @@ def is_complete(sweep: Path, cell: Cell) -> bool:
     return (folder_of(sweep, cell) / COMPLETE).exists()
 
 
+def changed(cell: Cell) -> list[str]:
+    """Return the keys of what is of other content here than in a cell's digests.
+
+    Raises:
+        InputError: a file is missing.
+    """
+    found, told = cell.scenario.digests(), cell.digests
+    return sorted(k for k in found.keys() | told.keys() if found.get(k) != told.get(k))
+
+
 def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
     """Do a cell, or what is left of it, as ``mi-nerfattack attack`` would.
 
@@ -99,8 +109,7 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
     with claimed(output, resume=True):
         if is_complete(sweep, cell):
             return
-        if (found := scenario.digests()) != cell.digests:
-            wrong = sorted(k for k, v in found.items() if v != cell.digests.get(k))
+        if wrong := changed(cell):
             raise InputError(
                 f"{cell.id}: {', '.join(wrong)}: other content here than where the "
                 "sweep began; give the same command again, and all machines one disk"

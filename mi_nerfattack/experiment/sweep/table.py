@@ -109,25 +109,32 @@ def write_table(path: Path, rows: Iterable[Row]) -> None:
     files.write_bytes(path, buffer.getvalue())
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> list[Row]:
+def read_table(
+    path: Path, columns: Sequence[str] | None = None, cell: str | None = None
+) -> list[Row]:
     """Read a table, row by row.
 
     Args:
         path: of the file.
         columns: names; by default all but the scenarios, which are long.
+        cell: whose rows are wanted; by default all.
 
     Raises:
         InputError: there is none, or it is damaged, too large, or not a sweep's table.
         SetupError: pyarrow is not installed.
     """
     pa = load_extra("pyarrow", "sweep", "a sweep's table")
+    load_extra("pyarrow.compute", "sweep", "a sweep's table")
     parquet = load_extra("pyarrow.parquet", "sweep", "a sweep's table")
     raw = files.read_bytes(path, MAX_TABLE_BYTES)
     try:
         with parquet.ParquetFile(io.BytesIO(raw)) as file:
             _check(path, file.schema_arrow, file.metadata.num_rows, _schema(pa))
             names = [name for name in SCHEMA if name != "scenario"]
-            return file.read(columns=columns or names).to_pylist()
+            table = file.read(columns=columns or names)
+            if cell is not None:
+                table = table.filter(pa.compute.field("cell") == cell)
+            return table.to_pylist()
     except (pa.ArrowException, OSError, ValueError) as err:
         if isinstance(err, InputError):
             raise

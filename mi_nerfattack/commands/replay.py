@@ -1,0 +1,107 @@
+"""``mi-nerfattack replay``: rows of a sweep's table, repeated."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from mi_nerfattack.system.workers import Processes
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Repeat rows of a sweep's table, and say by how much they differ.
+
+    The whole cell of each row is done anew, the attack first, as the sweep did it; the
+    table alone says how. Refused where a file that it was made of has another content.
+    Ends with 1 where a row differs by more than --tolerance, or its cell fails.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Folder with results.parquet: a sweep's, or a copy of that file alone."""
+    row: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="ROW")]
+    """Rows: index in the table, from 0, or CELL:ENVIRONMENT:CASE:RUN."""
+    rows: int = 0
+    """Draw so many rows at random, too."""
+    seed: int = 0
+    """Of these."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder for the repeated cells, itself a sweep's: the same command continues
+    there. By default one that is removed at the end."""
+    drives_only: bool = False
+    """Begin where the cells' own checkpoints in FOLDER end: repeat the drives alone,
+    past the textures that were found."""
+    tolerance: float | None = None
+    """Largest difference of a row's mean error, metres; by default any."""
+    workers: int | None = None
+    """Cells that are done at a time; by default as many as there are cores for."""
+    cores: int = 1
+    """Cores that each cell renders with."""
+    json: bool = False
+    """Print JSON in place of sentences."""
+
+    def run(self) -> int:
+        """Read, repeat, compare and tell."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.cells import do_cells
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.experiment.sweep.replay import (
+            compare_rows,
+            read_replay,
+            sentences,
+            take_checkpoints,
+        )
+        from mi_nerfattack.experiment.sweep.table import read_table
+
+        if self.rows < 0 or not (self.row or self.rows):
+            raise InputError("replay: no row; give ROW, or --rows 1 or more")
+        if not self.cores > 0:
+            raise InputError(f"--cores: {self.cores}; more than 0")
+        variant.ensure()
+        wanted = read_replay(self.folder, self.row, self.rows, self.seed)
+        with self._place() as place:
+            output = Path(place)
+            if self.drives_only:
+                take_checkpoints(wanted, self.folder, output)
+            sweep = do_cells(wanted.cells, output, self.cores, self._workers())
+            errors = {wanted.cells[i].id: told for i, told in sweep.errors.items()}
+            found = compare_rows(wanted, read_table(sweep.table), errors)
+        if self.json:
+            print(json.dumps(found, allow_nan=False))
+        else:
+            print(*sentences(found), sep="\n")
+        return int(bool(errors) or self._is_exceeded(found))
+
+    def _place(self) -> AbstractContextManager[str | Path]:
+        """Return the folder of the repetition, which may be for a while."""
+        from mi_nerfattack.errors import InputError
+
+        if self.output is None:
+            return tempfile.TemporaryDirectory()
+        if self.output.resolve() == self.folder.resolve():
+            raise InputError(f"{self.output}: the sweep's own folder; choose another")
+        return nullcontext(self.output)
+
+    def _workers(self) -> Processes:
+        from mi_nerfattack.system.workers import Processes, available_cores
+
+        count = self.workers
+        if count is None:
+            count = max(1, available_cores() // self.cores)
+        return Processes(count, pieces_each=1)
+
+    def _is_exceeded(self, found: Mapping[str, Any]) -> bool:
+        """Whether a row differs by more than was allowed, or is not there."""
+        limit = self.tolerance
+        return limit is not None and any(
+            row["difference"] is None or row["difference"]["cross_track_mean_m"] > limit
+            for row in found["rows"]
+        )

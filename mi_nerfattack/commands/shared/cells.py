@@ -1,0 +1,44 @@
+"""The cells of a sweep done, with a bar."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mi_nerfattack.experiment.sweep.cell import Cell
+    from mi_nerfattack.experiment.sweep.sweep import Sweep
+    from mi_nerfattack.system.workers import AbstractWorkers
+
+
+def do_cells(
+    cells: Sequence[Cell], folder: Path, cores: int, workers: AbstractWorkers
+) -> Sweep:
+    """Do all cells that are not complete; returns what became of them.
+
+    Args:
+        cells: of the sweep.
+        folder: of the sweep.
+        cores: that each cell renders with.
+        workers: who does them.
+
+    Raises:
+        InputError: as of `Sweep.run`.
+        SetupError: likewise.
+    """
+    from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
+
+    with StageBars() as bars:
+
+        def show(sweep: Sweep) -> None:
+            done, total = len(sweep.complete), len(cells)
+            state = f"{done}/{total}, {sweep.steps} control periods"
+            if sweep.errors:
+                state += f", {len(sweep.errors)} failed"
+            bars.show("cells", done, total, state, kept=done == sweep.kept)
+
+        sweep = Sweep(Cells(tuple(cells), folder.resolve(), cores), show)
+        sweep.run(workers)
+        return sweep

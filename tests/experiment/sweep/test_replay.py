@@ -1,0 +1,143 @@
+"""Rows that are repeated, and by how much they are said to differ."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mi_nerfattack import cli
+from mi_nerfattack.commands.replay import Replay
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.sweep.cell import folder_of
+from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.experiment.sweep.replay import (
+    compare_rows,
+    read_replay,
+    sentences,
+)
+from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
+from mi_nerfattack.experiment.sweep.table import read_table, write_table
+from mi_nerfattack.system.workers import InThisProcess
+
+pytest.importorskip(
+    "pyarrow", reason="needs the extra 'sweep': pyarrow writes the table"
+)
+pytestmark = pytest.mark.usefixtures("variant")
+
+GRID = """\
+scenario = "scenario.toml"
+[[methods]]
+name = "gradient"
+set.attack.deterministic = true
+set.attack.max_iterations = 2
+set.baseline.textures = 2
+"""
+ROUNDED = 0.125
+
+
+@pytest.fixture(scope="module")
+def swept(scenario_folder, tmp_path_factory):
+    """A sweep of one cell, and a copy of its table alone, of which a row is wrong."""
+    grid = scenario_folder / "replay.toml"
+    grid.write_text(GRID)
+    folder, copy = (tmp_path_factory.mktemp(name) for name in ("sweep", "copy"))
+    [cell] = cells = load_cells(grid)
+    sweep = Sweep(Cells(tuple(cells), folder))
+    sweep.run(InThisProcess())
+    assert not sweep.errors
+    rows = [row | {"scenario": cell.text} for row in read_table(sweep.table)]
+    rows[-1]["cross_track_mean_m"] += ROUNDED
+    rows[-1]["versions"] = json.dumps(json.loads(rows[-1]["versions"]) | {"torch": "1"})
+    rows.append({"status": "failed", "error": "no room", "cell": "other"})
+    write_table(copy / "results.parquet", rows)
+    return folder, copy, cell
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Return what runs the command in this process: exit code, output."""
+    monkeypatch.setattr(Replay, "_workers", lambda self: InThisProcess())
+
+    def run(*words):
+        code = cli.main(["replay", *map(str, words)])
+        return code, capsys.readouterr().out
+
+    return run
+
+
+def test_rows_come_back_to_the_bit(swept, command, tmp_path):
+    """Of the table alone; all but the row that was made wrong."""
+    _, copy, cell = swept
+    last = len(read_table(copy / "results.parquet")) - 2
+    words = copy, last, f"{cell.id}:surrogate:own:0", "--json", "-o", tmp_path / "out"
+    code, out = command(*words)
+    found = json.loads(out)
+    assert code == 0
+    wrong, right = found["rows"]
+    assert (wrong["row"], wrong["case"], right["case"]) == (last, "attack", "own")
+    assert set(right["difference"].values()) == {0}
+    assert right["stored"] == right["repeated"]
+    assert wrong["difference"].pop("cross_track_mean_m") == pytest.approx(ROUNDED)
+    assert set(wrong["difference"].values()) == {0}
+    [told] = found["cells"]
+    assert (told["cell"], told["rows"], told["unmatched"]) == (cell.id, last + 1, 0)
+    assert told["largest_difference"]["cross_track_mean_m"] == pytest.approx(ROUNDED)
+    assert told["largest_difference"]["frames"] == 0
+    code, out = command(*words[:2], *words[4:], "--tolerance", 0.1)
+    assert code == 1 and f"(0.125){chr(10)}" in out  # it is not done again
+    code, out = command(*words[:1], *words[2:3], *words[4:], "--tolerance", 0)
+    assert code == 0 and "m, all equal\n" in out
+
+
+def test_drives_alone_come_back(swept, command, tmp_path):
+    folder, _, cell = swept
+    out = tmp_path / "out"
+    code, told = command(folder, "--rows", 3, "--drives-only", "--json", "-o", out)
+    found = json.loads(told)
+    assert code == 0 and len(found["rows"]) == 3
+    assert set(found["largest_difference"].values()) == {0}
+    assert set(found["cells"][0]["largest_difference"].values()) == {0}
+    cost = json.loads((folder_of(out, cell) / "metrics.json").read_text())["cost"]
+    assert cost["processes"] == 2  # the attack's, and this one
+
+
+def test_what_differs_is_told(swept):
+    """Versions, drives that there are none of, failures; made by hand."""
+    folder, copy, cell = swept
+    wanted = read_replay(copy, ["0"])
+    rows = read_table(folder / "results.parquet")
+    found = compare_rows(wanted, rows[2:], {})
+    [row], [told] = found["rows"], found["cells"]
+    assert row["repeated"] is None and found["largest_difference"] is None
+    assert (told["rows"], told["unmatched"]) == (len(rows) - 2, 2)
+    other = [dict(each, versions='{"numpy": "0"}') for each in rows]
+    lines = sentences(compare_rows(wanted, other, {}))
+    assert any(f"{cell.id}: mitsuba 3." in line for line in lines)
+    assert any(line.endswith("then, 0 here") for line in lines)
+    lines = sentences(compare_rows(wanted, [], {cell.id: "a mistake\nno room"}))
+    assert lines[-1] == f"failed: {cell.id}: no room"
+
+
+def test_rows_that_cannot_be_repeated(swept, command, scenario_folder, tmp_path):
+    folder, copy, cell = swept
+    for name, told in {
+        "99": "row 99; there are 0 to",
+        f"{cell.id}:moon:own:0": "no row .*such as .*:no_object:0",
+        str(len(read_table(copy / "results.parquet")) - 1): "failed .no room.",
+    }.items():
+        with pytest.raises(InputError, match=told):
+            read_replay(copy, [name])
+    with pytest.raises(InputError, match="rows of drives; 99 are asked for"):
+        read_replay(copy, [], 99)
+    assert command(copy)[0] == 2
+    assert command(folder, 0, "-o", folder)[0] == 2
+    assert command(copy, 0, "--drives-only", "-o", tmp_path / "out")[0] == 2
+    route = scenario_folder / "routes.json"
+    text = route.read_text()
+    route.write_text(text + "\n")
+    try:
+        with pytest.raises(InputError, match="scenario, scene.routes: other content"):
+            read_replay(copy, ["0"])
+    finally:
+        route.write_text(text)
