@@ -17,13 +17,14 @@ from mi_nerfattack.deploy.car import CAR, SMALL_CAR, Car
 from mi_nerfattack.deploy.mujoco.car import Handling
 from mi_nerfattack.deploy.mujoco.vehicle import MujocoVehicle, SteeringAngle
 from mi_nerfattack.io import files
+from mi_nerfattack.report.plots.charts import GREEN, PALETTE
 
 PERIOD_S = 0.1
 CARS = {"full-size car": CAR, "small car": SMALL_CAR}
 LIMIT = 0.05  # of the radius, where the tyres' friction suffices
 _SETTLE_S = 3.0
 _GRAVITY = 9.81
-_COLOURS = ("#0072B2", "#D55E00", "#009E73")
+_COLOURS = PALETTE[:3]
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def _draw_errors(axes: Any, circles: Sequence[Circle]) -> None:
     colours = [_COLOURS[0] if ok else _COLOURS[1] for ok in held]
     bars = axes.bar(range(len(circles)), errors, color=colours)
     axes.bar_label(bars, fmt="%+.2f", fontsize=8)
-    axes.axhspan(-100 * LIMIT, 100 * LIMIT, color="#009E73", alpha=0.15)
+    axes.axhspan(-100 * LIMIT, 100 * LIMIT, color=GREEN, alpha=0.15)
     axes.axhline(0, color="black", lw=0.7)
     axes.set_yscale("symlog", linthresh=1)
     axes.set_ylim(-10, max(20, 3 * max(errors)))

@@ -28,6 +28,7 @@ from mi_nerfattack.render.composite import AbstractComposite, DepthComposite
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.report.plots.charts import BLUE, ORANGE
 from mi_nerfattack.scenes import bundled
 
 PLACE = (2.0, -1.75)  # in the lane; the road is at z = 0
@@ -117,7 +118,7 @@ def write_figure(
                 axes.set_ylabel(f"{name}\n({height:+.2f} m)")
     axes = figure.add_subplot(grid[len(SHOWN), :])
     heights = [result.height_m for result in results]
-    for key, line, colour in (("mean", "o-", "#0072B2"), ("largest", "s--", "#D55E00")):
+    for key, line, colour in (("mean", "o-", BLUE), ("largest", "s--", ORANGE)):
         values = [255 * getattr(result, key) for result in results]
         axes.plot(heights, values, line, color=colour, label=key)
     axes.set_yscale("symlog", linthresh=0.1)

@@ -172,6 +172,7 @@ class Retrain:
         from dataclasses import replace
 
         from mi_nerfattack.evaluation.evaluate import EvaluateSettings
+        from mi_nerfattack.experiment.transfer.columns import PASTED
         from mi_nerfattack.training.settings import (
             CLONING,
             CollectSettings,
@@ -182,10 +183,8 @@ class Retrain:
 
         frames = FRAMES if self.frames is None else self.frames
         for name in frames:
-            if name not in ("surrogate", "mitsuba", "mujoco", "mujoco_gl"):
-                raise InputError(
-                    f"--frames: {name!r}; of surrogate, mitsuba, mujoco and mujoco_gl"
-                )
+            if name not in PASTED:
+                raise InputError(f"--frames: {name!r}; of {', '.join(PASTED)}")
         # where the attacked policy goes, the expert shows it the way back
         cloning = Mixture((CLONING, PolicyDrives(policy)), (0.6, 0.4))
         width = place.car.width

@@ -53,8 +53,7 @@ class BuiltInObject:
     @property
     def world_vertices(self) -> np.ndarray:
         """Vertices (n, 3) in the world, metres."""
-        pose = self.pose
-        return pose.scale * self.vertices @ pose.rotation.T + pose.translation
+        return self.pose.apply(self.vertices)
 
 
 def built_in_shapes(objects: Sequence[BuiltInObject]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import rich.table
 
 from mi_nerfattack.evaluation.metrics import lane_of
 from mi_nerfattack.io import files
-from mi_nerfattack.rollout.drive import ATTACK, Drive, Lane
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, Drive, Lane
 
 STEP_COLUMNS = (
     "environment",
@@ -206,7 +206,7 @@ def retrain_table(document: Mapping[str, Any]) -> rich.table.Table:
     for row in document["table"]:
         labels = [row["group"].replace("_", " "), row["environment"]]
         for stage in ("before", "after"):
-            clean, attack = (row[stage][case] for case in ("no_object", ATTACK))
+            clean, attack = (row[stage][case] for case in (NO_OBJECT, ATTACK))
             table.add_row(
                 *labels,
                 stage,

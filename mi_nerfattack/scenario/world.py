@@ -373,7 +373,6 @@ def object_footprints(world: World) -> list[np.ndarray]:
     for posed in world.surrogate.objects:
         low, high = posed.field.lower, posed.field.upper
         x, y = (low[0], high[0], high[0], low[0]), (low[1], low[1], high[1], high[1])
-        corners, pose = np.stack([x, y, np.zeros(4)], axis=1), posed.placed
-        in_world = pose.scale * corners @ pose.rotation.T + pose.translation
-        outlines.append(in_world[:, :2])
+        corners = np.stack([x, y, np.zeros(4)], axis=1)
+        outlines.append(posed.placed.apply(corners)[:, :2])
     return outlines

@@ -16,7 +16,6 @@ from mi_nerfattack.system.workers import (
     OnUnits,
     do_alone,
     failure,
-    raise_failure,
 )
 
 #: Starts a cluster of this machine alone, which ends with the work.
@@ -44,21 +43,15 @@ class RayTasks(AbstractWorkers):
     memory_gb: float = 4.0
     count: int | None = None
 
-    def run(
-        self,
-        work: AbstractWork,
-        pieces: Sequence[int],
-        report: OnUnits,
-        on_end: OnEnd = raise_failure,
+    def _do(
+        self, work: AbstractWork, pieces: Sequence[int], report: OnUnits, on_end: OnEnd
     ) -> None:
-        """Do all pieces.
+        """See :meth:`run`.
 
         Raises:
             InputError: no machine of the cluster has the cores and the memory.
             SetupError: there is no cluster, or Ray is not installed.
         """
-        if not pieces:
-            return
         ray = self._connect()
         try:
             self._check(ray)

@@ -19,7 +19,6 @@ from mi_nerfattack.system.workers import (
     Told,
     do_alone,
     failure,
-    raise_failure,
 )
 
 _POLL_S = 0.5
@@ -48,16 +47,9 @@ class SlurmJobs(AbstractWorkers):
     minutes: int = 240
     count: int = MOST
 
-    def run(
-        self,
-        work: AbstractWork,
-        pieces: Sequence[int],
-        report: OnUnits,
-        on_end: OnEnd = raise_failure,
+    def _do(
+        self, work: AbstractWork, pieces: Sequence[int], report: OnUnits, on_end: OnEnd
     ) -> None:
-        """Do all pieces."""
-        if not pieces:
-            return
         executor, errors = self._executor()
         left: list[int] = list(reversed(pieces))
         jobs: dict[int, Any] = {}

@@ -89,7 +89,6 @@ def failure(piece: int, told: Told) -> Exception | None:
 class AbstractWorkers(ABC):
     """Who does the work."""
 
-    @abstractmethod
     def run(
         self,
         work: AbstractWork,
@@ -108,22 +107,23 @@ class AbstractWorkers(ABC):
                 the work, by default the error of a piece: an InputError from it, or of
                 a worker that ended in the midst of it; or a RuntimeError.
         """
+        if pieces:
+            self._do(work, pieces, report, on_end)
+
+    @abstractmethod
+    def _do(
+        self, work: AbstractWork, pieces: Sequence[int], report: OnUnits, on_end: OnEnd
+    ) -> None:
+        """See :meth:`run`; there are pieces."""
 
 
 @dataclass(frozen=True)
 class InThisProcess(AbstractWorkers):
     """One piece after the other, without a process of its own."""
 
-    def run(
-        self,
-        work: AbstractWork,
-        pieces: Sequence[int],
-        report: OnUnits,
-        on_end: OnEnd = raise_failure,
+    def _do(
+        self, work: AbstractWork, pieces: Sequence[int], report: OnUnits, on_end: OnEnd
     ) -> None:
-        """Do all pieces, in order."""
-        if not pieces:
-            return
         opened = work.open()
         try:
             for index in pieces:
@@ -159,14 +159,9 @@ class Processes(AbstractWorkers):
         if not isinstance(self.count, int) or not 1 <= self.count <= MOST:
             raise InputError(f"workers: {self.count!r}; 1 to {MOST}")
 
-    def run(
-        self,
-        work: AbstractWork,
-        pieces: Sequence[int],
-        report: OnUnits,
-        on_end: OnEnd = raise_failure,
+    def _do(
+        self, work: AbstractWork, pieces: Sequence[int], report: OnUnits, on_end: OnEnd
     ) -> None:
-        """Do all pieces."""
         team: list[_Member] = []
         left = list(reversed(pieces))
         try:

@@ -18,6 +18,7 @@ from mi_nerfattack.experiment.checks.check import duration
 from mi_nerfattack.experiment.checks.ground import ground_findings, likeness_findings
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
+from mi_nerfattack.scenario.scenario import DriveSection
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -76,11 +77,9 @@ def test_a_policy_whose_images_are_others(scenario_folder, capsys):
 def world(points, length_m=20.0) -> Any:
     """Return as much of a world as the ground is compared with."""
     route = Route("line", 0, np.array(points))
-    scenario = SimpleNamespace(
-        vehicle=SimpleNamespace(dt_s=0.1), drive=SimpleNamespace(start_m=0.0)
-    )
-    horizon = round(length_m / 0.5)
-    return SimpleNamespace(route=route, scenario=scenario, horizon=horizon)
+    drive = DriveSection(horizon=round(length_m / 0.5))
+    scenario = SimpleNamespace(vehicle=SimpleNamespace(dt_s=0.1), drive=drive)
+    return SimpleNamespace(route=route, scenario=scenario)
 
 
 @pytest.fixture(scope="module")

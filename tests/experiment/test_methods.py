@@ -14,7 +14,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import Baseline
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.scenario.scenario import load_scenario
-from mi_nerfattack.scenario.world import build_attack, build_world
+from mi_nerfattack.scenario.world import build_attack, build_world, judged_frames
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -46,6 +46,7 @@ def test_searches_spend_their_frames_and_keep_the_best(
         attack.step()
     attack.finish()
     assert attack.iteration == 6
+    assert attack.curve(0.0)[0, 0] == judged_frames(work.scenario)
     objectives = [record.objective for record in attack.history]
     assert attack.best_objective == min(objectives) != before
     looks = Baseline.of(world, original, attack, Effort())
@@ -90,6 +91,7 @@ def test_attacks_on_an_unattacked_path(folder, tmp_path, no_results, method):
     assert work.scenario.attack.method.iterations(2) == count
     attack.step()
     attack.step()
+    assert attack.curve(1.0)[0, 0] == judged_frames(work.scenario)
     assert attack.history[1].objective < attack.history[0].objective
 
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from mi_nerfattack.attack.black_box.low_frequency import LowFrequency
 from mi_nerfattack.attack.black_box.search import AbstractSearch, Proposal
-from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.system.extras import load_extra
 
 if TYPE_CHECKING:
-    import optuna
+    from optuna.trial import Trial
 
 #: Coefficients beyond which a Gaussian process learns too little from few drives.
 MOST = 64
@@ -43,20 +44,14 @@ class BayesianSearch(AbstractSearch):
     ) -> None:
         if basis.count > MOST:
             raise InputError(f"coefficients: {basis.count}; at most {MOST}")
-        try:
-            import optuna
-        except ImportError as err:
-            raise SetupError(
-                "Bayesian optimisation needs Optuna: "
-                "pip install 'mi-nerfattack[bayesian]'"
-            ) from err
+        optuna = load_extra("optuna", "bayesian", "Bayesian optimisation")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.basis = basis
         sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=_RANDOM_FIRST)
         self._study = optuna.create_study(sampler=sampler)
         one = optuna.distributions.FloatDistribution(-1.0, 1.0)
         self._space = {f"{i:02d}": one for i in range(basis.count)}
-        self._asked: optuna.trial.Trial | None = None
+        self._asked: Trial | None = None
         for coefficients, objective in known:
             at = dict(zip(self._space, map(float, coefficients), strict=True))
             self._study.add_trial(
@@ -67,10 +62,9 @@ class BayesianSearch(AbstractSearch):
 
     def ask(self) -> Proposal:
         """See :meth:`AbstractSearch.ask`; asked again, it asks the same."""
-        if self._asked is None:
-            self._asked = self._study.ask(dict(self._space))
-        asked = [self._asked.params[name] for name in self._space]
-        return self.basis.propose(np.array(asked))
+        asked: Trial = self._asked or self._study.ask(dict(self._space))
+        self._asked = asked
+        return self.basis.propose(np.array([asked.params[k] for k in self._space]))
 
     def tell(self, objective: float) -> None:
         """See :meth:`AbstractSearch.tell`."""

@@ -231,10 +231,9 @@ class Check:
 
 def _top(posed: Any) -> np.ndarray:
     """Return the middle of the upper side of an object's box, metres."""
-    field, pose = posed.field, posed.placed
+    field = posed.field
     middle = (field.lower + field.upper) / 2
-    top = np.array([middle[0], middle[1], field.upper[2]])
-    return pose.scale * pose.rotation @ top + pose.translation
+    return posed.placed.apply(np.array([*middle[:2], field.upper[2]]))
 
 
 def duration(seconds: float) -> str:

@@ -54,7 +54,7 @@ class Solid:
     @staticmethod
     def of(name: str, posed: PosedField) -> Solid:
         """Find the solid points of an object as it is placed."""
-        field, pose = posed.field, posed.placed
+        field = posed.field
         size = field.upper - field.lower
         index = dr.arange(mi.UInt32, _CELLS**3)
         cells = index // _CELLS**2, index // _CELLS % _CELLS, index % _CELLS
@@ -64,9 +64,7 @@ class Solid:
         )
         solid = np.argwhere(_is_solid(posed, at).reshape([_CELLS] * 3))
         local = field.lower + (solid + 0.5) / _CELLS * size
-        return Solid(
-            name, posed, pose.scale * local @ pose.rotation.T + pose.translation
-        )
+        return Solid(name, posed, posed.placed.apply(local))
 
     def is_solid(self, points: np.ndarray) -> np.ndarray:
         """Tell which points (n, 3) of the world are solid."""

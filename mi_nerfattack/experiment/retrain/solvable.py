@@ -76,7 +76,7 @@ def drive_expert(found: FoundAttack) -> Driven:
 def _outline(posed: PosedField) -> np.ndarray:
     """Return points (n, 2) on the ground around an object's occupied box, metres."""
     assert isinstance(posed.field, GridField)
-    shape, pose = Shape.of(posed.field), posed.placed
+    shape = Shape.of(posed.field)
     low, high = shape.lower[:2], shape.upper[:2]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     share = np.arange(_PER_SIDE)[:, None] / _PER_SIDE
@@ -86,7 +86,7 @@ def _outline(posed: PosedField) -> np.ndarray:
     ]
     points = np.concatenate(sides)
     local = np.column_stack([points, np.full(len(points), shape.lower[2])])
-    return (pose.scale * local @ pose.rotation.T + pose.translation)[:, :2]
+    return posed.placed.apply(local)[:, :2]
 
 
 def _distance(path: np.ndarray, points: np.ndarray) -> float:

@@ -12,8 +12,6 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import PROVENANCE, Cell, folder_of
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
-from mi_nerfattack.scenario.scenario import Scenario
-from mi_nerfattack.scenario.world import judged_frames
 from mi_nerfattack.system.extras import load_extra
 
 FORMAT = "mi_nerfattack sweep 1"
@@ -63,7 +61,7 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
     folder = folder_of(sweep, cell)
     document = files.read_json(folder / "metrics.json")
     about = files.read_json(folder / PROVENANCE)
-    frames = _frames(cell.scenario, document)
+    frames = _frames(document)
     labels = _labels(cell) | {"versions": json.dumps(about["versions"])}
     return [
         {
@@ -184,16 +182,15 @@ def _labels(cell: Cell) -> Row:
     }
 
 
-def _frames(scenario: Scenario, document: Any) -> dict[str, int]:
+def _frames(document: Any) -> dict[str, int]:
     """Return the frames that finding what each case shows has cost.
 
     Args:
-        scenario: of the cell.
         document: content of ``metrics.json``.
     """
-    judged = judged_frames(scenario)
+    frames = document["curve"]["frames"]  # every method's first is one judgement
     return {
-        RANDOM: judged,
-        BEST_RANDOM: judged * document["baseline"]["textures"],
-        ATTACK: document["curve"]["frames"][-1],
+        RANDOM: frames[0],
+        BEST_RANDOM: frames[0] * document["baseline"]["textures"],
+        ATTACK: frames[-1],
     }

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from mi_nerfattack.errors import InputError, SetupError, is_interrupt
+from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.onnx.budget import Budget
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
+from mi_nerfattack.system.extras import load_extra
 
 MAX_ONNX_BYTES = 1 << 31
 MAX_VALUE_BYTES = 1 << 30  # of all nodes, an image
@@ -172,13 +173,7 @@ def load_onnx(path: Path) -> OnnxNetwork:
             that are not supported, by name.
         SetupError: the package ``onnx`` is not installed.
     """
-    try:
-        import onnx
-    except ImportError as err:
-        raise SetupError(
-            f"{path}: reading it needs the package onnx; pip install "
-            "'mi-nerfattack[onnx]'"
-        ) from err
+    onnx = load_extra("onnx", "onnx", f"{path}: reading it")
     raw = files.read_bytes(path, MAX_ONNX_BYTES)
     try:
         model = onnx.load_model_from_string(raw)

@@ -66,6 +66,10 @@ class Pose:
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Pose(rotation, np.asarray(position, float), scale)
 
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Turn points (..., 3) of the field into points of the world, metres."""
+        return self.scale * points @ self.rotation.T + self.translation
+
     @property
     def yaw(self) -> float:
         """Angle about the world's z axis from its x axis to the field's, radians."""

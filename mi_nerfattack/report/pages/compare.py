@@ -20,13 +20,12 @@ from mi_nerfattack.fit.scores import HAZY
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.elements import render
 from mi_nerfattack.report.pages.fit import finite
-from mi_nerfattack.report.plots.charts import chart
+from mi_nerfattack.report.plots.charts import PALETTE, chart
 from mi_nerfattack.report.plots.views import ViewPair, write_colours, write_depths
 
 MIN_PSNR_DB = 26.0  # mean along a route
 MAX_DEPTH_M = 0.1  # median error along a route, near the camera
 MAX_HOLES = 0.005  # share of the scene's surfaces, mean along a route
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def write_compare_report(folder: Path, comparison: Comparison, title: str) -> Path:
@@ -275,7 +274,7 @@ def write_along(path: str | Path, comparison: Comparison) -> None:
         labels = ("PSNR (dB)", "SSIM", "depth error (m)", "rays (%)")
         handles: list[Any] = []
         for i, route in enumerate(comparison.routes):
-            style = {"color": _COLOURS[i % len(_COLOURS)], "linewidth": 1.6}
+            style = {"color": PALETTE[i % len(PALETTE)], "linewidth": 1.6}
             handles.append(Line2D([], [], label=route.name, **style))
             arc = [station.arc_m for station in route.stations]
             for axis, name, dash, factor in _LINES:

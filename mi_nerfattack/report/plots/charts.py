@@ -16,7 +16,10 @@ from mi_nerfattack.io import files
 
 WIDTH_PX = 1200
 DPI = 150
-BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#7f7f7f"  # Okabe and Ito 2008
+#: After Okabe and Ito 2008.
+BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+YELLOW, SKY, GREY = "#E69F00", "#56B4E9", "#7f7f7f"
+PALETTE = BLUE, ORANGE, GREEN, PINK, YELLOW, SKY
 
 RC: Any = {
     "font.family": "DejaVu Sans",

@@ -21,7 +21,16 @@ from matplotlib.patheffects import withStroke
 
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.render.camera.outside import Overhead
-from mi_nerfattack.report.plots.charts import DPI, RC, WIDTH_PX, chart, save
+from mi_nerfattack.report.plots.charts import (
+    BLUE,
+    DPI,
+    GREY,
+    ORANGE,
+    RC,
+    WIDTH_PX,
+    chart,
+    save,
+)
 from mi_nerfattack.rollout.drive import (
     ATTACK,
     BEST_RANDOM,
@@ -33,9 +42,9 @@ from mi_nerfattack.rollout.drive import (
 )
 
 _STYLES: dict[str, dict[str, Any]] = {
-    RANDOM: {"color": "#7f7f7f", "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
+    RANDOM: {"color": GREY, "linewidth": 0.8, "alpha": 0.75, "zorder": 3},
     NO_OBJECT: {"color": "#00C48F", "linewidth": 0.9, "zorder": 4.2},
-    OWN: {"color": "#0072B2", "linewidth": 2.2, "zorder": 4},
+    OWN: {"color": BLUE, "linewidth": 2.2, "zorder": 4},
     BEST_RANDOM: {
         "color": "#8A4F7D",
         "linewidth": 1.6,
@@ -43,7 +52,7 @@ _STYLES: dict[str, dict[str, Any]] = {
         "linestyle": (0, (1.5, 1)),
     },
     ATTACK: {
-        "color": "#D55E00",
+        "color": ORANGE,
         "linewidth": 2.0,
         "zorder": 5,
         "linestyle": (0, (5, 1.2)),

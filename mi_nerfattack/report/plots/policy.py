@@ -10,13 +10,13 @@ from typing import Any
 from matplotlib.lines import Line2D
 
 from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
-from mi_nerfattack.rollout.drive import RANDOM, Drive
+from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "no_object": {"color": BLUE, "linewidth": 0.9},
+    NO_OBJECT: {"color": BLUE, "linewidth": 0.9},
     "expert": {"color": GREY, "linewidth": 0.8, "linestyle": ":"},
 }
-_LABELS = {"no_object": "alone", "expert": "expert, alone"}
+_LABELS = {NO_OBJECT: "alone", "expert": "expert, alone"}
 _PAST = {"color": ORANGE, "linewidth": 0.8, "linestyle": (0, (5, 1.2))}
 #: Of further numbers of objects.
 _COLORS = (ORANGE, "#882255", "#117733", "#AA4499")

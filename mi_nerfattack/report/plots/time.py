@@ -11,10 +11,19 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
+from mi_nerfattack.report.plots.charts import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    SKY,
+    YELLOW,
+    chart,
+)
 
-#: Okabe and Ito 2008, for objects.
-PALETTE = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#0072B2", "#D55E00")
+#: Of objects: last the colours of the other lines.
+_COLOURS = YELLOW, SKY, GREEN, PINK, BLUE, ORANGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +121,7 @@ def _draw_shares(axis: Axes, data: TimeAttribution) -> None:
             share,
             width,
             bottom,
-            color=PALETTE[index % len(PALETTE)],
+            color=_COLOURS[index % len(_COLOURS)],
             edgecolor="white",
             linewidth=0.4,
             label=name,

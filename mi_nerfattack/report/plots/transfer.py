@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from mi_nerfattack.report.plots.charts import GREY, chart
+from mi_nerfattack.report.plots.charts import GREY, PALETTE, chart
 from mi_nerfattack.rollout.drive import ATTACK
 from mi_nerfattack.scenario.deployment import SURROGATE
 
@@ -139,14 +139,10 @@ def _curve(
         axis.errorbar(x, y, bars, capsize=3, linewidth=1, **style)
 
 
-#: Of environments; colours after Okabe and Ito 2008.
+#: Of environments.
 _STYLES: list[dict[str, Any]] = [
     {"color": color, "marker": marker}
-    for color, marker in zip(
-        ("#7f7f7f", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
-        "osD^vP*",
-        strict=True,
-    )
+    for color, marker in zip((GREY, *PALETTE), "osD^vP*", strict=True)
 ]
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6}
 
