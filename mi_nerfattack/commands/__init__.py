@@ -22,6 +22,7 @@ from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.replay import Replay
+from mi_nerfattack.commands.report import Report
 from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
@@ -54,6 +55,7 @@ COMMANDS: dict[str, type[Command]] = {
     "replay": Replay,
     "transfer": Transfer,
     "retrain": Retrain,
+    "report": Report,
 }
 
 __all__ = ["COMMANDS", "Command"]

@@ -79,16 +79,13 @@ def attribute(
 
 def write_attribution(
     folder: Path, found: FailureAttribution, fields: Sequence[GridField]
-) -> dict[str, Path]:
+) -> None:
     """Write ``attribution.json``, ``attribution.png``, ``attribution_object.png``.
 
     Args:
         folder: the run folder.
         found: from :func:`attribute`.
         fields: the objects, with the textures that are to be seen.
-
-    Returns:
-        the pictures by title.
     """
     times = found.times
     data = {
@@ -99,13 +96,10 @@ def write_attribution(
         "gradient_share": _columns(times.objects, times.shares),
     }
     files.write_json(folder / "attribution.json", data)
-    when, where = folder / "attribution.png", folder / "attribution_object.png"
-    plot_attribution(when, times, found.subject)
+    plot_attribution(folder / "attribution.png", times, found.subject)
     pairs = zip(times.objects, fields, found.textures, strict=True)
-    write_heat(where, {name: side_views(grid, g) for name, grid, g in pairs})
-    note = f" ({UNCHANGED})" if found.subject == UNCHANGED else ""
-    titles = (f"{word} the failure is made{note}" for word in ("When", "Where"))
-    return dict(zip(titles, (when, where), strict=True))
+    sides = {name: side_views(grid, g) for name, grid, g in pairs}
+    write_heat(folder / "attribution_object.png", sides)
 
 
 def _columns(names: Sequence[str], table: np.ndarray) -> dict[str, list[float]]:

@@ -167,7 +167,7 @@ class Job:
             flags,
         )
         how = self.on_progress, self.on_notice, self.frames
-        return results.write_results(self.output, done, self.text, effort, *how)
+        return results.write_results(self.output, done, effort, *how)
 
     def _check(
         self, world: World, folder: RunFolder, stages: Stages, anyway: bool

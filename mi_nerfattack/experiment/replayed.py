@@ -84,25 +84,17 @@ def write_control_changes(output: Path, drives: Sequence[Drive]) -> None:
     files.write_text(output / "controls.csv", buffer.getvalue())
 
 
-def plot_control_changes(
-    output: Path, drives: Sequence[Drive], unit: str
-) -> dict[str, Path]:
-    """Write a plot of each environment.
+def plot_control_changes(output: Path, drives: Sequence[Drive], unit: str) -> None:
+    """Write ``controls_NAME.png`` of each environment.
 
     Args:
         output: the run folder.
         drives: as of :func:`control_changes`.
         unit: of the control.
-
-    Returns:
-        the plots by title.
     """
-    images = {}
     for environment, group in _environments(drives).items():
         path = output / f"controls_{environment}.png"
         control_change(path, group, _own(group), unit)
-        images[f"Change of control in the recording, {environment}"] = path
-    return images
 
 
 def _environments(drives: Sequence[Drive]) -> dict[str, list[Drive]]:

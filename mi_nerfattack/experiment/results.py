@@ -7,20 +7,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.evaluation.flags import run_flags
 from mi_nerfattack.evaluation.metrics import metrics_document, validate
 from mi_nerfattack.evaluation.textures import texture_figures
 from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.finished import Finished, Frames
+from mi_nerfattack.experiment.page.run import read_run
+from mi_nerfattack.experiment.page.write import write_page
 from mi_nerfattack.experiment.pictures.write import write_images
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.stages import OnProgress
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.attack import write_report
 from mi_nerfattack.report.table import write_steps
 from mi_nerfattack.rollout.drive import ATTACK, OWN
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -30,7 +30,6 @@ from mi_nerfattack.scenario.world import Appearance, World
 def write_results(
     output: Path,
     done: Finished,
-    scenario_text: str,
     effort: Callable[[], Effort],
     on_progress: OnProgress,
     on_notice: Callable[[str], None],
@@ -41,7 +40,6 @@ def write_results(
     Args:
         output: the run folder, present.
         done: what the run came to.
-        scenario_text: the scenario file.
         effort: tells what the run has cost so far.
         on_progress: told about every time step of attribution and frames.
         on_notice: told what is safe when pictures fail.
@@ -59,11 +57,10 @@ def write_results(
     if frames is None:
         return document
     try:
-        images = write_images(output, done, history, frames, on_progress)
+        write_images(output, done, history, frames, on_progress)
         document["cost"] = effort().model_dump()
         files.write_json(path, document)
-        page = output / "report.html"
-        write_report(page, document, images, scenario_text, versions())
+        write_page(output / "report.html", [read_run(output, output.name)])
     except BaseException:
         on_notice(
             f"{path}: holds all figures; pictures are missing: make room if the disk "

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.checkpoint import CheckpointFile
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
@@ -14,12 +17,40 @@ from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM
 
 CHECKPOINT = "checkpoint.safetensors"
 DRIVES = "drives"
+METRICS = "metrics.json"
 SCENARIO = "scenario.toml"
 
 
 def object_path(folder: Path, name: str) -> Path:
     """Return the file of an attacked object, by its id, in a run folder."""
     return folder / "objects" / f"{name}.safetensors"
+
+
+def read_finished(folder: Path) -> dict[str, Any]:
+    """Read what ``metrics.json`` of a finished run holds.
+
+    Raises:
+        InputError: the folder holds no finished run, or the file is damaged.
+    """
+    path = folder / METRICS
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: holds no finished attack, {METRICS} is missing; give run "
+            "folders of 'mi-nerfattack attack', which finishes one with --resume"
+        )
+    document = files.read_json(path)
+    validate(document)
+    return document
+
+
+def folder_labels(folders: Sequence[Path]) -> list[str]:
+    """Tell folders apart by as little of their paths as does it."""
+    paths = [os.path.abspath(folder) for folder in folders]
+    names = [Path(path).name for path in paths]
+    if len(set(names)) == len(names):
+        return names
+    start = os.path.commonpath(paths)
+    return [os.path.relpath(path, start) for path in paths]
 
 
 class RunFolder:

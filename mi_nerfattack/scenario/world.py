@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -367,10 +367,10 @@ def initial_states(
     return route.pose_at(*shifts)
 
 
-def object_footprints(world: World) -> list[np.ndarray]:
+def object_footprints(objects: Iterable[PosedField]) -> list[np.ndarray]:
     """Return the outlines of the objects' boxes on the ground, (4, 2) metres each."""
     outlines = []
-    for posed in world.surrogate.objects:
+    for posed in objects:
         low, high = posed.field.lower, posed.field.upper
         x, y = (low[0], high[0], high[0], low[0]), (low[1], low[1], high[1], high[1])
         corners = np.stack([x, y, np.zeros(4)], axis=1)

@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 def leave_out_results(monkeypatch):
     from mi_nerfattack.experiment import results
 
-    def only_numbers(output, done, text, effort, *more):
+    def only_numbers(output, done, effort, *more):
         cost = effort().model_dump()
         files.write_json(output / "metrics.json", {"cost": cost})
         found = {"ignored_changes": done.ignored, "flags": done.flags}

@@ -220,7 +220,7 @@ class Check:
         return Overlay(
             [world.route],
             (float(arc[0]), float(arc[-1])),
-            dict(zip(names, object_footprints(world), strict=True)),
+            dict(zip(names, object_footprints(posed), strict=True)),
             {n: _top(item) for n, item in zip(names, posed, strict=True)},
             world.initial,
             scenario.vehicle.width_m,

@@ -72,7 +72,7 @@ def frame_steps(drive: Drive, frames: Frames) -> list[int]:
 
 def write_frames(
     output: Path, done: Finished, frames: Frames, on_progress: OnProgress
-) -> Path:
+) -> None:
     """Write ``strip.png`` and ``frames/``.
 
     Args:
@@ -80,9 +80,6 @@ def write_frames(
         done: what the run came to.
         frames: which frames become files.
         on_progress: told about every time step.
-
-    Returns:
-        the strip.
     """
     world, nominal = done.world, nominal_drives(done)
     places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)
@@ -112,9 +109,8 @@ def write_frames(
         finally:
             environment.close()
         count += len(drive.controls) + 1
-    path = output / "strip.png"
-    first_person_strip(path, rows, [f"{place:.1f} m" for place in places])
-    return path
+    titles = [f"{place:.1f} m" for place in places]
+    first_person_strip(output / "strip.png", rows, titles)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from mi_nerfattack.scenario.world import object_footprints
 _GROUND_PX = 400  # of the longer edge of pictures from above
 
 
-def write_triptych(output: Path, done: Finished) -> Path:
+def write_triptych(output: Path, done: Finished) -> None:
     """Draw unperturbed, surrogate and transferred drives over the rendered ground.
 
     Args:
@@ -36,7 +36,8 @@ def write_triptych(output: Path, done: Finished) -> Path:
         [d for d in done.driven if (d.case, d.environment) == pair] for pair in pairs
     ]
     points = [d.states[:, :2] for group in groups for d in group]
-    seen = np.concatenate([*points, *object_footprints(world)])
+    footprints = object_footprints(world.surrogate.objects)
+    seen = np.concatenate([*points, *footprints])
     overhead = Overhead.covering(seen, route.lane_width_m, _GROUND_PX)
     scene = mesh_scene(world)
     bare = None if scene is None else scene_above(scene, overhead, points[0], 4)
@@ -48,8 +49,9 @@ def write_triptych(output: Path, done: Finished) -> Path:
         else:
             objects = world.surrogate.objects
             ground = Paster(overhead.camera, objects).paste(bare).image
-        panels.append(plots.Panel(drives, ground, object_footprints(world)))
+        panels.append(
+            plots.Panel(drives, ground, object_footprints(world.surrogate.objects))
+        )
     world.show(done.look(ATTACK))
     path, lane = output / "triptych.png", (route.lane_width_m, done.lane.wheel_m)
     plots.triptych(path, panels, overhead, route.points, *lane)
-    return path

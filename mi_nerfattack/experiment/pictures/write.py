@@ -23,56 +23,45 @@ def write_images(
     history: list[dict[str, Any]],
     frames: Frames,
     on_progress: OnProgress,
-) -> dict[str, Path]:
+) -> None:
     """Write plots, attribution and frames; of all frames, videos, too.
 
     Args:
-        output: the run folder.
+        output: the run folder; what an earlier run left of attribution and videos is
+            removed.
         done: what the run came to; the objects look different afterwards.
         history: a record an iteration of the attack.
         frames: which frames become files.
         on_progress: told about every time step of attribution and frames.
-
-    Returns:
-        the figures of the page by their titles.
     """
     world, limit = done.world, done.lane.wheel_m
-    images = _write_plots(output, done, history)
+    for path in (*output.glob("attribution*"), *(output / "videos").glob("*.mp4")):
+        path.unlink()
+    _write_plots(output, done, history)
     unit = world.scenario.vehicle.car().control_unit
-    images["Trajectories over the ground"] = write_triptych(output, done)
-    images |= plot_control_changes(output, done.replayed, unit)
+    write_triptych(output, done)
+    plot_control_changes(output, done.replayed, unit)
     if world.policy.differentiable:
         names = [item.id for item in world.scenario.objects]
         sweeps = 3 * world.horizon
         on_step = step_counter(on_progress, "surrogate: attribution", sweeps)
         found = attribute(done.attack, names, limit, on_step)
-        images |= write_attribution(output, found, world.fields)
-    images["First-person frames"] = write_frames(output, done, frames, on_progress)
-    for path in (output / "videos").glob("*.mp4"):  # of an earlier run
-        path.unlink()
+        write_attribution(output, found, world.fields)
+    write_frames(output, done, frames, on_progress)
     if frames == "all":
         write_videos(output, done, on_progress)
-    return images
 
 
-def _write_plots(
-    output: Path, done: Finished, history: list[dict[str, Any]]
-) -> dict[str, Path]:
-    images = {
-        "Overhead view": output / "overhead.png",
-        "Cross-track error": output / "errors.png",
-        "Convergence of the attack": output / "convergence.png",
-    }
+def _write_plots(output: Path, done: Finished, history: list[dict[str, Any]]) -> None:
     world, drives, limit = done.world, done.driven, done.lane.wheel_m
     route = world.route
     plots.overhead(
-        images["Overhead view"],
+        output / "overhead.png",
         drives,
         route.points,
         route.lane_width_m,
-        object_footprints(world),
+        object_footprints(world.surrogate.objects),
         limit,
     )
-    plots.errors(images["Cross-track error"], drives, limit)
-    convergence(images["Convergence of the attack"], history, done.curve)
-    return images
+    plots.errors(output / "errors.png", drives, limit)
+    convergence(output / "convergence.png", history, done.curve)

@@ -16,9 +16,14 @@ import numpy as np
 
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.baseline import random_appearance
-from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO, object_path
+from mi_nerfattack.experiment.run_folder import (
+    CHECKPOINT,
+    SCENARIO,
+    folder_labels,
+    object_path,
+    read_finished,
+)
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import differences, refuse
@@ -136,23 +141,12 @@ def read_found(folders: Sequence[Path]) -> tuple[FoundAttack, ...]:
     paths = [os.path.abspath(folder) for folder in folders]
     if not paths or len(set(paths)) < len(paths):
         raise InputError("RUN: at least one run folder, each once")
-    names = [Path(path).name for path in paths]
-    unique = len(set(names)) == len(names)
-    start = os.path.commonpath(paths) if len(paths) > 1 else ""
-    labels = names if unique else [os.path.relpath(path, start) for path in paths]
-    pairs = zip(folders, labels, strict=True)
+    pairs = zip(folders, folder_labels(folders), strict=True)
     return tuple(_read(Path(path), label) for path, label in pairs)
 
 
 def _read(folder: Path, label: str) -> FoundAttack:
-    metrics = folder / "metrics.json"
-    if not metrics.is_file():
-        raise InputError(
-            f"{folder}: holds no finished attack, {metrics.name} is missing; give run "
-            "folders of 'mi-nerfattack attack', which finishes one with --resume"
-        )
-    document = files.read_json(metrics)
-    validate(document)
+    document = read_finished(folder)
     scenario, _ = load_scenario(folder / SCENARIO)
     identity = scenario.identity()
     _check_unchanged(folder / CHECKPOINT, identity)

@@ -13,6 +13,8 @@ from PIL import Image
 
 from mi_nerfattack.io import files
 
+_EXACT_BYTES = 200_000  # on a page, of an image whose pixels are kept as they are
+_QUALITY = 85  # of larger ones
 # What ends a cell of a table or begins an element, and how Markdown shows it.
 _IN_MARKDOWN = str.maketrans({"&": "&amp;", "<": "&lt;", "|": "\\|", "\n": " "})
 
@@ -28,12 +30,24 @@ def render(template: str, **values: Any) -> str:
     return environment.get_template(template).render(values)
 
 
-def _embedded(path: str | Path) -> Markup:
-    """Return the address of an image file as PNG that holds its pixels."""
+def address(image: Image.Image, **options: Any) -> Markup:
+    """Return the address of an image that holds it: WebP in a `data:` URI.
+
+    Args:
+        image: sRGB.
+        options: of Pillow's writer of WebP.
+    """
     buffer = io.BytesIO()
-    Image.fromarray(files.read_image(path)).save(buffer, "PNG")
+    image.save(buffer, "WEBP", **options)
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Markup(f"data:image/png;base64,{data}")
+    return Markup(f"data:image/webp;base64,{data}")
+
+
+def _embedded(path: str | Path) -> Markup:
+    """Return the address of an image file; exact, unless that takes too much room."""
+    image = Image.fromarray(files.read_image(path))
+    exact = address(image, lossless=True, quality=60, method=3)
+    return exact if len(exact) <= _EXACT_BYTES else address(image, quality=_QUALITY)
 
 
 def _in_markdown(value: Any) -> Markup:

@@ -1,4 +1,4 @@
-"""Plot of what an attack found, and at what cost."""
+"""Plots of what attacks found, and at what cost."""
 
 from __future__ import annotations
 
@@ -6,8 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from mi_nerfattack.report.plots.charts import BLUE, ORANGE, chart
+
+#: `frames` rendered, increasing, and `cross_track_mean_m` of the best until then.
+Curves = list[Mapping[str, Sequence[float]]]
+
+#: Of methods; colours after Okabe and Ito 2008.
+_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")
+_DASHES = ("-", "--", "-.", ":")
 
 
 def convergence(
@@ -46,3 +54,51 @@ def convergence(
         words = "iteration" if curve is None else "frames rendered, or their cost"
         figure.axes[-1].set_xlabel(words)
         figure.align_ylabels()
+
+
+def damage(path: str | Path, methods: Mapping[str, Curves]) -> None:
+    """Plot the mean distance from the lane centre against rendered frames.
+
+    Of a method with several attacks, their median, and the range of them; as far as
+    all of them have begun.
+
+    Args:
+        path: PNG file.
+        methods: curves of attacks by method, at least one each.
+    """
+    with chart(path, 4.2) as figure:
+        axis = figure.subplots()
+        for number, (method, curves) in enumerate(methods.items()):
+            color = _COLOURS[number % len(_COLOURS)]
+            style = _DASHES[number // len(_COLOURS) % len(_DASHES)]
+            _draw(axis, curves, f"{method} ({len(curves)})", color, style)
+        axis.set_ylim(bottom=0)
+        axis.set_xlim(left=0)
+        axis.set_xlabel("frames rendered, or their cost")
+        axis.set_ylabel("mean distance from\nthe lane centre (m)")
+        axis.set_title(
+            "best so far in the surrogate; median and range of so many attacks",
+            loc="left",
+            fontsize=9,
+        )
+        axis.grid(alpha=0.25)
+        figure.legend(loc="outside lower center", ncols=4, frameon=False)
+
+
+def _draw(axis: Axes, curves: Curves, label: str, color: str, style: str) -> None:
+    begun = max(curve["frames"][0] for curve in curves)
+    frames = np.unique(np.concatenate([curve["frames"] for curve in curves]))
+    frames = frames[frames >= begun]
+    table = np.stack([_held(curve, frames) for curve in curves])
+    look = {"color": color, "linewidth": 1.6, "linestyle": style, "label": label}
+    axis.step(frames, np.median(table, axis=0), where="post", **look)
+    if len(curves) > 1:
+        ends = table.min(axis=0), table.max(axis=0)
+        band = {"step": "post", "facecolor": color, "alpha": 0.18, "linewidth": 0}
+        axis.fill_between(frames, *ends, **band)
+
+
+def _held(curve: Mapping[str, Sequence[float]], frames: np.ndarray) -> np.ndarray:
+    """Return what had been found after so many frames."""
+    done = np.searchsorted(curve["frames"], frames, side="right")
+    return np.asarray(curve["cross_track_mean_m"])[done - 1]

@@ -15,28 +15,16 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.render.camera.intrinsics import (
-    Camera,
-    generate_rays,
-    look_at,
-    pose_arrays,
-)
-from mi_nerfattack.render.march import march
-from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.report.plots.around import PAPER, Around, over_paper
 from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
 
 #: Sides of the object, by the compass of its own frame: degrees about z from +x.
 SIDES = {"from +x": 0.0, "from +y": 90.0, "from -x": 180.0, "from -y": 270.0}
-ELEVATION_DEG = 15.0
-DISTANCE = 4.0  # of the eye from the object's centre, in radii of its box
 #: Opacity below which a pixel counts as beside the object.
 VISIBLE = 0.1
 COLOUR_MAP = "viridis"  # perceptually uniform
-PAPER = np.array([1.0, 1.0, 1.0])
 #: The finest level that is shown has at most so many vertices along an edge: finer
 #: ones show which rays were traced rather than where the object matters.
 MAX_RESOLUTION = 28
@@ -140,19 +128,14 @@ def side_views(
     """
     values = surface_heat(grid, gradient)
     largest = values.max() or 1.0  # keeps the march in a good range of numbers
-    colours = PosedField(grid)
-    heats = PosedField(MagnitudeField(grid, values / largest))
-    poses = {name: _pose(grid, azimuth) for name, azimuth in SIDES.items()}
-    camera = _camera(grid, list(poses.values()), edge_px)
+    around = Around(grid.lower, grid.upper, list(SIDES.values()), edge_px)
+    heats = around.views(MagnitudeField(grid, values / largest))
     views = []
-    for name, pose in poses.items():
-        colour, opacity = _render(colours, camera, pose)
-        heat, _ = _render(heats, camera, pose)
+    for name, look, (heat, _) in zip(SIDES, around.views(grid), heats, strict=True):
+        opacity = look[1]
         seen = opacity > VISIBLE
         shown = heat[..., 0] / np.where(seen, opacity, 1) * largest
-        over = colour + (1 - opacity[..., None]) * PAPER
-        srgb = linear_to_srgb_numpy(over).clip(0, 1)
-        views.append(SideView(name, srgb, np.where(seen, shown, np.nan)))
+        views.append(SideView(name, over_paper(*look), np.where(seen, shown, np.nan)))
     return views
 
 
@@ -210,42 +193,6 @@ def _shown_level(grid: GridField) -> tuple[int, int]:
         if level == 0 or best[1] < resolution <= MAX_RESOLUTION:
             best = level, resolution
     return best
-
-
-def _pose(grid: GridField, azimuth_deg: float) -> np.ndarray:
-    """Place the eye on one side of the object, camera_to_world (4, 4)."""
-    centre = 0.5 * (grid.lower + grid.upper)
-    distance = DISTANCE * 0.5 * float(np.linalg.norm(grid.upper - grid.lower))
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(ELEVATION_DEG)
-    level = np.cos(elevation)
-    outwards = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
-    return look_at(centre + distance * np.array(outwards), centre)
-
-
-def _camera(grid: GridField, poses: Sequence[np.ndarray], edge_px: int) -> Camera:
-    """Make the camera whose frame the object's box just fits in from all poses."""
-    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper, strict=True)), -1)
-    corners = corners.reshape(-1, 3)
-    slopes = []
-    for pose in poses:
-        local = (corners - pose[:3, 3]) @ pose[:3, :3]
-        slopes.append(np.abs(local[:, :2] / local[:, 2:]).max(axis=0))
-    reach = np.max(slopes, axis=0)
-    focal = 0.5 * edge_px / reach.max()
-    width, height = (max(1, int(size)) for size in np.ceil(2 * focal * reach))
-    return Camera(width, height, focal, focal, width / 2, height / 2)
-
-
-def _render(
-    posed: PosedField, camera: Camera, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return premultiplied radiance (height, width, 3) and opacity."""
-    origin, direction = generate_rays(camera, *pose_arrays(pose), 1)
-    seen = march(posed, Rays(origin, direction))
-    dr.eval(seen.radiance, seen.opacity)
-    shape = (camera.height, camera.width)
-    radiance = seen.radiance.numpy().T.reshape(*shape, 3)
-    return radiance.copy(), seen.opacity.numpy().reshape(shape).copy()
 
 
 def _coloured(view: SideView, norm: Normalize) -> np.ndarray:

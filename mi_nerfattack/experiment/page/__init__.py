@@ -1,0 +1,1 @@
+"""One page of what run folders, sweeps, transfers and retrainings came to."""
