@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from mi_nerfattack.report.plots.charts import BLUE, ORANGE, chart
+from mi_nerfattack.report.plots.charts import BLUE, ORANGE, PALETTE, chart
 
 #: `frames` rendered, increasing, and `cross_track_mean_m` of the best until then.
 Curves = list[Mapping[str, Sequence[float]]]
 
-#: Of methods; colours after Okabe and Ito 2008.
-_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")
 _DASHES = ("-", "--", "-.", ":")
 
 
@@ -69,8 +67,8 @@ def damage(path: str | Path, methods: Mapping[str, Curves]) -> None:
     with chart(path, 4.2) as figure:
         axis = figure.subplots()
         for number, (method, curves) in enumerate(methods.items()):
-            color = _COLOURS[number % len(_COLOURS)]
-            style = _DASHES[number // len(_COLOURS) % len(_DASHES)]
+            color = PALETTE[number % len(PALETTE)]
+            style = _DASHES[number // len(PALETTE) % len(_DASHES)]
             _draw(axis, curves, f"{method} ({len(curves)})", color, style)
         axis.set_ylim(bottom=0)
         axis.set_xlim(left=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,7 @@ def side_views(
 
 
 def write_heat(
-    path: str | Path, objects: dict[str, Sequence[SideView]], unit: str = "cost"
+    path: str | Path, objects: Mapping[str, Sequence[SideView]], unit: str = "cost"
 ) -> None:
     """Write a picture: two rows an object, as it looks and its heat, a column a side.
 
@@ -176,7 +176,7 @@ def write_heat(
         bar.set_label(f"|d {unit} / d raw colour| per m³")
 
 
-def _height_in(objects: dict[str, Sequence[SideView]]) -> float:
+def _height_in(objects: Mapping[str, Sequence[SideView]]) -> float:
     """Return the height at which views fill their cells, inches."""
     cell_in = WIDTH_PX / DPI / (len(SIDES) + 0.7)
     aspects = [views[0].heat.shape for views in objects.values()]
