@@ -16,6 +16,7 @@ from bench.commands.speed import (
     BenchSteps,
 )
 from bench.commands.study import BenchStudy
+from bench.commands.table2 import BenchTable2
 from bench.commands.training import BenchCollect, BenchDagger
 from mi_nerfattack import cli
 
@@ -32,6 +33,7 @@ COMMANDS = {
     "collect": BenchCollect,
     "dagger": BenchDagger,
     "study": BenchStudy,
+    "table2": BenchTable2,
 }
 
 

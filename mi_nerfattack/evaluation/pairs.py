@@ -112,6 +112,33 @@ class Departures:
     p_value: float
 
 
+def over_attacks(
+    errors_m: np.ndarray, wheel_out_s: np.ndarray, seed: int
+) -> dict[str, Any]:
+    """Summarise attacks, each of which counts once.
+
+    Args:
+        errors_m: (n,), the mean error of each, over its drives.
+        wheel_out_s: (n,), mean seconds with a wheel out.
+        seed: of the resampling.
+
+    Returns:
+        how many ``attacks``; mean error, its standard deviation (None of one) and BCa
+        interval; mean seconds; how many are out for `DEPARTED_S`, with Wilson's
+        interval of their share.
+    """
+    count, out = len(errors_m), int((wheel_out_s >= DEPARTED_S).sum())
+    return {
+        "attacks": count,
+        "cross_track_mean_m": float(errors_m.mean()),
+        "cross_track_sd_m": float(errors_m.std(ddof=1)) if count > 1 else None,
+        "cross_track_mean_ci95_m": mean_interval(errors_m, seed),
+        "wheel_out_s": float(wheel_out_s.mean()),
+        "attacks_out": out,
+        "attacks_out_rate_ci95": share_interval(out, count),
+    }
+
+
 def outcomes(
     document: Mapping[str, Any],
     environment: str,

@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mi_nerfattack.evaluation.flags import black_box_better, noise_larger
-from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
+from mi_nerfattack.evaluation.intervals import share_interval
 from mi_nerfattack.evaluation.pairs import (
     DEPARTED_S,
     Effect,
     Outcome,
     compare,
     compare_departures,
+    over_attacks,
 )
 from mi_nerfattack.experiment.sweep.table import RESULTS, Row, read_table
 from mi_nerfattack.io import files
@@ -141,26 +142,18 @@ def _about(group: Group, rows: Sequence[Row]) -> dict[str, Any]:
     def over(figure: Callable[[Row], float]) -> np.ndarray:
         return np.array([np.mean([figure(row) for row in own]) for own in attacks])
 
-    errors = over(lambda row: row[_ERROR])
-    outside = over(lambda row: row["wheel_out_s"])
-    out = int((outside >= DEPARTED_S).sum())
     left = sum(row["departed"] for row in rows)
+    errors, out_s = over(lambda row: row[_ERROR]), over(lambda row: row["wheel_out_s"])
     return {
         **group._asdict(),
-        "attacks": len(attacks),
         "places": len({(row["route"], row["objects"]) for row in rows}),
         "seeds": len({row["seed"] for row in rows}),
         "frames": float(over(lambda row: row["frames"]).mean()),
-        "cross_track_mean_m": float(errors.mean()),
-        "cross_track_sd_m": float(errors.std(ddof=1)) if len(errors) > 1 else None,
-        "cross_track_mean_ci95_m": mean_interval(errors, _SEED),
+        **over_attacks(errors, out_s, _SEED),
         "cross_track_total": float(over(lambda r: r[_ERROR] * r["steps"]).mean()),
-        "wheel_out_s": float(outside.mean()),
         "drives": len(rows),
         "drives_departed": left,
         "departure_rate_ci95": share_interval(left, len(rows)),
-        "attacks_out": out,
-        "attacks_out_rate_ci95": share_interval(out, len(attacks)),
     }
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.evaluation.intervals import mean_interval, share_interval
+from mi_nerfattack.evaluation.intervals import share_interval
 from mi_nerfattack.evaluation.metrics import summarise
-from mi_nerfattack.evaluation.pairs import DEPARTED_S
+from mi_nerfattack.evaluation.pairs import DEPARTED_S, over_attacks
 from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
@@ -160,16 +160,15 @@ def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]
 
 def _over_attacks(cases: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
     """Summarise a case of one column over the attacks, each of which counts once."""
-    means = np.array([case["cross_track_mean_m"] for case in cases])
-    out = sum(_is_out(case) for case in cases)
+    errors, out_s = (
+        np.array([case[name] for case in cases])
+        for name in ("cross_track_mean_m", "wheel_out_s")
+    )
     return {
-        "cross_track_mean_m": float(means.mean()),
-        "cross_track_mean_ci95_m": mean_interval(means, seed),
+        **over_attacks(errors, out_s, seed),
         "cross_track_max_m": max(case["cross_track_max_m"] for case in cases),
         "drives": sum(case["n"] for case in cases),
         "drives_departed": sum(case["drives_departed"] for case in cases),
-        "attacks_out": out,
-        "attacks_out_rate_ci95": share_interval(out, len(cases)),
     }
 
 

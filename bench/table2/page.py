@@ -1,0 +1,141 @@
+"""Table 2 of the paper beside a sweep's figures: a page in Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+
+from bench.table2.rows import (
+    COLUMNS,
+    FLOOR,
+    STEPS,
+    TITLES,
+    Figures,
+    Table,
+    against_rows,
+    aim_rows,
+    cell,
+    detail_rows,
+    make_table,
+    own_rows,
+    paper_rows,
+)
+from mi_nerfattack.experiment.retrain.compare import AFTER, BEFORE
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
+
+_INTRODUCTION = """\
+# Table 2 of the paper, on the bundled intersection
+
+Three cars and three hydrants at natural size, attacked at once on three routes. Places,
+seeds and budget are those of [`scenes/table2.toml`](../../scenes/table2.toml), settled
+before the first result. Beside this page lie `results.parquet`, a row a drive, and
+`summary.json`, of which the page is made ([what they hold](../sweep.md#the-table)).
+
+Figures are mean distances from the lane's centre, metres: mean ± standard deviation
+over attacks [95 % interval, BCa] (attacks); then how many of them have a wheel out of
+the lane for 1 s, in the mean over their drives [95 % interval, Wilson, per cent]. An
+attack is a seed with a place of its own."""
+_UNIT = f"""\
+The paper sums the distance over {STEPS} steps of 0.01 s, from a line 2 m beside the
+lane's centre: a drive along the centre has {FLOOR:,} metre-steps, one that strays away
+from the line more, one that strays towards it less. In brackets: (total - {FLOOR:,}) /
+{STEPS}, its mean deviation to one side, metres. Ours are distances to whichever side:
+{FLOOR:,} + {STEPS} x mean is what that count would come to if all of it led away from
+the line, the most that it could be; in brackets the mean. Scenes, policies and control
+periods differ: compare within a row, not between the rows."""
+_AGAINST = [
+    *("environment", "route", "ratio", "difference (m)", "spread over seeds (m)"),
+    *("random out", "gradient out", "p (McNemar)"),
+]
+_DETAILS = [
+    *("environment", "route", "case", "attacks", "drives", "mean (m)", "± sd"),
+    *("95 % interval", "own metre-steps", "drives departed", "attacks out"),
+]
+
+
+def page(
+    summary: Figures, rows: Sequence[Figures], retrained: Table, made: Figures
+) -> str:
+    """Return the page.
+
+    Args:
+        summary: ``summary.json`` of the sweep of ``scenes/table2.toml``.
+        rows: of its table.
+        retrained: of `rows.read_retrained`; may be empty.
+        made: date, machine and command, as of `bench.results.stamp`.
+
+    Raises:
+        InputError: the sweep has no such attacks, or several budgets.
+    """
+    table, cases = make_table(summary, retrained), list(COLUMNS.values())
+    parts = [_INTRODUCTION, _flags(summary)]
+    for environment, title in TITLES.items():
+        own = own_rows(table, environment)
+        parts.append(_section(title, "", ["route", *cases], own))
+    theirs = paper_rows(table)
+    against = against_rows(summary["comparisons"])
+    aims = aim_rows(summary, rows, table, retrained)
+    parts += [
+        _section("In the paper's unit", _UNIT, ["route", "", *cases], theirs),
+        _section("Against random textures", "", _AGAINST, against),
+        _section("What was aimed at", "", ["aim", "found", ""], aims),
+    ]
+    if retrained:
+        parts.append(_retraining(retrained))
+    parts.append(_section("All figures", "", _DETAILS, detail_rows(table)))
+    parts.append(_provenance(summary, rows, made))
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(
+    title: str, text: str, header: Sequence[str], rows: Iterable[Sequence[str]]
+) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return "\n\n".join(filter(None, (f"## {title}", text, table)))
+
+
+def _flags(summary: Figures) -> str:
+    told = [f"- **{flag}".replace(": ", ":** ", 1) for flag in summary["flags"]]
+    told += [f"- **failed:** {r['cell']}: {r['error']}" for r in summary["failed"]]
+    cells = f"{summary['complete']} of {summary['cells']} attacks are complete."
+    if not told:
+        return f"## Flags\n\n{cells} No flag was raised."
+    return "\n".join([f"## Flags\n\n{cells}\n", *told])
+
+
+def _retraining(retrained: Table) -> str:
+    stages = [f"{s} {c}" for c in (NO_OBJECT, ATTACK) for s in (BEFORE, AFTER)]
+    rows = (
+        (name, route or "all", *(cell(retrained[route, name, case]) for case in stages))
+        for route, name in dict.fromkeys(key[:2] for key in retrained)
+    )
+    text = "Drives of both policies from the same starts, which no run has seen."
+    header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
+    return _section("Before and after retraining", text, header, rows)
+
+
+def _provenance(summary: Figures, rows: Iterable[Figures], made: Figures) -> str:
+    versions, contents = {}, {}
+    for row in rows:
+        if row["versions"] is not None:
+            versions[row["versions"]] = None
+        for key, digest in json.loads(row["digests"]).items():
+            if key != "scenario":
+                contents[digest] = contents.get(digest, key)
+    done = sum(attack["converged"] for attack in summary["attacks"])
+    told = [", ".join(f"{k} {v}" for k, v in json.loads(v).items()) for v in versions]
+    machine = ", ".join(f"{key}: {value}" for key, value in made["machine"].items())
+    lines = [
+        "## How it was made\n",
+        "```",
+        "mi-nerfattack sweep scenes/table2.toml -o FOLDER",
+        made["command"],
+        "mi-nerfattack replay docs/table2 --rows 10  # any row comes back",
+        "```\n",
+        f"- {made['date']}; {machine}",
+        *(f"- attacked with: {text}" for text in told),
+        f"- {done} of {len(summary['attacks'])} attacks converged",
+        *(f"- {key}: SHA-256 {digest}" for digest, key in contents.items()),
+    ]
+    return "\n".join(lines)
