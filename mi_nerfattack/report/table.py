@@ -227,17 +227,20 @@ def sweep_table(document: Mapping[str, Any]) -> rich.table.Table:
         document: whole, of `sweep.summary.summarise`.
 
     Returns:
-        A row per route, method, budget, environment and case: mean error over the
-        attacks, each of which counts once, its standard deviation and BCa interval;
-        drives that left the lane; how many attacks have a wheel out for a second, with
-        Wilson's interval in per cent.
+        A row per route (and of all, if there are several), method, budget, environment
+        and case: mean error over the attacks, each of which counts once, its standard
+        deviation and BCa interval; drives that left the lane; how many attacks have a
+        wheel out for a second, with Wilson's interval in per cent.
     """
     table = _distances("Mean distance from the lane centre (m)")
     table.add_column("case", overflow="fold", max_width=22)
     for name in ("mean", "± sd", "95 % interval", "drives\ndeparted", "attacks\nout"):
         table.add_column(name, justify="right", no_wrap=True)
-    last = ""
-    for group in document["groups"]:
+    last, groups = "", document["groups"]
+    single = len({group["route"] for group in groups}) == 2  # it, and None
+    for group in groups:
+        if single and group["route"] is None:
+            continue
         route = "all routes" if group["route"] is None else group["route"]
         labels = route, group["method"], group["budget"], group["environment"]
         title = " ".join(str(label) for label in labels if label is not None)

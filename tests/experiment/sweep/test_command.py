@@ -106,6 +106,7 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     told, table, *failed = out.splitlines()[-4:]
     assert code == 1 and "cells: 0/6, 0 control periods" in err
     assert not told.strip() and "line blocks 30 " in out
+    assert "all routes" not in out  # there is one
     [row, *_] = [line.split() for line in out.splitlines() if "attack " in line][1:]
     assert row[:3] == ["attack", "0.400", "0.141"] and row[5:7] == ["2/2", "2/2"]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import math
 
 import numpy as np
 import pytest
+import rich.console
 
 from mi_nerfattack.evaluation.intervals import mean_interval
 from mi_nerfattack.experiment.sweep.summary import summarise
+from mi_nerfattack.report.table import sweep_table
 
 #: Mean errors by cell (route, method, seed) and case: of two starts, of random looks
 #: from starts 0, 1, 0.
@@ -95,6 +98,21 @@ def test_groups_by_hand():
     assert (together["attacks"], together["places"], together["seeds"]) == (3, 2, 2)
     left = pick(found["groups"], route="left", **wanted)
     assert left["cross_track_sd_m"] is None and left["cross_track_mean_ci95_m"] is None
+
+
+def test_the_table_fits_80_columns():
+    console = rich.console.Console(width=80, file=io.StringIO(), color_system=None)
+    console.print(sweep_table(summarise(rows())))
+    lines = console.file.getvalue().splitlines()
+    assert all(len(line) <= 80 and "…" not in line for line in lines)
+    attacks = [
+        line.strip().split(maxsplit=3) for line in lines if line.startswith("  attack ")
+    ]
+    # right by gradient and blocks, left, which has no deviation, all by either
+    means = [line[1] for line in attacks]
+    assert means == ["0.700", "0.400", "1.300", "0.900", "0.400"]
+    assert attacks[0][3].split() == "[0.500, 0.900] 3/4 1/2 [9, 91]".split()
+    assert attacks[2][2:] == ["0/2", "0/1 [0, 79]"]
 
 
 def test_comparisons_by_hand():
