@@ -53,7 +53,7 @@ class OurTrainer(AbstractTrainer):
     def __init__(self, job: Path) -> None:
         document = files.read_json(job)
         self.images = read_images(document["folder"], document["long_edge"])
-        if self.images.images.shape[3] == 4:
+        if self.images.channels == 4:
             raise InputError(
                 f"{document['folder']}: images have alpha, behind which a fit puts "
                 "random colours and the peers do not; give images without alpha"
@@ -171,6 +171,6 @@ def pictures_of(images: PosedImages, indices: np.ndarray) -> Pictures:
         origin, rotation = pose_arrays(images.camera_to_world[index])
         rays = generate_rays(images.camera_of(index), origin, rotation, 1)[1]
         direction.append(rays.numpy().T.astype(np.float32))
-        colour.append(images.images[index, ..., :3].reshape(-1, 3))
+        colour.append(images.images[index][..., :3].reshape(-1, 3))
     centre = images.camera_to_world[indices, :3, 3].astype(np.float32)
     return Pictures(np.stack(colour), centre, np.stack(direction))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.capture.posed_images import PosedImages, stacked
 from mi_nerfattack.capture.transforms import FILE_NAMES, find_transforms, read_table
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -42,8 +42,9 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
         images: as read from there.
 
     Returns:
-        (n, height, width), float32, metres along the ray, infinite where nothing is
-        hit and NaN where it is unknown; None if no depth is named.
+        n maps (height, width), float32, as `stacked` puts them together, metres along
+        the ray, infinite where nothing is hit and NaN where it is unknown; None if no
+        depth is named.
 
     Raises:
         InputError: a file is missing or cannot be read, there is not a map for each
@@ -62,7 +63,7 @@ def read_depth(folder: str | Path, images: PosedImages) -> np.ndarray | None:
             _read_axial(source, i, frames[i].get("depth_file_path"), images, k)
             for k, i in enumerate(used)
         ]
-        return np.stack(maps)
+        return stacked(maps)
     return None
 
 
@@ -94,7 +95,9 @@ def _read_own(
             f"{where}: tensor 'depth' holds a depth of 0 or less; write infinity where "
             "nothing is hit, and NaN where it is unknown"
         )
-    return np.stack([_at_pixels(depth[i], images.camera) for i in used])
+    return stacked(
+        [_at_pixels(depth[i], images.camera_of(k)) for k, i in enumerate(used)]
+    )
 
 
 def _read_axial(

@@ -57,6 +57,23 @@ def read_cameras(
     return tuple(cameras)
 
 
+def intrinsics_table(camera: Camera) -> dict[str, float]:
+    """Return the keys of a `transforms.json`, or of one of its frames."""
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "k1": camera.k1,
+        "k2": camera.k2,
+        "p1": camera.p1,
+        "p2": camera.p2,
+        "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
+    }
+
+
 def _check_model(where: str, merged: Mapping[str, Any]) -> None:
     model = merged.get("camera_model", "OPENCV")
     is_known = isinstance(model, str) and model in COLMAP_MODELS

@@ -27,10 +27,11 @@ _HELD_OUT_EVERY = 8
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """Images of one size from known poses.
+    """Images from known poses.
 
     Args:
-        images: (n, height, width, 3 or 4), uint8 sRGB; alpha is not premultiplied.
+        images: n images (height, width, 3 or 4), uint8 sRGB, as `stacked` puts them
+            together; alpha is not premultiplied, and all have it or none.
         camera_to_world: (n, 4, 4), OpenCV axes, float64.
         camera: intrinsics shared by all images, in pixels of `images`; where
             `cameras` is given, those of the first.
@@ -57,14 +58,7 @@ class PosedImages:
 
     def __post_init__(self) -> None:
         """Check shapes and poses."""
-        n, size = len(self.images), (self.camera.height, self.camera.width)
-        shape = self.images.shape
-        if self.images.ndim != 4 or shape[1:3] != size or shape[3] not in (3, 4):
-            raise InputError(
-                f"images: shape {shape}; must be (n, {size[0]}, {size[1]}, 3 or 4)"
-            )
-        if self.images.dtype != np.uint8:
-            raise InputError(f"images: {self.images.dtype}; must be uint8 sRGB")
+        n = len(self.images)
         if self.camera_to_world.shape != (n, 4, 4) or len(self.names) != n:
             raise InputError(
                 f"camera_to_world, names: shape {self.camera_to_world.shape} and "
@@ -77,12 +71,33 @@ class PosedImages:
                 f"cameras: {len(self.cameras)}; must be one for each of {n} images, "
                 "or none where all share `camera`"
             )
-        for name, camera in zip(self.names, self.cameras, strict=False):
-            if (camera.height, camera.width) != size:
-                raise InputError(
-                    f"{name}: its camera has {camera.width} x {camera.height} px, the "
-                    f"images have {size[1]} x {size[0]} px; all must have one size"
-                )
+        for index in range(n):
+            self._check_image(index)
+
+    def _check_image(self, index: int) -> None:
+        image, camera = self.images[index], self.camera_of(index)
+        if image.dtype != np.uint8:
+            raise InputError(f"images: {image.dtype}; must be uint8 sRGB")
+        if image.ndim != 3 or image.shape[2] != self.channels not in (3, 4):
+            raise InputError(
+                f"images: {self.names[index]} has shape {image.shape}; must be "
+                "(height, width, 3) in all, or (height, width, 4) in all"
+            )
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{self.names[index]}: its camera has {camera.width} x "
+                f"{camera.height} px, the image {image.shape[1]} x {image.shape[0]} px"
+            )
+
+    @property
+    def channels(self) -> int:
+        """3, or 4 with alpha."""
+        return self.images[0].shape[2]
+
+    @property
+    def has_one_size(self) -> bool:
+        """Whether all images have the size of `camera`."""
+        return self.images.dtype != object
 
     def camera_of(self, index: int) -> Camera:
         """Return the intrinsics of one image, in its pixels."""
@@ -98,13 +113,22 @@ def held_out(n: int) -> np.ndarray:
     return np.arange(0, n, _HELD_OUT_EVERY)
 
 
+def stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Put arrays together: one (n, ...), or where shapes differ n in one of objects."""
+    if len({array.shape for array in arrays}) == 1:
+        return np.stack(arrays)
+    result = np.empty(len(arrays), object)
+    result[:] = arrays
+    return result
+
+
 def load_images(
     paths: Sequence[Path],
     cameras: Sequence[Camera],
     source: Path,
     long_edge_px: int | None,
 ) -> tuple[np.ndarray, tuple[Camera, ...]]:
-    """Read images of one size, and reduce them by averaging areas in linear light.
+    """Read images, and reduce them by averaging areas in linear light.
 
     Args:
         paths: of the images.
@@ -114,25 +138,18 @@ def load_images(
             and None keeps them.
 
     Returns:
-        (n, height, width, 3 or 4), uint8 sRGB, and one camera per image in their
-        pixels.
+        n images (height, width, 3 or 4), uint8 sRGB, as `stacked` puts them together,
+        and one camera per image in their pixels.
 
     Raises:
-        InputError: an image cannot be read, or its size is not that of its camera or
-            of the other images.
+        InputError: an image cannot be read, or its size is not that of its camera.
     """
     if long_edge_px is not None and long_edge_px < 1:
         raise InputError(f"long_edge_px: {long_edge_px}; must be at least 1")
-    first = cameras[0]
     result: list[np.ndarray] = []
     for path, camera in zip(paths, cameras, strict=True):
         image = files.read_image(path)
         height, width = image.shape[:2]
-        if (width, height) != (first.width, first.height) and result:
-            raise InputError(
-                f"{path}: {width} x {height} px, but {paths[0]} has {first.width} x "
-                f"{first.height} px; all images must have one size"
-            )
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"{path}: {width} x {height} px, but the intrinsics (w, h) in {source} "
@@ -143,7 +160,7 @@ def load_images(
         result.append(resize_area(image, target.width, target.height))
     if len({image.shape[2] for image in result}) > 1:
         result = [_with_alpha(image) for image in result]
-    return np.stack(result), tuple(_reduced(c, long_edge_px) for c in cameras)
+    return stacked(result), tuple(_reduced(c, long_edge_px) for c in cameras)
 
 
 def differing(cameras: Iterable[Camera]) -> tuple[Camera, ...]:

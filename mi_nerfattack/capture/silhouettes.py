@@ -24,15 +24,16 @@ _ALPHA = 0.02  # opacity from which a pixel belongs to the object
 
 def check_alpha(images: PosedImages, source: str) -> None:
     """Raise InputError, naming the source, unless the images show a silhouette."""
-    if images.images.shape[3] != 4:
+    if images.channels != 4:
         raise InputError(
             f"{source}: its images have no alpha channel; an object needs RGBA images "
             "with a transparent background (in Blender: Film, Transparent)"
         )
-    alpha = images.images[..., 3]
+    alpha = [image[..., 3] for image in images.images]
+    least, most = min(a.min() for a in alpha), max(a.max() for a in alpha)
     for name, found, what in (
-        ("1", alpha.min() > 255 * (1 - _ALPHA), "nothing tells object and background"),
-        ("0", alpha.max() < 255 * _ALPHA, "no object is seen"),
+        ("1", least > 255 * (1 - _ALPHA), "nothing tells object and background"),
+        ("0", most < 255 * _ALPHA, "no object is seen"),
     ):
         if found:
             raise InputError(
@@ -58,7 +59,7 @@ def silhouette_bounds(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
         InputError: no point is inside of all silhouettes.
     """
     chosen = np.unique(np.linspace(0, len(images) - 1, _VIEWS).round().astype(int))
-    silhouettes = [_reduced(images.images[i, ..., 3] > 255 * _ALPHA) for i in chosen]
+    silhouettes = [_reduced(images.images[i][..., 3] > 255 * _ALPHA) for i in chosen]
     lower, upper = find_bounds(replace(images, points=None))
     cells = _COARSE
     for _ in range(_PASSES):

@@ -5,7 +5,6 @@ In memory poses are OpenCV camera-to-world matrices; in the file they are OpenGL
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.capture.colmap.model import MODEL_FOLDERS, find_model, read_colmap
-from mi_nerfattack.capture.intrinsics import read_cameras
+from mi_nerfattack.capture.intrinsics import intrinsics_table, read_cameras
 from mi_nerfattack.capture.posed_images import (
     PosedImages,
     differing,
@@ -187,7 +186,7 @@ def begin_posed(folder: str | Path) -> Path:
 def write_poses(
     path: Path,
     names: Sequence[str],
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     camera_to_world: np.ndarray,
     extra: Mapping[str, Any] | None = None,
     times_s: Sequence[float] | None = None,
@@ -197,29 +196,24 @@ def write_poses(
     Args:
         path: of the file.
         names: of the images, relative to its folder.
-        camera: shared intrinsics.
+        camera: shared intrinsics, or those of each image.
         camera_to_world: (n, 4, 4), OpenCV axes.
         extra: more keys for the top level.
         times_s: of the images, seconds: `time_s`, which recorded drives have.
     """
-    table: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "k1": camera.k1,
-        "k2": camera.k2,
-        "p1": camera.p1,
-        "p2": camera.p2,
-        "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
-        **(extra or {}),
-    }
+    cameras = [camera] * len(names) if isinstance(camera, Camera) else list(camera)
+    has_one = len(set(cameras)) == 1
+    table: dict[str, Any] = {"camera_model": "OPENCV"}
+    table |= intrinsics_table(cameras[0]) if has_one else {}
+    table |= extra or {}
+    matrices = opencv_to_opengl(camera_to_world)
     table["frames"] = [
-        {"file_path": name, "transform_matrix": matrix.tolist()}
-        for name, matrix in zip(names, opencv_to_opengl(camera_to_world), strict=True)
+        {
+            "file_path": name,
+            **({} if has_one else intrinsics_table(own)),
+            "transform_matrix": matrix.tolist(),
+        }
+        for name, own, matrix in zip(names, cameras, matrices, strict=True)
     ]
     if times_s is not None:
         for frame, time_s in zip(table["frames"], times_s, strict=True):

@@ -14,14 +14,14 @@ import tyro
 class Poses:
     """Estimate the camera poses of photographs by structure from motion, on the CPU.
 
-    The photographs show one still scene, from different places, and come from one
-    camera at one focal length. z points up if they were held level on average. Their
-    scale is unknown: measure the distance that the command prints at its end, and run
-    it again with --metres-per-unit.
+    The photographs show one still scene, from different places, by one camera or
+    several, each with three or more at a focal length and held one way. z points up if
+    they were held level on average. Their scale is unknown: measure the distance that
+    the command prints at its end, and run it again with --metres-per-unit.
     """
 
     photographs: tyro.conf.Positional[Path]
-    """Folder of JPEG, PNG or WebP images of one size; those below it are not read."""
+    """Folder of JPEG, PNG or WebP images; those below it are not read."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for transforms.json, upright copies of the images and sparse points."""
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
@@ -39,7 +39,10 @@ class Poses:
 
     def run(self) -> int:
         """Estimate and write."""
-        from mi_nerfattack.capture.photographs import PoseOptions, estimate_poses
+        from mi_nerfattack.capture.photographs.estimate import (
+            PoseOptions,
+            estimate_poses,
+        )
         from mi_nerfattack.commands.shared.progress import StageBars
 
         options = PoseOptions(

@@ -99,10 +99,12 @@ def _digest(training: Training) -> str:
     """Hash what decides a fit: images, poses, depth, options, architecture, box."""
     digest = hashlib.sha256()
     images = training.images
-    digest.update(np.ascontiguousarray(images.images).data)
+    for image in images.images:
+        digest.update(np.ascontiguousarray(image).data)
     digest.update(np.ascontiguousarray(images.camera_to_world).data)
     if training.depth is not None:
-        digest.update(np.ascontiguousarray(training.depth).data)
+        for depth in training.depth:
+            digest.update(np.ascontiguousarray(depth).data)
     digest.update(repr((images.camera, images.cameras, training.options)).encode())
     metadata = training.field.metadata()
     info = {key: metadata[key] for key in metadata if key not in training.field.info}

@@ -88,7 +88,7 @@ def fit_ngp(
         cone=cone,
         seed=options.seed,
     )
-    if images.images.shape[3] == 4 or not options.sky:
+    if images.channels == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
     return _run(training, progress, checkpoint, resume)
@@ -129,7 +129,7 @@ def fit_grid(
 
     Source: appendix A.4.1, B.1.
     """
-    if images.images.shape[3] != 4:
+    if images.channels != 4:
         raise InputError("images: have no alpha channel; an object's grid needs RGBA")
     options = options or FitOptions()
     low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)

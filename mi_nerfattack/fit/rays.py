@@ -68,29 +68,34 @@ class RayBank:
         box: tuple[np.ndarray, np.ndarray] | None = None,
         corrections: CameraCorrections | None = None,
     ) -> None:
-        if depth is not None and depth.shape != images.images.shape[:3]:
-            raise InputError(
-                f"depth: shape {depth.shape}; must be {images.images.shape[:3]}, "
-                "as the images"
-            )
+        _check_depth(images, depth)
         self.camera: Camera = images.camera
-        self.channels = images.images.shape[3]
+        self.channels = images.channels
         self.has_alpha = self.channels == 4
-        chosen = images.images[indices]
-        if chosen.size >= 1 << 32:
+        ends = np.cumsum(
+            [images.images[i].shape[0] * images.images[i].shape[1] for i in indices]
+        )
+        self.count = int(ends[-1])
+        if self.count * self.channels >= 1 << 32:
             raise InputError(
-                f"images: {chosen.size} values; at most {(1 << 32) - 1} can be fitted "
-                "to, reduce the images (long_edge_px) or their number"
+                f"images: {self.count * self.channels} values; at most "
+                f"{(1 << 32) - 1} can be fitted to, reduce the images (long_edge_px) "
+                "or their number"
             )
+        self._ends, self._widths = None, None
+        if not images.has_one_size:
+            widths = [images.images[i].shape[1] for i in indices]
+            self._ends = mi.UInt32(ends.tolist())
+            self._widths = mi.UInt32(widths)
+            dr.make_opaque(self._ends, self._widths)
         # device arrays of their own: Dr.Jit may alias NumPy's memory
-        self._pixels = dr.uint8_array_t(mi.Float)(chosen.ravel().copy())
+        self._pixels = dr.uint8_array_t(mi.Float)(_flat(images.images, indices))
         self._depth = None
         if depth is not None:
-            self._depth = mi.Float(depth[indices].astype(np.float32).ravel().copy())
+            self._depth = mi.Float(_flat(depth, indices).astype(np.float32))
         self.corrections = corrections or CameraCorrections(len(indices), ())
         self._origin, self._rotation = pose_arrays(images.camera_to_world[indices])
         self._lens = Lens([images.camera_of(index) for index in indices])
-        self.count = len(indices) * self.camera.width * self.camera.height
         dr.make_opaque(self._pixels, self._depth, self._origin)
         self._chosen = None
         if box is not None:
@@ -99,6 +104,7 @@ class RayBank:
     def state(self) -> list[Any]:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
         device = [self._pixels, self._depth, self._origin, self._rotation, self._chosen]
+        device += [self._ends, self._widths]
         return [self, device, self._lens.state(), self.corrections.values]
 
     def draw(self, random: Any) -> Any:
@@ -132,17 +138,29 @@ class RayBank:
         return RayBatch(origin, direction, colour, alpha, depth, image)
 
     def _rays(self, index: Any) -> tuple[Any, Any, Any]:
-        per_image = self.camera.width * self.camera.height
-        image = index // per_image
-        pixel = index - image * per_image
-        row = pixel // self.camera.width
-        position = mi.Point2f(pixel - row * self.camera.width, row) + 0.5
+        image, pixel, width = self._place(index)
+        row = pixel // width
+        position = mi.Point2f(pixel - row * width, row) + 0.5
         columns = [dr.gather(mi.Vector3f, c, image) for c in self._rotation]
         origin = dr.gather(mi.Point3f, self._origin, image)
         origin, columns = self.corrections.move(image, origin, columns)
         lens = self._lens.of(image)
         rotation = (columns[0], columns[1], columns[2])
         return image, *lens_rays(lens, origin, rotation, position)
+
+    def _place(self, index: Any) -> tuple[Any, Any, Any]:
+        """Return the image of pixels, their place in it by rows, and its width."""
+        ends, widths = self._ends, self._widths
+        if ends is None or widths is None:
+            per_image = self.camera.width * self.camera.height
+            image = index // per_image
+            return image, index - image * per_image, self.camera.width
+        image = dr.binary_search(
+            0, dr.width(ends), lambda i: dr.gather(mi.UInt32, ends, i) <= index
+        )
+        start = dr.gather(mi.UInt32, ends, image - 1, image > 0)
+        width = dr.gather(mi.UInt32, widths, image)
+        return image, index - start, dr.maximum(width, 1)  # 0 in lanes without a ray
 
     def _seeing(self, lower: np.ndarray, upper: np.ndarray) -> Any:
         box = mi.Point3f(*lower.tolist()), mi.Point3f(*upper.tolist())
@@ -160,3 +178,20 @@ class RayBank:
                 "box, give bounds around what the cameras look at"
             )
         return dr.concat(found)
+
+
+def _check_depth(images: PosedImages, depth: np.ndarray | None) -> None:
+    if depth is None:
+        return
+    found = [each.shape for each in depth]
+    wanted = [image.shape[:2] for image in images.images]
+    if found != wanted:
+        raise InputError(
+            f"depth: shape {depth.shape}, maps of {sorted(set(found))}; must be "
+            f"{len(images)} maps of {sorted(set(wanted))}, as the images"
+        )
+
+
+def _flat(arrays: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the values of chosen arrays one after the other."""
+    return np.concatenate([arrays[i].ravel() for i in indices])

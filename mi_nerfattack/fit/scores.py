@@ -162,7 +162,7 @@ def evaluate(
     Returns:
         a score for each index, in order.
     """
-    renderer = FieldRenderer(field, over_white=images.images.shape[3] == 4)
+    renderer = FieldRenderer(field, over_white=images.channels == 4)
     scores: list[ViewScore] = []
     for index in map(int, indices):
         pose, camera = images.camera_to_world[index], images.camera_of(index)

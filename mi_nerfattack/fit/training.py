@@ -65,14 +65,15 @@ class Training:
         self.fitted = np.setdiff1d(np.arange(len(images)), self.held_out)
         if len(self.fitted) == 0:
             raise InputError(f"images: {len(images)}; at least 2 are needed for a fit")
-        if min(images.camera.width, images.camera.height) < MIN_EDGE_PX:
-            raise InputError(
-                f"images: {images.camera.width} x {images.camera.height} px; SSIM "
-                f"takes at least {MIN_EDGE_PX} px each way"
-            )
-        if depth is not None and (depth <= 0).any():
+        for image in images.images:
+            if min(image.shape[:2]) < MIN_EDGE_PX:
+                raise InputError(
+                    f"images: {image.shape[1]} x {image.shape[0]} px; SSIM takes at "
+                    f"least {MIN_EDGE_PX} px each way"
+                )
+        if depth is not None and any((each <= 0).any() for each in depth):
             raise InputError("depth: holds values of 0 or less; NaN says unknown")
-        if options.exposure and images.images.shape[3] == 4:
+        if options.exposure and images.channels == 4:
             raise InputError("exposure: needs images without alpha, as of a camera")
         learn = [EXPOSURE] * options.exposure + [POSES] * options.poses
         self.cameras = CameraCorrections(len(self.fitted), learn)
@@ -110,7 +111,7 @@ class Training:
         # the levels of a grid divide all edges alike
         is_grid = isinstance(self.field, GridField)
         shape = (n, n, n) if is_grid else grid_shape(lower, upper, n)
-        if depth is None or np.isnan(depth[self.fitted]).any():
+        if depth is None or any(np.isnan(depth[i]).any() for i in self.fitted):
             cells = seen_cells(self.images, self.fitted, lower, upper, shape)
             if not cells.any():
                 raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,7 +14,11 @@ from helpers.posed_folders import render_views, write_transforms
 
 from mi_nerfattack.capture.posed_images import PosedImages, held_out, resize_area
 from mi_nerfattack.capture.scene import capture_scene, drive_poses
-from mi_nerfattack.capture.transforms import read_transforms
+from mi_nerfattack.capture.transforms import (
+    begin_posed,
+    read_transforms,
+    write_poses,
+)
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import (
@@ -117,11 +122,30 @@ class TestTransforms:
             read_transforms(folder)
 
     def test_mixed_sizes(self, folder):
-        files.write_image(folder / "images/0002.png", np.zeros((8, 10, 3), np.uint8))
-        with pytest.raises(
-            InputError, match="0002.png: 10 x 8 px, but .*0000.png has 12 x 8 px"
-        ):
+        small = np.full((6, 10, 3), 7, np.uint8)
+        files.write_image(folder / "images/0002.png", small)
+        message = "0002.png: 10 x 6 px, but the intrinsics .* are for 12 x 8 px"
+        with pytest.raises(InputError, match=message):
             read_transforms(folder)
+        edited(folder, lambda t: t["frames"][2].update(w=10, h=6, cx=5.0, cy=3.0))
+        read = read_transforms(folder)
+        assert [image.shape for image in read.images] == [(8, 12, 3)] * 2 + [(6, 10, 3)]
+        assert read.camera_of(2).cx == 5 and read.camera_of(1) == CAMERA
+        np.testing.assert_array_equal(read.images[2], small)
+        reduced = read_transforms(folder, long_edge_px=5)
+        assert [image.shape for image in reduced.images] == [(3, 5, 3)] * 3
+        assert reduced.camera_of(2).cx == 2.5
+
+    def test_intrinsics_of_each_frame(self, tmp_path):
+        images, poses = some_frames()
+        own = [CAMERA, replace(CAMERA, fx=20.0), CAMERA]
+        path = begin_posed(tmp_path)
+        names = [f"images/{i}.png" for i in range(3)]
+        for name, image in zip(names, images, strict=True):
+            files.write_image(tmp_path / name, image)
+        write_poses(path, names, own, poses)
+        assert "fl_x" not in json.loads(path.read_text())
+        assert list(read_transforms(tmp_path).cameras) == own
 
     @pytest.mark.parametrize(
         ("edit", "message"),

@@ -15,6 +15,7 @@ from helpers.sphere_views import (
     TINY_GRID,
     TINY_NGP,
     directions,
+    mixed_views,
     sphere_views,
 )
 
@@ -101,6 +102,13 @@ def test_grid_learns_a_sphere(fitted):
     assert 0.5 < result.ssim_heldout <= 1
     assert reports[-1].loss < 0.3 * reports[0].loss
     assert tuple(reports) == result.history
+
+
+@pytest.mark.slow
+def test_grid_learns_from_images_of_several_sizes():
+    images, depth = mixed_views(32)
+    result = fit_grid(images, *BOX, TINY_GRID, grid_options(150), depth)
+    assert result.psnr_heldout_db > 24
 
 
 def test_fitted_sphere_is_solid_and_where_it_was(fitted):

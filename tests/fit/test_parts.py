@@ -9,7 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import small_fields as small
-from helpers.sphere_views import RADIUS, SIZE, sphere_views, world_rays, write_folder
+from helpers.sphere_views import (
+    RADIUS,
+    SIZE,
+    mixed_views,
+    sphere_views,
+    world_rays,
+    write_folder,
+)
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
 from mi_nerfattack.capture.inputs import find_bounds, read_depth
@@ -38,6 +45,29 @@ def test_batch_holds_the_rays_and_values_of_its_pixels():
     values = np.append(batch.colour.numpy()[:, 0], batch.alpha.numpy()[0])
     np.testing.assert_allclose(255 * values, images.images[1, row, column], atol=1e-4)
     assert batch.depth.numpy()[0] == depth[1, row, column]
+
+
+def test_batch_of_images_of_several_sizes():
+    images, depth = mixed_views(4, alpha=False)
+    chosen = np.array([3, 2, 0])
+    bank = RayBank(images, chosen, depth)
+    assert bank.count == sum(images.images[i][..., 0].size for i in chosen)
+    batch = bank.batch(dr.arange(mi.UInt32, bank.count))
+    rays = [
+        world_rays(images.camera_of(i), images.camera_to_world[i]).reshape(-1, 3)
+        for i in chosen
+    ]
+    np.testing.assert_allclose(
+        batch.direction.numpy().T, np.concatenate(rays), atol=1e-6
+    )
+    shown = np.concatenate([images.images[i].reshape(-1, 3) for i in chosen])
+    np.testing.assert_allclose(255 * batch.colour.numpy().T, shown, atol=1e-4)
+    known = np.concatenate([depth[i].ravel() for i in chosen])
+    np.testing.assert_array_equal(batch.depth.numpy(), known)
+    places = np.repeat(np.arange(3), [len(r) for r in rays])
+    np.testing.assert_array_equal(batch.image.numpy(), places)
+    with pytest.raises(InputError, match="depth: shape"):
+        RayBank(images, chosen, depth[::-1])
 
 
 def test_box_restricts_the_pixels_drawn():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from helpers.posed_folders import write_transforms
 
-from mi_nerfattack.capture.posed_images import PosedImages
+from mi_nerfattack.capture.posed_images import PosedImages, stacked
 from mi_nerfattack.fields import GridLayout, NGPLayout
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
@@ -54,6 +55,26 @@ def sphere_views(count: int = 16, alpha: bool = True) -> tuple[PosedImages, np.n
         images = images[..., :3]
     names = tuple(f"view {i}" for i in range(count))
     return PosedImages(images, poses, camera, names), depth
+
+
+def mixed_views(count: int, alpha: bool = True) -> tuple[PosedImages, np.ndarray]:
+    """Cut the views of the sphere to several sizes, so that their intrinsics differ."""
+    whole, depth = sphere_views(count, alpha)
+    crops = [np.s_[:, :], np.s_[:, 4:-4], np.s_[3:, :], np.s_[:, 4:-4]] * count
+    cut = [a[crop] for a, crop in zip(whole.images, crops, strict=False)]
+    maps = [a[crop] for a, crop in zip(depth, crops, strict=False)]
+    cameras = [
+        replace(
+            whole.camera,
+            height=own.shape[0],
+            width=own.shape[1],
+            cx=whole.camera.cx - (columns.start or 0),
+            cy=whole.camera.cy - (rows.start or 0),
+        )
+        for own, (rows, columns) in zip(cut, crops, strict=False)
+    ]
+    mixed = replace(whole, images=stacked(cut), cameras=tuple(cameras))
+    return mixed, stacked(maps)
 
 
 def world_rays(camera: Camera, pose: np.ndarray) -> np.ndarray:

@@ -68,7 +68,7 @@ class Stages:
     def __init__(self, progress: StageCallback) -> None:
         self.missing: str | None = None
         self._progress = progress
-        self.name, self._total = "start", 0
+        self.name, self._total, self._part = "start", 0, (0, 0)
         self._last: deque[str] = deque(maxlen=_LAST_LINES)
 
     def follow(self, lines: Iterable[str]) -> None:
@@ -84,7 +84,10 @@ class Stages:
         if "stage" in what:
             self.end()
             self.name, self._total = what["stage"], what["total"]
+            self._part = 0, self._total
             self._show(0)
+        if "part" in what:
+            self._part = what["part"]
         if "done" in what:
             self._show(what["done"])
 
@@ -98,7 +101,8 @@ class Stages:
         i, n, j, m = (1 if number is None else int(number) for number in numbers)
         # a file's line comes when it is done, the others when they begin
         done = (i - 1) * m + j - (kind != "file")
-        self._show(self._total * done // (n * m))
+        start, count = self._part
+        self._show(start + count * done // (n * m))
 
     def _show(self, done: int) -> None:
         self._progress(self.name, min(done, self._total - 1), self._total)

@@ -64,7 +64,7 @@ def read_colmap(
 
     Raises:
         InputError: no model, a damaged file, a camera model that is not one of
-            `COLMAP_MODELS`, missing images, or images of several sizes.
+            `COLMAP_MODELS`, or missing images.
         SetupError: pycolmap, which reads it, is not installed.
     """
     root = Path(path)

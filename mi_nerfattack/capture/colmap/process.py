@@ -91,11 +91,15 @@ def _read(pycolmap: Any, names: list[str], work: Path) -> dict[str, Any]:
         images = [_placed(image) for image in model.images.values()]
     points = [model.points3D[i].xyz for i in sorted(model.points3D)]
     np.save(work / POINTS, np.array(points, np.float64).reshape(-1, 3))
-    cameras = {
+    return {"cameras": _cameras(model), "images": images}
+
+
+def _cameras(model: Any) -> dict[int, tuple[str, int, int, list[float]]]:
+    """Return the cameras of a model as `conventions.from_colmap` takes them."""
+    return {
         i: (camera.model.name, camera.width, camera.height, camera.params.tolist())
         for i, camera in model.cameras.items()
     }
-    return {"cameras": cameras, "images": images}
 
 
 def _limit(name: str, most: int) -> None:
@@ -129,20 +133,24 @@ def _reconstruct(
 ) -> dict[str, Any] | None:
     """Return what photographs show, None if nothing could be placed."""
     database, folder = work / "database.db", Path(task["folder"])
-    names = task["names"]
+    count = sum(map(len, task["groups"]))
     pycolmap.set_random_seed(task["seed"])
-    _say(stage="features", total=len(names))
-    pycolmap.extract_features(
-        database,
-        folder,
-        names,
-        pycolmap.CameraMode.SINGLE,
-        pycolmap.ImageReaderOptions(camera_model=task["lens"]),
-        pycolmap.FeatureExtractionOptions(
-            max_image_size=task["long_edge_px"], use_gpu=False
-        ),
-    )
-    _match(pycolmap, database, task["matching"], len(names))
+    _say(stage="features", total=count)
+    start = 0
+    for names in task["groups"]:  # each call makes one camera
+        _say(part=[start, len(names)])
+        pycolmap.extract_features(
+            database,
+            folder,
+            names,
+            pycolmap.CameraMode.SINGLE,
+            pycolmap.ImageReaderOptions(camera_model=task["lens"]),
+            pycolmap.FeatureExtractionOptions(
+                max_image_size=task["long_edge_px"], use_gpu=False
+            ),
+        )
+        start += len(names)
+    _match(pycolmap, database, task["matching"], count)
     models = _map(pycolmap, database, folder, task)
     found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
     return None if found is None else _summary(found)
@@ -177,7 +185,7 @@ def _map(pycolmap: Any, database: Path, folder: Path, task: dict[str, Any]) -> A
         placed += 1
         _say(done=placed)
 
-    _say(stage="poses", total=len(task["names"]))
+    _say(stage="poses", total=sum(map(len, task["groups"])))
     options = {"min_model_size": LEAST_IMAGES, "random_seed": task["seed"]}
     return pycolmap.incremental_mapping(
         database, folder, Path(task["work"]), options, next_image_callback=count_image
@@ -189,7 +197,6 @@ def _summary(model: Any) -> dict[str, Any]:
     images = sorted(
         (model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name
     )
-    camera = model.cameras[images[0].camera_id]
     poses = [image.cam_from_world().inverse().matrix().tolist() for image in images]
     points = [
         point.xyz.tolist()
@@ -199,9 +206,8 @@ def _summary(model: Any) -> dict[str, Any]:
     return {
         "names": [image.name for image in images],
         "camera_to_world": poses,
-        "model": camera.model.name,
-        "size": [camera.width, camera.height],
-        "parameters": camera.params.tolist(),
+        "cameras": _cameras(model),
+        "camera_ids": [image.camera_id for image in images],
         "points": points,
         "error_px": model.compute_mean_reprojection_error(),
     }

@@ -1,4 +1,4 @@
-"""Structure from motion by pycolmap: features, matches, poses, one camera."""
+"""Structure from motion by pycolmap: features, matches, poses, cameras."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class Structure:
     Attributes:
         names: n images that were placed, sorted.
         camera_to_world: (n, 4, 4), OpenCV axes.
-        camera: of all images.
+        cameras: n, of the images; equal where these were taken by the same.
         points: (m, 3), seen in at least three images each.
         error_px: mean reprojection error.
     """
 
     names: tuple[str, ...]
     camera_to_world: np.ndarray
-    camera: Camera
+    cameras: tuple[Camera, ...]
     points: np.ndarray
     error_px: float
 
 
 def reconstruct(
     folder: Path,
-    names: Sequence[str],
+    groups: Sequence[Sequence[str]],
     work: Path,
     matching: Matching,
     lens: Lens,
@@ -49,14 +49,14 @@ def reconstruct(
     seed: int,
     progress: StageCallback,
 ) -> Structure:
-    """Estimate poses and the one camera of photographs, on the CPU.
+    """Estimate poses and cameras of photographs, on the CPU.
 
     pycolmap runs in a process of its own, which is ended when `progress` raises.
 
     Args:
-        folder: of the photographs, all of one size.
-        names: of the photographs, in the order they were taken if matching is
-            sequential.
+        folder: of the photographs.
+        groups: names of the photographs, a group for each camera, all of one size. If
+            matching is sequential, the sorted names are the order they were taken in.
         work: an empty folder for intermediate files.
         matching: every photograph with every other one, or with its neighbours.
         lens: COLMAP's camera model.
@@ -70,7 +70,7 @@ def reconstruct(
     """
     task = {
         "folder": str(folder),
-        "names": list(names),
+        "groups": [list(group) for group in groups],
         "work": str(work),
         "matching": matching,
         "lens": lens,
@@ -87,7 +87,7 @@ def reconstruct(
         )
     stages.end()
     found = json.loads((work / RESULT).read_text(encoding="utf-8"))
-    return _structure(found, len(names))
+    return _structure(found, sum(map(len, groups)))
 
 
 def _structure(found: dict[str, Any] | None, count: int) -> Structure:
@@ -101,8 +101,9 @@ def _structure(found: dict[str, Any] | None, count: int) -> Structure:
     poses = np.tile(np.eye(4), (placed, 1, 1))
     poses[:, :3] = found["camera_to_world"]
     try:
-        width, height = found["size"]
-        camera = from_colmap(found["model"], width, height, found["parameters"])
+        known = {
+            i: from_colmap(*found["cameras"][str(i)]) for i in set(found["camera_ids"])
+        }
     except InputError as error:
         raise InputError(
             f"photographs: the estimated lens is impossible ({error}); take a simpler "
@@ -111,7 +112,7 @@ def _structure(found: dict[str, Any] | None, count: int) -> Structure:
     return Structure(
         tuple(found["names"]),
         poses,
-        camera,
+        tuple(known[i] for i in found["camera_ids"]),
         np.array(found["points"], np.float64).reshape(-1, 3),
         found["error_px"],
     )

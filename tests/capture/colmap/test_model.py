@@ -193,11 +193,8 @@ def test_missing_images(scene):
 
 def test_image_of_another_size(scene):
     files.write_image(scene / "images/b.png", np.zeros((3, 4, 3), np.uint8))
-    with pytest.raises(InputError, match="b.png: 4 x 3 px, but .*a.png has 40 x 30"):
-        read_images(scene)
-    files.write_image(scene / "images/a.png", np.zeros((3, 4, 3), np.uint8))
     with pytest.raises(
-        InputError, match=r"a.png: 4 x 3 px.*cameras.(txt|bin).*40 x 30"
+        InputError, match=r"b.png: 4 x 3 px.*cameras.(txt|bin).*40 x 30"
     ):
         read_images(scene)
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.capture.colmap.reconstruct import (
@@ -19,13 +17,17 @@ from mi_nerfattack.capture.colmap.reconstruct import (
     Structure,
     reconstruct,
 )
+from mi_nerfattack.capture.photographs.staging import (
+    check_in_place,
+    list_photographs,
+    stage,
+)
 from mi_nerfattack.capture.transforms import begin_posed, write_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Count, Positive, Seed, checked
 from mi_nerfattack.render.camera.intrinsics import Camera
 
-_LEAST = 3
 _LEAST_UP = 0.2  # length of the mean of unit vectors
 
 
@@ -37,7 +39,7 @@ class PoseOptions:
     Attributes:
         matching: compare every photograph with every other one, or with those taken
             shortly before and after, by the order of their names.
-        lens: COLMAP's camera model, one for all photographs.
+        lens: COLMAP's camera model, of all cameras.
         long_edge_px: look for features at most at this size.
         metres_per_unit: of the arbitrary unit of an earlier run; None keeps the
             unit.
@@ -59,7 +61,7 @@ class PoseEstimate:
         path: of the `transforms.json`.
         placed: names of the photographs with a pose.
         left_out: names of those that could not be placed.
-        camera: of all photographs.
+        cameras: of the photographs with a pose.
         error_px: mean reprojection error.
         farthest: the two photographs that were taken farthest apart.
         distance: between these, in the unit of the poses.
@@ -68,7 +70,7 @@ class PoseEstimate:
     path: Path
     placed: tuple[str, ...]
     left_out: tuple[str, ...]
-    camera: Camera
+    cameras: tuple[Camera, ...]
     error_px: float
     farthest: tuple[str, str]
     distance: float
@@ -89,30 +91,31 @@ def estimate_poses(
     stored upright.
 
     Args:
-        photographs: folder of at least 3 JPEG, PNG or WebP images of one size, taken
-            by one camera at one focal length.
+        photographs: folder of at least 3 JPEG, PNG or WebP images; at least 3 of each
+            camera, of each of its focal lengths, and of each way that it was held.
+            Their EXIF data and sizes tell these apart.
         output: folder for `transforms.json`, `images` and `points.safetensors`.
         options: None for the defaults.
         progress: called with stage, done and total.
 
     Raises:
-        InputError: too few photographs, an unreadable one, several sizes, or too few
-            could be placed. Nothing is written then.
+        InputError: too few photographs, an unreadable one, or too few could be
+            placed. Nothing is written then.
         SetupError: pycolmap failed or crashed; nothing is written either.
     """
     options = options or PoseOptions()
     root = Path(photographs)
-    names = _list(root)
+    names = list_photographs(root)
     _check_output(Path(output))
     with tempfile.TemporaryDirectory() as folder:
         staged, work = Path(folder) / "images", Path(folder) / "work"
         staged.mkdir()
         work.mkdir()
-        _copy_all(root, names, staged, progress)
-        _check_in_place(root, names, staged, Path(output) / "images")
+        groups = stage(root, names, staged, progress)
+        check_in_place(root, names, staged, Path(output) / "images")
         found = reconstruct(
             staged,
-            names,
+            list(groups.values()),
             work,
             options.matching,
             options.lens,
@@ -124,82 +127,12 @@ def estimate_poses(
         return _write(Path(output), staged, found, names, options)
 
 
-def _list(root: Path) -> list[str]:
-    if not root.is_dir():
-        raise InputError(f"{root}: is not a folder; give the folder of the photographs")
-    names = sorted(
-        p.name for p in root.iterdir() if p.suffix.lower() in files.IMAGE_SUFFIXES
-    )
-    if len(names) < _LEAST:
-        raise InputError(
-            f"{root}: {len(names)} photographs "
-            f"({', '.join(files.IMAGE_SUFFIXES)}); at least "
-            f"{_LEAST} are needed, 20 or more are better"
-        )
-    return names
-
-
 def _check_output(output: Path) -> None:
     """Check that a folder can be written to, without making it."""
     existing = output.absolute()
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     files.check_writable(existing / "transforms.json")
-
-
-def _check_in_place(
-    root: Path, names: Sequence[str], staged: Path, target: Path
-) -> None:
-    """Refuse to write turned copies over the photographs themselves."""
-    if not (target.is_dir() and target.samefile(root)):
-        return
-    for name in names:
-        limit = files.MAX_IMAGE_BYTES
-        if files.read_bytes(root / name, limit) != files.read_bytes(
-            staged / name, limit
-        ):
-            raise InputError(
-                f"{root / name}: its EXIF data turn it, and the upright copy would "
-                "replace it; choose another output folder"
-            )
-
-
-def _copy_all(
-    root: Path, names: Sequence[str], staged: Path, progress: StageCallback
-) -> None:
-    """Copy the photographs upright, and check that they have one size."""
-    first = (0, 0)
-    for done, name in enumerate(names):
-        progress("photographs", done, len(names))
-        size = _copy_upright(root / name, staged / name)
-        first = first if done else size
-        if size != first:
-            raise InputError(
-                f"{root / name}: {size[0]} x {size[1]} px, but {root / names[0]} has "
-                f"{first[0]} x {first[1]} px; all must come from one camera, held one "
-                "way: leave out the others"
-            )
-    progress("photographs", len(names), len(names))
-
-
-def _copy_upright(source: Path, target: Path) -> tuple[int, int]:
-    """Copy an image; turn it, if EXIF data say so; return width and height."""
-    height, width = files.read_image(source).shape[:2]
-    raw = files.read_bytes(source, files.MAX_IMAGE_BYTES)
-    with Image.open(io.BytesIO(raw), formats=("PNG", "JPEG", "WEBP")) as image:
-        kind = image.format
-        turned = ImageOps.exif_transpose(image)
-        if turned.size == (width, height) and not _is_turned(image):
-            files.write_bytes(target, raw)
-            return width, height
-    buffer = io.BytesIO()
-    turned.save(buffer, kind, quality=95, exif=turned.getexif())
-    files.write_bytes(target, buffer.getvalue())
-    return turned.size
-
-
-def _is_turned(image: Image.Image) -> bool:
-    return image.getexif().get(0x0112, 1) != 1  # the tag Orientation
 
 
 def upright(found: Structure, scale: float) -> Structure:
@@ -222,7 +155,7 @@ def upright(found: Structure, scale: float) -> Structure:
     result[:, :3, :3] = turn @ poses[:, :3, :3]
     result[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ turn.T
     points = scale * (found.points - centre) @ turn.T
-    return Structure(found.names, result, found.camera, points, found.error_px)
+    return replace(found, camera_to_world=result, points=points)
 
 
 def _write(
@@ -248,7 +181,7 @@ def _write(
         "left_out": list(left_out),
     }
     stored = [f"images/{name}" for name in found.names]
-    write_poses(path, stored, found.camera, found.camera_to_world, extra)
+    write_poses(path, stored, found.cameras, found.camera_to_world, extra)
     eyes = found.camera_to_world[:, :3, 3]
     apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
     a, b = np.unravel_index(int(apart.argmax()), apart.shape)
@@ -256,7 +189,7 @@ def _write(
         path,
         found.names,
         left_out,
-        found.camera,
+        found.cameras,
         found.error_px,
         (found.names[a], found.names[b]),
         float(apart[a, b]),

@@ -10,13 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from mi_nerfattack import cli
 from mi_nerfattack.capture.colmap.follow import Stages
 from mi_nerfattack.capture.colmap.process import MARK
 from mi_nerfattack.capture.colmap.reconstruct import Structure
-from mi_nerfattack.capture.photographs import PoseOptions, estimate_poses, upright
+from mi_nerfattack.capture.photographs.estimate import (
+    PoseOptions,
+    estimate_poses,
+    upright,
+)
+from mi_nerfattack.capture.photographs.staging import (
+    copy_upright,
+    list_photographs,
+    stage,
+)
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.io import files
@@ -42,10 +51,11 @@ def noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.clip((total - 0.2) / 0.6, 0, 1)
 
 
-def corner_photograph(pose: np.ndarray) -> np.ndarray:
+def corner_photograph(pose: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
     """Trace a floor z = 0 and two walls x = 3, y = 3, seen from inside."""
-    u, v = np.meshgrid(np.arange(240) + 0.5, np.arange(180) + 0.5)
-    local = [(u - 120) / CAMERA.fx, (v - 90) / CAMERA.fy, np.ones_like(u)]
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    local = [x, y, np.ones_like(u)]
     ray = np.stack(local, -1) @ pose[:3, :3].T
     eye = pose[:3, 3]
     with np.errstate(divide="ignore"):
@@ -61,8 +71,8 @@ def corner_photograph(pose: np.ndarray) -> np.ndarray:
     return np.repeat(np.round(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def corner_poses() -> np.ndarray:
-    angle = np.linspace(-0.5, 0.5, COUNT)
+def corner_poses(count: int = COUNT) -> np.ndarray:
+    angle = np.linspace(-0.5, 0.5, count)
     eyes = np.stack(
         [2 - 4 * np.cos(angle + 0.785), 2 - 4 * np.sin(angle + 0.785), 1.6 + angle], 1
     )
@@ -106,7 +116,7 @@ class TestCorner:
         found, _ = aligned(posed.camera_to_world[:, :3, 3], given)
         np.testing.assert_allclose(found, given, atol=0.05)
         assert result.error_px < 1
-        assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.05)
+        assert result.cameras[0].fx == pytest.approx(CAMERA.fx, rel=0.05)
 
     def test_z_points_up(self, corner):
         posed = read_images(corner[0] / "out")
@@ -170,7 +180,8 @@ class TestCorner:
 class TestUpright:
     def structure(self, poses) -> Structure:
         names = tuple(str(i) for i in range(len(poses)))
-        return Structure(names, poses, CAMERA, np.zeros((0, 3)), 0.5)
+        cameras = (CAMERA,) * len(poses)
+        return Structure(names, poses, cameras, np.zeros((0, 3)), 0.5)
 
     @pytest.mark.parametrize(
         "up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.3, -0.8, 0.2], [0, -1, 0]]
@@ -225,8 +236,10 @@ class TestUnusable:
 
     def test_mixed_sizes(self, tmp_path):
         folder = self.photographs(tmp_path / "p", 3)
-        files.write_image(folder / "1.jpg", np.zeros((80, 60, 3), np.uint8))
-        self.refused(folder, "1.jpg: 60 x 80 px, but .*0.jpg has 80 x 60")
+        for name in "34":
+            files.write_image(folder / f"{name}.jpg", np.zeros((80, 60, 3), np.uint8))
+        message = "p: only 3.jpg, 4.jpg of 60 x 80 px; .* at least 3 .* 2 such groups"
+        self.refused(folder, message)
 
     def test_nothing_placed(self, tmp_path, monkeypatch):
         pytest.importorskip("pycolmap")
@@ -332,7 +345,7 @@ class TestProcess:
     def test_process_ends_with_its_parent(self, tmp_path):
         (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
         command = [sys.executable, "-m", "mi_nerfattack.capture.colmap.process"]
-        task = json.dumps({"work": "", "folder": "", "names": []})
+        task = json.dumps({"work": "", "folder": "", "groups": []})
         environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
         result = subprocess.run(command, input=task + "\n", text=True, env=environment)
         assert result.returncode == 1
@@ -361,17 +374,91 @@ def write_turned(path: Path, image: np.ndarray) -> None:
 
 
 def test_turned_photographs_are_stored_upright(tmp_path):
-    from mi_nerfattack.capture.photographs import _copy_upright
-
     image = np.zeros((60, 80, 3), np.uint8)
     image[:, :40] = 255  # left, so on top when turned clockwise
     write_turned(tmp_path / "a.jpg", image)
-    assert _copy_upright(tmp_path / "a.jpg", tmp_path / "b.jpg") == (60, 80)
+    held = copy_upright(tmp_path / "a.jpg", tmp_path / "b.jpg")
+    assert held[-3:] == (6, 60, 80)
     shown = files.read_image(tmp_path / "b.jpg")
     assert shown.shape == (80, 60, 3)
     assert shown[:36].min() > 240 and shown[44:].max() < 15
     with Image.open(tmp_path / "b.jpg") as stored:
         assert stored.getexif().get(0x0112, 1) == 1
+
+
+def photograph_with(path: Path, image: np.ndarray, focal_mm: float, turn: int) -> None:
+    """Store a picture as a phone does, turned, and with EXIF data that turn it back."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "Analytic"
+    exif[ExifTags.Base.Orientation] = {0: 1, 1: 6, 3: 8}[turn]
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal_mm
+    Image.fromarray(np.rot90(image, turn)).save(path, exif=exif, quality=95)
+
+
+class TestMixedSet:
+    """One camera held three ways and zoomed; EXIF data tell the groups apart."""
+
+    def taken(self, i: int) -> tuple[Camera, float, int]:
+        """Return lens, focal length and turn of the i-th photograph."""
+        wide, tele, tall = (
+            CAMERA,
+            from_fov(240, 180, 45.0),
+            Camera(180, 240, CAMERA.fx, CAMERA.fy, 90, 120),
+        )
+        return [(wide, 4.0, 0), (tall, 4.0, 1), (tele, 6.5, 0), (tall, 4.0, 3)][i % 4]
+
+    def photographs(self, folder: Path, count: int) -> np.ndarray:
+        folder.mkdir()
+        poses = corner_poses(count)
+        for i, pose in enumerate(poses):
+            camera, focal, turn = self.taken(i)
+            image = corner_photograph(pose, camera)
+            photograph_with(folder / f"{i:02d}.jpg", image, focal, turn)
+        return poses
+
+    def test_groups(self, tmp_path):
+        self.photographs(tmp_path / "p", 12)
+        (tmp_path / "staged").mkdir()
+        names = list_photographs(tmp_path / "p")
+        groups = stage(tmp_path / "p", names, tmp_path / "staged", lambda *_: None)
+        found = {(held.focal_mm, held.orientation): held for held in groups}
+        sizes = {key: (held.width, held.height) for key, held in found.items()}
+        assert sizes == {
+            ("4.0", 1): (240, 180),
+            ("4.0", 6): (180, 240),
+            ("6.5", 1): (240, 180),
+            ("4.0", 8): (180, 240),
+        }
+        assert [len(group) for group in groups.values()] == [3, 3, 3, 3]
+        assert str(found["4.0", 6]) == (
+            "Analytic, 4.0 mm, 180 x 240 px, turned by EXIF data (6)"
+        )
+        upright_one = files.read_image(tmp_path / "staged/01.jpg").astype(float)
+        wanted = corner_photograph(corner_poses(12)[1], self.taken(1)[0])
+        assert np.abs(upright_one - wanted).mean() < 8
+
+    def test_too_few_held_one_way(self, tmp_path):
+        self.photographs(tmp_path / "p", 10)
+        message = "only 02.jpg, 06.jpg of Analytic, 6.5 mm, .* at least 3"
+        with pytest.raises(InputError, match=message):
+            estimate_poses(tmp_path / "p", tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.slow
+    def test_is_placed_whole(self, tmp_path):
+        pytest.importorskip("pycolmap")
+        given = self.photographs(tmp_path / "p", 16)
+        options = PoseOptions(lens="SIMPLE_PINHOLE")
+        result = estimate_poses(tmp_path / "p", tmp_path / "out", options)
+        assert result.left_out == ()
+        for i, camera in enumerate(result.cameras):
+            wanted = self.taken(i)[0]
+            assert (camera.width, camera.height) == (wanted.width, wanted.height)
+            assert camera.fx == pytest.approx(wanted.fx, rel=0.05)
+        posed = read_images(tmp_path / "out")
+        found, _ = aligned(posed.camera_to_world[:, :3, 3], given[:, :3, 3])
+        np.testing.assert_allclose(found, given[:, :3, 3], atol=0.05)
+        assert posed.cameras == result.cameras and not posed.has_one_size
 
 
 @pytest.mark.slow

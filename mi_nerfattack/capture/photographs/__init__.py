@@ -1,0 +1,1 @@
+"""From photographs and videos to poses: cameras, scale, upright axes."""
