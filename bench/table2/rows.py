@@ -219,18 +219,17 @@ def aim_rows(
         retrained: of :func:`read_retrained`; may be empty.
     """
     for environment, least in _AIMS.items():
-        [effect] = [
-            row["effect"]
-            for row in summary["comparisons"]
-            if (row["route"], row["environment"]) == (None, environment)
-            and (row["method"], row["other_case"]) == (GRADIENT, RANDOM)
-        ]
-        ratio = effect["ratio"]
-        yield (
-            f"mean error at least {least:g} times that of random, {environment}",
-            f"{ratio:.2f}{_interval(effect['ratio_ci95'])}",
-            _met(ratio >= least),
-        )
+        for row in summary["comparisons"]:
+            labels = row["environment"], row["method"], row["other_case"]
+            if labels != (environment, GRADIENT, RANDOM):
+                continue
+            ratio, where = row["effect"]["ratio"], row["route"] or "all routes"
+            yield (
+                f"{where}: mean error at least {least:g} times that of random, "
+                f"{environment}",
+                f"{ratio:.2f}{_interval(row['effect']['ratio_ci95'])}",
+                _met(ratio >= least),
+            )
     attack = table[None, DEPLOYMENT, ATTACK]
     half = 2 * attack["attacks_out"] >= attack["attacks"]
     yield f"at least half of the attacks out, {DEPLOYMENT}", _out(attack), _met(half)

@@ -77,11 +77,15 @@ def test_rows_by_hand(tmp_path):
     assert "| 1320 ± 0 (0.200 m) | 1500 ± 85 (0.500 m) | 1254 (0.090 m) |" in ours[1]
     # in all 0.4 m, of which 0.2 m by chance; 0.01 m more without objects
     aims = [line for line in text.splitlines() if line.endswith("met** |")]
+    assert aims.pop(0).startswith("| straight: mean error at least 2 times")
     assert len(aims) == 2 and "| 1/4 out [5, 70] |" in aims[0]
     assert "without objects at most 1.1 times" in aims[1] and "| 1.25 |" in aims[1]
     met = [line for line in text.splitlines() if line.endswith("| met |")]
-    assert "| 4.00 [" in met[0] and "| 2.00 [" in met[1]
-    assert "| 0 of 4 drives |" in met[2] and "| 1.12 |" in met[3]
+    routes = [line.split(":")[0] for line in met[:5]]
+    expected = ["straight", "right", "all routes", "right", "all routes"]
+    assert routes == [f"| {route}" for route in expected]
+    assert "| 4.00 [" in met[2] and "| 2.00 [" in met[4]
+    assert "| 0 of 4 drives |" in met[5] and "| 1.12 |" in met[6]
     assert "- policy.file: SHA-256 abc" in text and "with: mitsuba 3" in text
 
 
