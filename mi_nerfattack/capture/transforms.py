@@ -77,7 +77,7 @@ def _nothing_found(folder: Path) -> str:
     ]
     advice = (
         f"it holds {len(photographs)} photographs: estimate their poses with "
-        f"'mi-nerfattack poses {photographs[0].parent} -o FOLDER'"
+        f"'mi-nerfattack capture {photographs[0].parent} -o FOLDER'"
         if photographs
         else "give the folder that holds one of them"
     )

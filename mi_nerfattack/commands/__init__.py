@@ -19,7 +19,6 @@ from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
-from mi_nerfattack.commands.poses import Poses
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
@@ -42,7 +41,6 @@ COMMANDS: dict[str, type[Command]] = {
     "demo": Demo,
     "render": Render,
     "capture": Capture,
-    "poses": Poses,
     "fit": Fit,
     "bake": Bake,
     "asset": Asset,

@@ -1,25 +1,28 @@
-"""``mi-nerfattack capture``: posed renders of a Mitsuba scene along its routes."""
+"""``mi-nerfattack capture``: posed images of a scene, of photographs or of a video."""
 
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.capture.photographs.estimate import PoseEstimate
+    from mi_nerfattack.commands.shared.progress import StageBars
+
 
 @dataclass(frozen=True)
-class Capture:
-    """Render posed images and depth of a scene, from where a drive may look at it."""
+class SceneArguments:
+    """Views of a Mitsuba scene."""
 
-    scene: tyro.conf.Positional[Path]
-    """Mitsuba scene (.xml)."""
-    routes: Path
-    """Routes file (.json); all its routes are used."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder for transforms.json, images and depth."""
+    routes: Path | None = None
+    """Routes file (.json), needed; all its routes are used."""
     views: int = 256
     """Number of views."""
     width: int = 320
@@ -30,42 +33,162 @@ class Capture:
     """Horizontal field of view."""
     spp: int = 16
     """Samples per pixel."""
-    seed: int = 0
-    """Of poses and samples."""
 
-    def run(self) -> int:
-        """Render and write."""
+    def write(self, scene: Path, output: Path, seed: int, bars: StageBars) -> Path:
+        """Render and write; return the path of the `transforms.json`."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.scene import capture_scene
-        from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.errors import InputError
         from mi_nerfattack.render.camera.intrinsics import from_fov
         from mi_nerfattack.report.plots.place import routes_picture
         from mi_nerfattack.vehicle.route.route import load_routes
 
         variant.ensure()
+        if self.routes is None:
+            raise InputError("--routes: missing; give the routes file of the scene")
         for name in ("views", "width", "height", "spp"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: {getattr(self, name)}; at least 1")
         camera = from_fov(self.width, self.height, self.fov_deg)
-        with StageBars() as bars:
-            path = capture_scene(
-                self.scene,
-                self.routes,
-                self.output,
-                self.views,
-                camera,
-                self.spp,
-                self.seed,
-                bars.counter("rendering views"),
+        path = capture_scene(
+            scene,
+            self.routes,
+            output,
+            self.views,
+            camera,
+            self.spp,
+            seed,
+            bars.counter("rendering views"),
+        )
+        show = bars.counter("drawing the place")
+        show(0, 1)
+        picture = path.parent / "place.png"
+        routes_picture(picture, scene, load_routes(self.routes), camera)
+        show(1, 1)
+        bars.say(f"{picture}: scene, routes and lanes from above; look at it first")
+        return path
+
+
+@dataclass(frozen=True)
+class PhotographArguments:
+    """Poses of photographs and videos, by structure from motion on the CPU."""
+
+    matching: Literal["exhaustive", "sequential"] | None = None
+    """Compare all photographs, or each with its neighbours, as by default frames of a
+    video."""
+    lens: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = (
+        "OPENCV"
+    )
+    """Camera model of COLMAP."""
+    long_edge: int = 1600
+    """Look for features at most at this size, pixels; the images keep theirs."""
+    frames: int = 150
+    """Of a video, at most."""
+    baseline: float = 0.05
+    """How far the picture moves between two frames of a video, in shares of its longer
+    edge."""
+    metres_per_unit: float | None = None
+    """Multiply all lengths by this."""
+
+    def write(
+        self, source: Path, output: Path, seed: int, bars: StageBars
+    ) -> PoseEstimate:
+        """Estimate and write poses."""
+        from mi_nerfattack.capture.photographs.estimate import (
+            PoseOptions,
+            estimate_poses,
+        )
+        from mi_nerfattack.capture.photographs.frames import (
+            FrameOptions,
+            extract_frames,
+        )
+
+        def show(stage: str, done: int, total: int) -> None:
+            bars.show(stage, done, total, f"{done} of {total}")
+
+        is_video = not source.is_dir()
+        usual = "sequential" if is_video else "exhaustive"
+        options = PoseOptions(
+            self.matching or usual,
+            self.lens,
+            self.long_edge,
+            self.metres_per_unit,
+            seed,
+        )
+        if not is_video:
+            return estimate_poses(source, output, options, show)
+        with tempfile.TemporaryDirectory() as folder:
+            chosen = FrameOptions(self.frames, self.baseline)
+            extract_frames(source, Path(folder), chosen, show)
+            return estimate_poses(folder, output, options, show)
+
+    def tell(self, result: PoseEstimate) -> None:
+        """Print what was found."""
+        total = len(result.placed) + len(result.left_out)
+        print(
+            f"Placed {len(result.placed)} of {total} photographs, mean reprojection "
+            f"error {result.error_px:.2f} px; wrote {result.path}"
+        )
+        if result.left_out:
+            print(f"Not placed: {', '.join(result.left_out)}")
+        unit = "m" if self.metres_per_unit is not None else "units"
+        apart = f"{result.distance:.4g} {unit}"
+        print(f"{' and '.join(result.farthest)} were taken {apart} apart.")
+        if self.metres_per_unit is None:
+            print(
+                "The unit is arbitrary: measure this distance in metres and give its "
+                f"quotient by {result.distance:.4g} as --metres-per-unit."
             )
-            show = bars.counter("drawing the place")
-            show(0, 1)
-            picture = path.parent / "place.png"
-            routes_picture(picture, self.scene, load_routes(self.routes), camera)
-            show(1, 1)
-        print(f"{picture}: scene, routes and lanes from above; look at it first")
-        print(f"Wrote {self.views} views to {path.parent}; fit a field to them with")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Make posed images to fit a field to: of a scene, of photographs, or of a video.
+
+    A Mitsuba scene is rendered with depth from where a drive along its routes may look
+    at it.
+
+    Photographs and videos show one still scene from different places; their poses are
+    estimated. Photographs may come from several cameras, each with three or more at a
+    focal length and held one way. z points up if they were held level on average.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """Scene (.xml), folder of JPEG, PNG or WebP photographs, or video."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for transforms.json and images, with depth or sparse points."""
+    seed: int = 0
+    """Of all random numbers."""
+    scene: Annotated[SceneArguments, tyro.conf.OmitArgPrefixes] = field(
+        default_factory=SceneArguments
+    )
+    photographs: Annotated[PhotographArguments, tyro.conf.OmitArgPrefixes] = field(
+        default_factory=PhotographArguments
+    )
+
+    def run(self) -> int:
+        """Render or estimate, and write."""
+        from mi_nerfattack.commands.shared.progress import StageBars
+
+        is_scene = self.source.suffix.lower() == ".xml"
+        other = self.photographs if is_scene else self.scene
+        for name, value in vars(other).items():
+            if value != getattr(type(other)(), name):
+                raise InputError(
+                    f"--{name.replace('_', '-')}: not for {self.source}, which is "
+                    f"{'a scene' if is_scene else 'no scene (.xml)'}; leave it out"
+                )
+        with StageBars() as bars:
+            if is_scene:
+                path = self.scene.write(self.source, self.output, self.seed, bars)
+                told = None
+            else:
+                told = self.photographs.write(self.source, self.output, self.seed, bars)
+                path = told.path
+        if told is not None:
+            self.photographs.tell(told)
+        else:
+            print(f"Wrote {self.scene.views} views to {path.parent}")
+        print("Fit a field to them with")
         folder = shlex.quote(str(path.parent))
         print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors")
         return 0

@@ -1,9 +1,9 @@
-"""Write videos that every player shows: H.264 in MP4."""
+"""Videos: written as every player shows them, H.264 in MP4, and decoded."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.io import files
 
 CODEC = "libx264"
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm")
+MAX_VIDEO_BYTES = 1 << 32
 _OPTIONS = {"crf": "17", "preset": "medium"}
 _BT709 = 1  # primaries and matrix of ITU-T H.273, equal to those of sRGB
 _SRGB_CURVE = 13
@@ -102,3 +104,61 @@ def check_fps(fps: float) -> None:
     """Raise InputError unless frames per second are in [0.1, 1000]."""
     if not 0.1 <= fps <= 1000:
         raise InputError(f"fps: {fps}; frames per second, from 0.1 to 1000")
+
+
+def open_video(raw: bytes) -> Any:
+    """Open the bytes of a video as PyAV's container."""
+    import av
+
+    return av.open(io.BytesIO(raw), metadata_errors="replace")
+
+
+def video_stream(path: Path, container: Any) -> Any:
+    """Return a container's first stream of pictures.
+
+    Raises:
+        InputError: it has none, one of an unknown codec, or too large ones.
+    """
+    if not container.streams.video:
+        raise InputError(f"{path}: has no pictures; truncated, or only sound")
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise InputError(f"{path}: a codec that PyAV does not know; use H.264")
+    width, height = stream.codec_context.width, stream.codec_context.height
+    if not 0 < width * height <= files.MAX_IMAGE_PIXELS:
+        raise InputError(
+            f"{path}: {width} x {height} px; at most {files.MAX_IMAGE_PIXELS} pixels "
+            "are read"
+        )
+    return stream
+
+
+def decode_video(path: Path, raw: bytes) -> Iterator[tuple[Any, int]]:
+    """Yield the frames of a video.
+
+    Args:
+        path: of the video, for messages.
+        raw: its bytes.
+
+    Returns:
+        PyAV's frames, each with the number of frames that the video announces; 0 where
+        it does not tell.
+
+    Raises:
+        InputError: it is no video, or damaged.
+    """
+    from av.error import FFmpegError
+
+    try:
+        with open_video(raw) as container:
+            stream = video_stream(path, container)
+            stream.codec_context.options = {"max_pixels": str(files.MAX_IMAGE_PIXELS)}
+            for frame in container.decode(stream):
+                yield frame, stream.frames
+    except FFmpegError as error:
+        raise damaged_video(path, error) from error
+
+
+def damaged_video(path: Path, error: Exception) -> InputError:
+    """Return what is raised for a video that FFmpeg cannot read."""
+    return InputError(f"{path}: damaged or truncated video ({error}); copy it again")

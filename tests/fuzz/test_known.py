@@ -226,7 +226,7 @@ def test_names_that_no_file_has(capsys):
     from mi_nerfattack import cli
 
     name = "a" * 300
-    for command in (["poses", name], ["asset", f"{name}.glb"], ["fit", name]):
+    for command in (["capture", name], ["asset", f"{name}.glb"], ["fit", name]):
         assert cli.main([*command, "-o", "out.safetensors"]) == cli.EXIT_INPUT
         told = capsys.readouterr().err
         assert told.count("\n") == 1 and "too long; check the path" in told

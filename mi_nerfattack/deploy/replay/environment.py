@@ -13,10 +13,11 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.replay.folder import FolderRecording
 from mi_nerfattack.deploy.replay.mcap import McapRecording
 from mi_nerfattack.deploy.replay.recording import AbstractRecording
-from mi_nerfattack.deploy.replay.video import VIDEO_SUFFIXES, VideoRecording
+from mi_nerfattack.deploy.replay.video import VideoRecording
 from mi_nerfattack.deploy.vehicle import require_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io.video import VIDEO_SUFFIXES
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.vehicle.route.route import Route
 

@@ -80,7 +80,7 @@ def _pose_file(folder: Path) -> Path:
     if not found:
         raise InputError(
             f"{folder}: no poses; looked for {', '.join(_POSE_FILES)}; estimate them "
-            f"with 'mi-nerfattack poses {folder} -o FOLDER'"
+            f"with 'mi-nerfattack capture {folder} -o FOLDER'"
         )
     return found[0]
 

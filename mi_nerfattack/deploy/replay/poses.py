@@ -85,7 +85,7 @@ def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
     if table.get("units") == "arbitrary":
         raise InputError(
             f"{path}: units: 'arbitrary'; a drive is replayed in metres: measure a "
-            "length in it and run 'mi-nerfattack poses' with --metres-per-unit"
+            "length in it and run 'mi-nerfattack capture' with --metres-per-unit"
         )
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,14 @@ from mi_nerfattack.deploy.replay.recording import (
 )
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.video import (
+    MAX_VIDEO_BYTES,
+    damaged_video,
+    decode_video,
+    open_video,
+    video_stream,
+)
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
-
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm")
-MAX_VIDEO_BYTES = 1 << 32
 
 
 class VideoRecording(AbstractRecording):
@@ -60,9 +63,9 @@ class VideoRecording(AbstractRecording):
     def image(self, index: int) -> np.ndarray:
         """Decode up to one frame."""
         if index < self._at:
-            self._frames, self._at = self._decode(), -1
+            self._frames, self._at = decode_video(self._path, self._raw), -1
         while self._at < index:
-            frame = next(self._frames, None)
+            frame, _ = next(self._frames, (None, 0))
             if frame is None:
                 raise InputError(
                     f"{self._path}: ends at frame {self._at + 1} of "
@@ -87,19 +90,14 @@ class VideoRecording(AbstractRecording):
         from av.error import FFmpegError
 
         try:
-            with _open(self._raw) as container:
-                stream = _video_stream(self._path, container)
+            with open_video(self._raw) as container:
+                stream = video_stream(self._path, container)
                 width, height = stream.codec_context.width, stream.codec_context.height
-                if not 0 < width * height <= files.MAX_IMAGE_PIXELS:
-                    raise InputError(
-                        f"{self._path}: {width} x {height} px; at most "
-                        f"{files.MAX_IMAGE_PIXELS} pixels are read"
-                    )
                 # what a cut keeps before its first frame is decoded, but not shown
                 packets = [(p.pts, p.is_discard) for p in container.demux(stream)]
                 announced, base = stream.frames, stream.time_base
         except FFmpegError as error:
-            raise self._damaged(error) from error
+            raise damaged_video(self._path, error) from error
         found = [(stamp, hidden) for stamp, hidden in packets if stamp is not None]
         stamps = [stamp for stamp, hidden in found if not hidden]
         if not stamps or base is None or announced > len(found):
@@ -110,38 +108,6 @@ class VideoRecording(AbstractRecording):
         times = np.sort(np.array([float(stamp * base) for stamp in stamps]))
         check_times(str(self._path), times)
         return width, height, times
-
-    def _decode(self) -> Iterator[Any]:
-        from av.error import FFmpegError
-
-        try:
-            with _open(self._raw) as container:
-                stream = _video_stream(self._path, container)
-                limit = str(files.MAX_IMAGE_PIXELS)
-                stream.codec_context.options = {"max_pixels": limit}
-                yield from container.decode(stream)
-        except FFmpegError as error:
-            raise self._damaged(error) from error
-
-    def _damaged(self, error: Exception) -> InputError:
-        return InputError(
-            f"{self._path}: damaged or truncated video ({error}); copy it again"
-        )
-
-
-def _open(raw: bytes) -> Any:
-    import av
-
-    return av.open(io.BytesIO(raw), metadata_errors="replace")
-
-
-def _video_stream(path: Path, container: Any) -> Any:
-    if not container.streams.video:
-        raise InputError(f"{path}: has no pictures; truncated, or only sound")
-    stream = container.streams.video[0]
-    if stream.codec_context is None:
-        raise InputError(f"{path}: a codec that PyAV does not know; use H.264")
-    return stream
 
 
 def _pose_file(path: Path) -> Path:

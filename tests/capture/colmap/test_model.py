@@ -203,7 +203,7 @@ def test_nothing_there(tmp_path):
     with pytest.raises(InputError, match="no posed images; looked for .*sparse/0"):
         read_images(tmp_path)
     write_photographs(tmp_path / "images")
-    with pytest.raises(InputError, match="2 photographs.*mi-nerfattack poses"):
+    with pytest.raises(InputError, match="2 photographs.*mi-nerfattack capture"):
         read_images(tmp_path)
     with pytest.raises(InputError, match="nowhere: does not exist"):
         read_images(tmp_path / "nowhere")

@@ -168,7 +168,7 @@ class TestCorner:
     def test_command(self, corner, tmp_path, capsys):
         arguments = ["--matching", "sequential", "--lens", "SIMPLE_PINHOLE"]
         code = cli.main(
-            ["poses", str(corner[0] / "photographs"), "-o", str(tmp_path), *arguments]
+            ["capture", str(corner[0] / "photographs"), "-o", str(tmp_path), *arguments]
         )
         out = capsys.readouterr().out
         assert code == 0 and f"Placed {COUNT} of {COUNT + 1} photographs" in out
