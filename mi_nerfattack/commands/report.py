@@ -11,24 +11,28 @@ import tyro
 
 @dataclass(frozen=True)
 class Report:
-    """Write one HTML page of finished runs, which needs no network and no other file.
+    """Write one HTML page of results, which needs no network and no other file.
 
-    Figures with flags first, drives from above, damage against cost, what the policy
-    sees, frame by frame, the objects from all around, when and where the failure is
-    made, versions, checksums, and the command that makes each run again.
+    Figures with flags first, drives from above, damage against cost, the matrix of
+    transfers, what the policy sees, frame by frame, the objects from all around, when
+    and where the failure is made, versions, checksums, and the command that makes each
+    row again.
     """
 
     folders: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FOLDER...")
     ]
-    """Run folders of attack."""
+    """Finished run folders of attack, folders of sweep and transfer, and files
+    NAME-retrain.json of retrain, any of them together."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """HTML file to write."""
     title: str | None = None
-    """Of the page; made of the runs' names by default."""
+    """Of the page; made of names of what it shows by default."""
 
     def run(self) -> int:
         """Read, render the objects and write."""
+        from tempfile import TemporaryDirectory
+
         from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.page.folders import read_folders
@@ -39,7 +43,9 @@ class Report:
             raise InputError(f"--output: {self.output}; name an .html file")
         files.check_writable(self.output)
         variant.ensure()
-        write_page(self.output, read_folders(self.folders), self.title)
+        with TemporaryDirectory() as scratch:
+            parts = read_folders(self.folders, Path(scratch))
+            write_page(self.output, parts, Path(scratch), self.title)
         size = self.output.stat().st_size / 1e6
         print(f"Written: {self.output.resolve()} ({size:.1f} MB)")
         return 0

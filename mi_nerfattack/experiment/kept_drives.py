@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.checkpoint import REMEDY
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.io import files
@@ -22,6 +23,26 @@ class DriveRecord(Record):
     run: int
     objective: float | None
     effort: Effort
+
+
+def read_drive(path: Path, route: str) -> Drive:
+    """Read a finished drive, whatever scenario and versions it is of.
+
+    Args:
+        path: of a file in the folder of a run's drives.
+        route: that it follows.
+
+    Raises:
+        InputError: the file is damaged, or of another format.
+    """
+    unit = Unit(path, {"format": FORMAT}, DriveRecord, REMEDY)
+    kept = unit.read(force=True)
+    if kept is None:
+        raise InputError(f"{path}: missing; it was removed")
+    record = kept.record
+    with misfits_told(path):
+        about = record.environment, route, record.case, record.run
+        return Drive(*about, record.run, **kept.tensors)
 
 
 class KeptDrives:

@@ -14,13 +14,14 @@ from mi_nerfattack.evaluation.verdict import verdict
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.page.run import read_run
-from mi_nerfattack.experiment.page.write import write_page
 from mi_nerfattack.experiment.pictures.write import write_images
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.stages import OnProgress
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.parts import Parts
+from mi_nerfattack.report.pages.results import write_results_page
 from mi_nerfattack.report.table import write_steps
 from mi_nerfattack.rollout.drive import ATTACK, OWN
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -60,7 +61,8 @@ def write_results(
         write_images(output, done, history, frames, on_progress)
         document["cost"] = effort().model_dump()
         files.write_json(path, document)
-        write_page(output / "report.html", [read_run(output, output.name)])
+        parts = Parts(runs=[read_run(output, output.name)])
+        write_results_page(output / "report.html", document["scenario"]["name"], parts)
     except BaseException:
         on_notice(
             f"{path}: holds all figures; pictures are missing: make room if the disk "

@@ -81,3 +81,66 @@ def _draw(folder, frames):
             pixels = np.full((4, 8, 3), 60 * number + 10 * step, np.uint8)
             files.make_folder(own)
             files.write_image(own / f"{step:04d}.png", pixels)
+
+
+def case(mean, out, of=2):
+    """Figures of a case over attacks."""
+    return {
+        "cross_track_mean_m": mean,
+        "cross_track_mean_ci95_m": [mean / 2, 2 * mean],
+        "cross_track_max_m": 3 * mean,
+        "drives": 4 * of,
+        "drives_departed": 4 * out,
+        "attacks_out": out,
+        "attacks_out_rate_ci95": [0.25, 0.75],
+    }
+
+
+def make_transfer(folder, complete=True):
+    """Write the folder of a transfer: light has no effect in the surrogate."""
+
+    def column(environment, condition, mean, out):
+        cases = {"no_object": case(0.05, 0), "attack": case(mean, out)}
+        transfer = {"of": 2, "kept": out, "rate_ci95": [0.25, 0.75]}
+        about = {"environment": environment, "condition": condition, "attacks": 2}
+        return about | {"cases": cases, "ratio_to_surrogate": 0.5, "transfer": transfer}
+
+    document = {
+        "schema": 1,
+        "complete": complete,
+        "starts": 4,
+        "success_s": 1.0,
+        "cases": ["no_object", "attack"],
+        "conditions": {"day": {}, "<noon>": {}},
+        "attacks": [{"label": name} for name in ("one", "two")],
+        "rows": [
+            {
+                "attack": name,
+                "environment": environment,
+                "condition": "day",
+                "cases": {"attack": case(0.7, 1)},
+            }
+            for name in ("one", "two")
+            for environment in ("surrogate", "mitsuba")
+        ],
+        "columns": [
+            column("surrogate", "day", 0.8, 2),
+            column("mitsuba", "day", 0.4, 1),
+            column("mitsuba", "<noon>", 0.2, 0),
+        ],
+        "surrogates": [],
+    }
+    files.make_folder(folder)
+    files.write_json(folder / "transfer.json", document)
+
+
+def make_retraining(path):
+    """Write what a retraining leaves."""
+    before = {"no_object": case(0.05, 0), "attack": case(0.8, 2)}
+    after = {"no_object": case(0.06, 0), "attack": case(0.09, 0)}
+    row = {"group": "held_out", "environment": "mitsuba", "attacks": 2}
+    row |= {"before": before, "after": after, "clean_ratio": 1.2}
+    row["attack_to_clean"] = {"before": 16.0, "after": 1.5}
+    left_out = {"third": "the expert leaves its lane"}
+    about = {"policy": {}, "runs": [{}, {}], "held_out": [], "left_out": left_out}
+    files.write_json(path, {"schema": 1, **about, "table": [row]})

@@ -26,6 +26,7 @@ class PageReader(HTMLParser):
         self.feed(page)
         self.close()
         assert self._open == []
+        self.rows = [[" ".join(cell.split()) for cell in row] for row in self.rows]
 
     def handle_starttag(self, tag, attrs):
         values = dict(attrs)
@@ -38,6 +39,8 @@ class PageReader(HTMLParser):
             self.addresses.append("link")
         if tag == "img":
             self.images.append(values)
+        if tag == "br":
+            self.handle_data(" ")
         if tag == "tr":
             self.rows.append([])
         if tag in ("td", "th"):
@@ -51,7 +54,7 @@ class PageReader(HTMLParser):
     def handle_data(self, data):
         self.text += data
         if {"td", "th"} & set(self._open):
-            self.rows[-1][-1] += data.strip()
+            self.rows[-1][-1] += data
 
     def check_alone(self):
         """Assert that nothing but the file itself is needed, nor a picture unsaid."""

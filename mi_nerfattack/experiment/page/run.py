@@ -12,7 +12,7 @@ from mi_nerfattack.experiment.attribution import UNCHANGED
 from mi_nerfattack.experiment.page.scrubbers import seen_scrubbers, turntables
 from mi_nerfattack.experiment.run_folder import DRIVES, SCENARIO, read_finished
 from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.results import (
+from mi_nerfattack.report.pages.parts import (
     ABOVE,
     COST,
     SEEN,

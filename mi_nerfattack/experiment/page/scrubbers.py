@@ -20,8 +20,8 @@ from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
 #: Beside each other.
 CASES = (NO_OBJECT, RANDOM, ATTACK)
 MOST_FRAMES = 60
-VIEWS = 16  # of a turntable
-VIEW_PX = 320  # longer edge
+VIEWS = 12  # of a turntable
+VIEW_PX = 256  # longer edge
 TURN_S = 4.0  # once around
 _FRAME = re.compile(r"([0-9]{4,})\.png")
 

@@ -44,10 +44,16 @@ def address(image: Image.Image, **options: Any) -> Markup:
 
 
 def _embedded(path: str | Path) -> Markup:
-    """Return the address of an image file; exact, unless that takes too much room."""
+    """Return the attributes of `img` that show a file.
+
+    Its pixels are exact, unless that takes too much room.
+    """
     image = Image.fromarray(files.read_image(path))
-    exact = address(image, lossless=True, quality=60, method=3)
-    return exact if len(exact) <= _EXACT_BYTES else address(image, quality=_QUALITY)
+    source = address(image, lossless=True, quality=60, method=3)
+    if len(source) > _EXACT_BYTES:
+        source = address(image, quality=_QUALITY)
+    size = 'width="{0}" height="{1}" style="--w: {0}" src="{2}"'
+    return Markup(size).format(*image.size, source)
 
 
 def _in_markdown(value: Any) -> Markup:

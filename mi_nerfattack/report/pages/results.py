@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+from matplotlib.colors import to_hex
+
 from mi_nerfattack.io import files
 from mi_nerfattack.report.pages.elements import render
-from mi_nerfattack.report.pages.scrubber import Scrubber
+from mi_nerfattack.report.pages.parts import Parts, RunPart
+from mi_nerfattack.report.plots.transfer import COLOURS, LIGHT, matrix_lines
 from mi_nerfattack.rollout.drive import ATTACK, RANDOM
 
 _COST_LABELS = {
@@ -21,57 +24,27 @@ _COST_LABELS = {
     "forward_s": "of the wall time, in the attack's drives (s)",
     "backward_s": "of the wall time, in the passes back through them (s)",
 }
-#: Sections of a page that have pictures of each run, with what the folder may lack.
-ABOVE, COST, SEEN, TEXTURES, WHEN = "above", "cost", "seen", "textures", "when"
 
 
-@dataclass(frozen=True, eq=False)
-class RunPart:
-    """A finished run, as a page shows it.
-
-    Attributes:
-        label: that tells it from the others.
-        document: as of `metrics.metrics_document`, with all that follows.
-        scenario: the scenario file as run.
-        made_with: version of each program by its name.
-        digests: SHA-256 of files by their keys.
-        repeat: the command that makes the run again.
-        pictures: image files by title, by section.
-        scrubbers: by section.
-        missing: by section, why there is nothing, and what makes it.
-    """
-
-    label: str
-    document: Mapping[str, Any]
-    scenario: str
-    made_with: Mapping[str, str]
-    digests: Mapping[str, str]
-    repeat: str
-    pictures: Mapping[str, Mapping[str, Path]]
-    scrubbers: Mapping[str, Sequence[Scrubber]]
-    missing: Mapping[str, str]
-
-
-def write_results_page(
-    path: str | Path, title: str, runs: Sequence[RunPart], damage: Mapping[str, Path]
-) -> None:
+def write_results_page(path: str | Path, title: str, parts: Parts) -> None:
     """Write a self-contained HTML page, atomically.
 
     Args:
         path: HTML file.
         title: of the page.
-        runs: what it shows.
-        damage: plots of several runs by title.
+        parts: what it shows.
     """
+    shown = parts.shown
     text = render(
         "results.html.j2",
         title=title,
-        runs=runs,
-        headline=[row for run in runs for row in _headline(run)],
-        damage=damage,
-        cost=_beside([run.document["cost"] for run in runs], _COST_LABELS),
-        made_with=_beside([run.made_with for run in runs]),
-        digests=_beside([run.digests for run in runs]),
+        parts=parts,
+        shown=shown,
+        headline=[row for run in parts.runs for row in _headline(run)],
+        matrices=[_matrix(part.document) for part in parts.transfers],
+        cost=_beside([run.document["cost"] for run in shown], _COST_LABELS),
+        made_with=_beside([run.made_with for run in shown]),
+        digests=_beside([run.digests for run in shown]),
     )
     files.write_text(path, text)
 
@@ -97,6 +70,47 @@ def _ratio(cases: Mapping[str, Any]) -> float | None:
     if attack is None or chance is None or not chance["cross_track_mean_m"]:
         return None
     return attack["cross_track_mean_m"] / chance["cross_track_mean_m"]
+
+
+def _matrix(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the blocks of a transfer's matrix, one an environment.
+
+    Returns:
+        ``environment`` and ``lines``, each a label and, by condition, None where
+        nothing was driven, or text, colour of the cell and colour of the text.
+    """
+    names = dict.fromkeys(column["environment"] for column in document["columns"])
+    blocks = {name: matrix_lines(document, name) for name in names}
+    values = [
+        value
+        for lines in blocks.values()
+        for line in lines
+        for value, _ in line.cells.values()
+    ]
+    most, colours = max([*values, 1e-9]), matplotlib.colormaps[COLOURS]
+
+    def cell(value: float, text: str) -> tuple[str, str, str]:
+        share = value / most
+        return text, to_hex(colours(share)), "#000" if share > LIGHT else "#fff"
+
+    return [
+        {
+            "environment": name,
+            "lines": [
+                (
+                    line.label.strip(),
+                    [
+                        cell(*line.cells[condition])
+                        if condition in line.cells
+                        else None
+                        for condition in document["conditions"]
+                    ],
+                )
+                for line in lines
+            ],
+        }
+        for name, lines in blocks.items()
+    ]
 
 
 def _beside(

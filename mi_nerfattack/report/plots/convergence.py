@@ -100,3 +100,36 @@ def _held(curve: Mapping[str, Sequence[float]], frames: np.ndarray) -> np.ndarra
     """Return what had been found after so many frames."""
     done = np.searchsorted(curve["frames"], frames, side="right")
     return np.asarray(curve["cross_track_mean_m"])[done - 1]
+
+
+def against_limit(
+    path: str | Path,
+    limit: str,
+    environments: Mapping[str, Sequence[tuple[float, float]]],
+) -> None:
+    """Plot the mean distance from the lane centre against what textures may change.
+
+    Of several attacks with one limit, their median, and the range of them.
+
+    Args:
+        path: PNG file.
+        limit: what is limited, for the axis.
+        environments: limit and distance of attacks by environment.
+    """
+    with chart(path, 3.6) as figure:
+        axis = figure.subplots()
+        for number, (name, points) in enumerate(environments.items()):
+            at = sorted({x for x, _ in points})
+            groups = [[y for x, y in points if x == here] for here in at]
+            middle = np.array([np.median(group) for group in groups])
+            ends = np.array([(min(group), max(group)) for group in groups]).T
+            bars = np.abs(ends - middle)
+            look = {"color": PALETTE[number % len(PALETTE)], "marker": "o"}
+            axis.errorbar(at, middle, bars, capsize=3, label=name, **look)
+        axis.set_ylim(bottom=0)
+        axis.set_xlim(left=0)
+        axis.set_xlabel(limit)
+        axis.set_ylabel("mean distance from\nthe lane centre (m)")
+        axis.set_title("median and range of attacks", loc="left", fontsize=9)
+        axis.grid(alpha=0.25)
+        figure.legend(loc="outside lower center", ncols=4, frameon=False)

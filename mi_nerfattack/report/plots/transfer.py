@@ -17,12 +17,19 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 #: Attacks that have lines of their own; of more there is the mean alone.
 _MOST = 6
 _LINE_IN, _MARGIN_IN = 0.26, 1.9
-_LIGHT = 0.6  # of the colours' range, from where text is black
+#: Share of the colours' range from which on text is black.
+LIGHT = 0.6
+COLOURS = "inferno"
 
 
 @dataclass(frozen=True)
-class _Line:
-    """A line of the matrix: its label, and by condition its error and its text."""
+class Line:
+    """A line of the matrix: its label, and by condition its error and its text.
+
+    Attributes:
+        label: what is driven past.
+        cells: by condition, metres and what is written there.
+    """
 
     label: str
     cells: Mapping[str, tuple[float, str]]
@@ -44,7 +51,7 @@ def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
     conditions = list(document["conditions"])
     lines, names = [], []
     for environment in environments:
-        own = _lines(document, environment)
+        own = matrix_lines(document, environment)
         names += [environment] + [""] * (len(own) - 1)
         lines += own
     values = [
@@ -54,11 +61,11 @@ def plot_transfer(path: str | Path, document: Mapping[str, Any]) -> None:
         axis = figure.subplots()
         most = max(np.nanmax(values), 1e-9)
         axis.set_facecolor("#d9d9d9")
-        image = axis.imshow(values, cmap="inferno", vmin=0, vmax=most, aspect="auto")
+        image = axis.imshow(values, cmap=COLOURS, vmin=0, vmax=most, aspect="auto")
         for row, line in enumerate(lines):
             for column, condition in enumerate(conditions):
                 value, text = line.cells.get(condition, (0.0, ""))
-                colour = "black" if value > _LIGHT * most else "white"
+                colour = "black" if value > LIGHT * most else "white"
                 axis.text(column, row, text, color=colour, **_CENTRED)
         _label(axis, conditions, [line.label for line in lines], names)
         bar = figure.colorbar(image, ax=axis, shrink=0.6, pad=0.01)
@@ -147,8 +154,13 @@ _STYLES: list[dict[str, Any]] = [
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6}
 
 
-def _lines(document: Mapping[str, Any], environment: str) -> list[_Line]:
-    """Return the lines of an environment: other cases, mean of the attacks, attacks."""
+def matrix_lines(document: Mapping[str, Any], environment: str) -> list[Line]:
+    """Return the lines of an environment: other cases, mean of the attacks, attacks.
+
+    Args:
+        document: whole, of `transfer.figures.make_document`.
+        environment: one of its columns'.
+    """
     columns = [c for c in document["columns"] if c["environment"] == environment]
     found = []
     for case in document["cases"]:
@@ -159,7 +171,7 @@ def _lines(document: Mapping[str, Any], environment: str) -> list[_Line]:
             if case == ATTACK:
                 text = f"\n{figures['attacks_out']}/{column['attacks']}"
             cells[column["condition"]] = value, f"{value:.2f}{text}"
-        found.append(_Line(case.replace("_", " "), cells))
+        found.append(Line(case.replace("_", " "), cells))
     attacks = [about["label"] for about in document["attacks"]]
     if ATTACK not in document["cases"] or not 1 < len(attacks) <= _MOST:
         return found
@@ -173,7 +185,7 @@ def _lines(document: Mapping[str, Any], environment: str) -> list[_Line]:
             row["condition"]: row["cases"][ATTACK]["cross_track_mean_m"] for row in rows
         }
         cells = {key: (value, f"{value:.2f}") for key, value in means.items()}
-        found.append(_Line(f"  {attack[-24:]}", cells))
+        found.append(Line(f"  {attack[-24:]}", cells))
     return found
 
 

@@ -9,7 +9,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.made_runs import PICTURES, make_run
+from helpers.made_runs import PICTURES, make_retraining, make_run, make_transfer
 from helpers.page_reader import PageReader
 from PIL import Image
 
@@ -17,12 +17,18 @@ from mi_nerfattack import cli
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.page.write import write_page
 from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.parts import Parts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def report(*words):
     return cli.main(["report", *map(str, words)])
+
+
+def page_of_run(folder):
+    parts = Parts(runs=[read_run(folder / "run", "run")])
+    write_page(folder / "page.html", parts, folder)
 
 
 def decoded(address):
@@ -33,7 +39,7 @@ def decoded(address):
 
 def test_a_run_is_on_one_page(tmp_path):
     document = make_run(tmp_path / "run")
-    write_page(tmp_path / "page.html", [read_run(tmp_path / "run", "run")])
+    page_of_run(tmp_path)
     page = files.read_text(tmp_path / "page.html")
     reader = PageReader(page)
     reader.check_alone()
@@ -62,7 +68,7 @@ def test_a_run_is_on_one_page(tmp_path):
 def test_frames_are_scrubbed_beside_each_other(tmp_path):
     make_run(tmp_path / "run", frames=4)
     shutil.rmtree(tmp_path / "run" / "frames" / "surrogate_random")
-    write_page(tmp_path / "page.html", [read_run(tmp_path / "run", "run")])
+    page_of_run(tmp_path)
     page = files.read_text(tmp_path / "page.html")
     sheets = [i for i in PageReader(page).images if "frame by frame" in i["alt"]]
     assert [i["alt"].split(", ")[1] for i in sheets] == ["no object", "attack"]
@@ -102,13 +108,73 @@ def test_several_runs_stand_side_by_side(tmp_path, capsys):
     assert re.search(f"without pictures; this writes them: .*{resume}", page)
 
 
+def test_transfers_and_retrainings_are_tables(tmp_path):
+    make_transfer(tmp_path / "moved")
+    make_retraining(tmp_path / "better-retrain.json")
+    words = tmp_path / "moved", tmp_path / "better-retrain.json"
+    assert report(*words, "-o", tmp_path / "page.html") == 0
+    page = files.read_text(tmp_path / "page.html")
+    reader = PageReader(page)
+    reader.check_alone()
+    assert "<title>transfer moved, retraining better</title>" in page
+    assert ["environment", "case", "day", "<noon>"] in reader.rows
+    # nothing was driven at noon in the surrogate; of attacks, how many are out
+    assert ["surrogate", "no object", "0.05", ""] in reader.rows
+    assert ["", "attack", "0.80 2/2", ""] in reader.rows
+    assert ["", "attack", "0.40 1/2", "0.20 0/2"] in reader.rows
+    largest, least = (
+        re.search(rf'style="background: (#\w+); color: (#\w+)">{text}<', page).groups()
+        for text in ("0.80", "0.20")
+    )
+    assert largest == ("#fcffa4", "#000") and least[1] == "#fff"  # the map's ends
+    middle = "0.400 to 1.600", "0.50", "8/8", "2/2 25 to 75 %", "2/2 25 to 75 %"
+    assert ["surrogate", "day", "0.050", "0.800", *middle] in reader.rows
+    after = ["", "", "after", "0.060", "0.090", "1.50", "0/8", "0/2 25 to 75 %"]
+    assert after in reader.rows
+    assert "Left out: third: the expert leaves its lane" in reader.text
+
+
+def test_damage_is_laid_against_what_textures_may_change(tmp_path):
+    for name, linf in (("free", None), ("little", 0.1)):
+        scenario = {
+            "name": name,
+            "vehicle": {"dt_s": 0.1},
+            "objects": [],
+            "attack": {"method": "gradient", "parameters": "texture", "linf": linf},
+        }
+        make_run(tmp_path / name, pictures=False, scenario=scenario)
+    words = tmp_path / "free", tmp_path / "little"
+    assert report(*words, "-o", tmp_path / "page.html") == 0
+    shown = {
+        i["alt"]
+        for i in PageReader(files.read_text(words[0].parent / "page.html")).images
+    }
+    assert "Damage against the texture's budget, linf" in shown
+    assert "Damage against the texture's budget, l2" not in shown
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda place: make_transfer(place, complete=False), "rows are missing"),
+        (lambda place: (place / "cells").mkdir(parents=True), "no cell is done"),
+        (lambda place: place.write_text("{}"), "is not of 'mi-nerfattack retrain'"),
+    ],
+)
+def test_what_is_not_finished_is_refused(tmp_path, capsys, make, told):
+    make(tmp_path / "it")
+    assert report(tmp_path / "it", "-o", tmp_path / "page.html") == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
 @pytest.mark.parametrize(
     ("damage", "told"),
     [
         (lambda run: (run / "metrics.json").unlink(), "finishes one with --resume"),
-        (lambda run: (run / "scenario.toml").unlink(), "holds no scenario.toml"),
+        (lambda run: (run / "scenario.toml").unlink(), "holds no results; give run"),
         (lambda run: (run / "metrics.json").write_text("{}"), "metrics.schema"),
-        (lambda run: shutil.rmtree(run), "holds no scenario.toml"),
+        (lambda run: shutil.rmtree(run), "holds no results; give run"),
     ],
 )
 def test_what_is_no_finished_run_is_refused(tmp_path, capsys, damage, told):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from helpers.page_reader import PageReader
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.replay import Replay
@@ -16,8 +17,10 @@ from mi_nerfattack.experiment.sweep.replay import (
     read_replay,
     sentences,
 )
+from mi_nerfattack.experiment.sweep.summary import summarise
 from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
 from mi_nerfattack.experiment.sweep.table import read_table, write_table
+from mi_nerfattack.io import files
 from mi_nerfattack.system.workers import InThisProcess
 
 pytest.importorskip(
@@ -100,6 +103,31 @@ def test_drives_alone_come_back(swept, command, tmp_path):
     assert set(found["cells"][0]["largest_difference"].values()) == {0}
     cost = json.loads((folder_of(out, cell) / "metrics.json").read_text())["cost"]
     assert cost["processes"] == 2  # the attack's, and this one
+
+
+def test_the_sweep_on_one_page(swept, tmp_path):
+    """Its cells give pictures; of a table alone there is what its rows tell."""
+    folder, copy, cell = swept
+    page = tmp_path / "page.html"
+    assert cli.main(["report", str(folder), str(copy), "-o", str(page)]) == 0
+    reader = PageReader(files.read_text(page))
+    reader.check_alone()
+    rows = [row for row in read_table(folder / "results.parquet")]
+    [attack] = [
+        group
+        for group in summarise(rows)["groups"]
+        if group["route"]
+        and (group["environment"], group["case"]) == ("deployment", "attack")
+    ]
+    n, mean = str(attack["attacks"]), f"{attack['cross_track_mean_m']:.3f}"
+    assert ["", "", "", "attack", n, mean, "–", "–"] in [r[:8] for r in reader.rows]
+    shown = [image["alt"] for image in reader.images]
+    assert "First drives of 1 attacks: line, gradient" in shown
+    assert any("as the attack left it" in alt for alt in shown)
+    name = f"{cell.id}:surrogate:attack:0"
+    assert f"mi-nerfattack replay {folder} {name}" in reader.text
+    assert "failed: no room" in reader.text
+    assert f"2 of 2 cells have no folder in {copy / 'cells'}" in reader.text
 
 
 def test_what_differs_is_told(swept):

@@ -1,0 +1,143 @@
+"""A sweep as a page shows it: its summary, its attacks, and some of its cells."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.page.above import draw_above
+from mi_nerfattack.experiment.page.run import read_run
+from mi_nerfattack.experiment.run_folder import METRICS
+from mi_nerfattack.experiment.sweep.cell import COMPLETE
+from mi_nerfattack.experiment.sweep.summary import read_attacks, summarise
+from mi_nerfattack.experiment.sweep.table import RESULTS, Row, read_table
+from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.parts import RunPart, SweepPart
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
+from mi_nerfattack.scenario.deployment import SURROGATE
+
+CASES = (NO_OBJECT, RANDOM, ATTACK)
+_LABELS = ("cell", "route", "objects", "method", "budget", "seed")
+
+
+def read_sweep(folder: Path, label: str, scratch: Path) -> SweepPart:
+    """Read a sweep's table, and of each route and method the cell of middle damage.
+
+    Args:
+        folder: of the sweep, or a copy of its table alone.
+        label: that tells it from others on the page.
+        scratch: folder for plots that are made for the page.
+
+    Raises:
+        InputError: the table or the folder of a cell is damaged.
+        SetupError: pyarrow is not installed.
+    """
+    rows = read_table(folder / RESULTS)
+    cells = folder / "cells"
+    known = {row["cell"] for row in rows}
+    present = {name for name in sorted(known) if (cells / name / METRICS).is_file()}
+    notes = []
+    begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
+    if begun:
+        notes.append(
+            f"{label} is not finished: {len(begun)} cells were begun and are not "
+            "complete; the sweep's command goes on with them."
+        )
+    if len(present) < len(known):
+        notes.append(
+            f"{len(known) - len(present)} of {len(known)} cells have no folder in "
+            f"{cells}, or failed: there is nothing of them but their rows."
+        )
+    attacks = _attacks(folder, rows, present)
+    return SweepPart(
+        label,
+        summarise(rows, read_attacks(folder, rows)),
+        attacks,
+        _shown(cells, [row for row in attacks if row["cell"] in present]),
+        _pictures(cells, rows, present, scratch, notes),
+        notes,
+    )
+
+
+def _attacks(
+    folder: Path, rows: Sequence[Row], present: set[str]
+) -> list[dict[str, Any]]:
+    """Return a row for each cell and environment, in the table's order.
+
+    Returns:
+        labels, `environment`, `error` (None unless the cell failed), `cases` (mean
+        error over its drives by case, metres), `wheel_out_s` past the attack,
+        `section` (`attack` of its scenario, None without its folder), and `repeat`, a
+        command.
+    """
+    sections = {
+        name: files.read_json(folder / "cells" / name / METRICS)["scenario"]["attack"]
+        for name in present
+    }
+    groups: dict[tuple[str, str | None], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["cell"], row["environment"]), []).append(row)
+    found = []
+    for (cell, environment), own in groups.items():
+        by_case = {case: [r for r in own if r["case"] == case] for case in CASES}
+        name = shlex.quote(f"{cell}:{environment}:{ATTACK}:0")
+        found.append(
+            {key: own[0][key] for key in (*_LABELS, "environment", "error")}
+            | {
+                "cases": {
+                    case: float(np.mean([row["cross_track_mean_m"] for row in some]))
+                    for case, some in by_case.items()
+                    if some
+                },
+                "wheel_out_s": float(
+                    np.mean([row["wheel_out_s"] for row in by_case[ATTACK]] or [0.0])
+                ),
+                "section": sections.get(cell),
+                "repeat": f"mi-nerfattack replay {shlex.quote(str(folder))} {name}",
+            }
+        )
+    return found
+
+
+def _shown(cells: Path, attacks: Sequence[Mapping[str, Any]]) -> list[RunPart]:
+    """Read the cell of middle damage in the surrogate of each route and method."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in attacks:
+        if row["environment"] == SURROGATE and ATTACK in row["cases"]:
+            key = row["route"], row["method"], row["budget"]
+            groups.setdefault(key, []).append(row)
+    found = []
+    for key, own in groups.items():
+        ordered = sorted(own, key=lambda row: row["cases"][ATTACK])
+        middle = ordered[len(ordered) // 2]
+        label = " ".join(str(word) for word in key if word is not None)
+        label += f", {middle['objects']}, seed {middle['seed']}"
+        label += f" (the middle one of {len(own)})"
+        found.append(read_run(cells / middle["cell"], label, middle["repeat"]))
+    return found
+
+
+def _pictures(
+    cells: Path, rows: Sequence[Row], present: set[str], scratch: Path, notes: list[str]
+) -> dict[str, Path]:
+    """Plot the drives of all cells of each route and method from above."""
+    groups: dict[str, dict[str, Path]] = {}
+    for row in rows:
+        if row["cell"] in present:
+            own = groups.setdefault(f"{row['route']}, {row['method']}", {})
+            own[row["cell"]] = cells / row["cell"]
+    found = {}
+    for name, folders in groups.items():
+        path = scratch / f"above_{cells.parent.name}_{len(found)}.png"
+        try:
+            draw_above(path, list(folders.values()))
+        except InputError as err:  # scenarios name files of the machine that made them
+            notes.append(f"No drives from above of {name}: {err}")
+        else:
+            found[f"First drives of {len(folders)} attacks: {name}"] = path
+    return found
