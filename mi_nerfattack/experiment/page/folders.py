@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.page.run import read_run
@@ -36,18 +35,16 @@ def read_folders(paths: Sequence[Path], scratch: Path) -> Parts:
     """
     if not paths or len({path.resolve() for path in paths}) < len(paths):
         raise InputError("FOLDER: at least one, each once")
-    found: dict[str, list[Any]] = {
-        kind: [] for kind in ("runs", "sweeps", "transfers", "retrainings")
-    }
+    runs, sweeps, transfers, retrainings = [], [], [], []
     for path, label in zip(paths, folder_labels(paths), strict=True):
         if (path / RESULTS).is_file():
-            found["sweeps"].append(read_sweep(path, label, scratch))
+            sweeps.append(read_sweep(path, label, scratch))
         elif (path / DOCUMENT).is_file():
-            found["transfers"].append(_transfer(path, label))
+            transfers.append(_transfer(path, label))
         elif path.is_file():
-            found["retrainings"].append(_retraining(path))
+            retrainings.append(_retraining(path))
         elif (path / SCENARIO).is_file():
-            found["runs"].append(read_run(path, label))
+            runs.append(read_run(path, label))
         elif (path / "cells").is_dir():
             raise InputError(
                 f"{path}: is of a sweep of which no cell is done, {RESULTS} is "
@@ -55,7 +52,7 @@ def read_folders(paths: Sequence[Path], scratch: Path) -> Parts:
             )
         else:
             raise InputError(f"{path}: holds no results; {_KINDS}")
-    return Parts(**found)
+    return Parts(runs, sweeps, transfers, retrainings)
 
 
 def _transfer(folder: Path, label: str) -> TransferPart:

@@ -139,5 +139,5 @@ def _pictures(
         except InputError as err:  # scenarios name files of the machine that made them
             notes.append(f"No drives from above of {name}: {err}")
         else:
-            found[f"First drives of {len(folders)} attacks: {name}"] = path
+            found[f"First drives of all attacks: {name}, n = {len(folders)}"] = path
     return found

@@ -124,8 +124,10 @@ def against_limit(
             middle = np.array([np.median(group) for group in groups])
             ends = np.array([(min(group), max(group)) for group in groups]).T
             bars = np.abs(ends - middle)
-            look = {"color": PALETTE[number % len(PALETTE)], "marker": "o"}
-            axis.errorbar(at, middle, bars, capsize=3, label=name, **look)
+            color = PALETTE[number % len(PALETTE)]
+            axis.errorbar(
+                at, middle, bars, capsize=3, label=name, color=color, marker="o"
+            )
         axis.set_ylim(bottom=0)
         axis.set_xlim(left=0)
         axis.set_xlabel(limit)

@@ -122,7 +122,7 @@ def test_the_sweep_on_one_page(swept, tmp_path):
     n, mean = str(attack["attacks"]), f"{attack['cross_track_mean_m']:.3f}"
     assert ["", "", "", "attack", n, mean, "–", "–"] in [r[:8] for r in reader.rows]
     shown = [image["alt"] for image in reader.images]
-    assert "First drives of 1 attacks: line, gradient" in shown
+    assert "First drives of all attacks: line, gradient, n = 1" in shown
     assert any("as the attack left it" in alt for alt in shown)
     name = f"{cell.id}:surrogate:attack:0"
     assert f"mi-nerfattack replay {folder} {name}" in reader.text
