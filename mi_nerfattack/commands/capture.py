@@ -14,6 +14,7 @@ from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.capture.photographs.estimate import PoseEstimate
+    from mi_nerfattack.capture.photographs.markers import Markers
     from mi_nerfattack.commands.shared.progress import StageBars
 
 
@@ -87,12 +88,22 @@ class PhotographArguments:
     """How far the picture moves between two frames of a video, in shares of its longer
     edge."""
     metres_per_unit: float | None = None
-    """Multiply all lengths by this."""
+    """Multiply all lengths by this. This and the next two tell the scale; give one."""
+    distance: tuple[str, str, float] | None = None
+    """Two photographs, and the metres between the places where they were taken."""
+    marker_m: float | None = None
+    """Edge of the black square of printed markers in the scene, metres; of a ChArUco
+    board, that of its markers."""
+    marker_family: str = "apriltag_36h11"
+    """Of the markers: apriltag_36h11, 4x4_50, 6x6_250, ... as OpenCV has them."""
+    markers_flat: bool = False
+    """All markers lie on the ground, which becomes z = 0."""
 
     def write(
         self, source: Path, output: Path, seed: int, bars: StageBars
     ) -> PoseEstimate:
         """Estimate and write poses."""
+        from mi_nerfattack.capture.photographs.alignment import Distance
         from mi_nerfattack.capture.photographs.estimate import (
             PoseOptions,
             estimate_poses,
@@ -112,6 +123,8 @@ class PhotographArguments:
             self.lens,
             self.long_edge,
             self.metres_per_unit,
+            None if self.distance is None else Distance(*self.distance),
+            self._markers(),
             seed,
         )
         if not is_video:
@@ -120,6 +133,15 @@ class PhotographArguments:
             chosen = FrameOptions(self.frames, self.baseline)
             extract_frames(source, Path(folder), chosen, show)
             return estimate_poses(folder, output, options, show)
+
+    def _markers(self) -> Markers | None:
+        from mi_nerfattack.capture.photographs.markers import Markers
+
+        if self.marker_m is None:
+            if self.markers_flat:
+                raise InputError("--markers-flat: needs the markers' edge, --marker-m")
+            return None
+        return Markers(self.marker_m, self.marker_family, self.markers_flat)
 
     def tell(self, result: PoseEstimate) -> None:
         """Print what was found."""
@@ -130,13 +152,20 @@ class PhotographArguments:
         )
         if result.left_out:
             print(f"Not placed: {', '.join(result.left_out)}")
-        unit = "m" if self.metres_per_unit is not None else "units"
+        scale = result.scale
+        if scale.spread is not None:
+            print(
+                f"Scale by {len(scale.markers)} markers, whose edges differ by "
+                f"{100 * scale.spread:.2f} % (standard deviation)."
+            )
+        unit = "m" if scale.metres_per_unit is not None else "units"
         apart = f"{result.distance:.4g} {unit}"
         print(f"{' and '.join(result.farthest)} were taken {apart} apart.")
-        if self.metres_per_unit is None:
+        if scale.metres_per_unit is None:
             print(
                 "The unit is arbitrary: measure this distance in metres and give its "
-                f"quotient by {result.distance:.4g} as --metres-per-unit."
+                f"quotient by {result.distance:.4g} as --metres-per-unit, or put "
+                "printed markers into the scene (--marker-m)."
             )
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.capture.colmap.reconstruct import (
     Lens,
@@ -17,6 +16,8 @@ from mi_nerfattack.capture.colmap.reconstruct import (
     Structure,
     reconstruct,
 )
+from mi_nerfattack.capture.photographs.alignment import Distance, Scale, align
+from mi_nerfattack.capture.photographs.markers import Markers
 from mi_nerfattack.capture.photographs.staging import (
     check_in_place,
     list_photographs,
@@ -27,8 +28,6 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Count, Positive, Seed, checked
 from mi_nerfattack.render.camera.intrinsics import Camera
-
-_LEAST_UP = 0.2  # length of the mean of unit vectors
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,10 @@ class PoseOptions:
             shortly before and after, by the order of their names.
         lens: COLMAP's camera model, of all cameras.
         long_edge_px: look for features at most at this size.
-        metres_per_unit: of the arbitrary unit of an earlier run; None keeps the
-            unit.
+        metres_per_unit: of the arbitrary unit of an earlier run.
+        distance: between two photographs.
+        markers: of known size in the scene. With none of these three, the unit stays
+            arbitrary.
         seed: of the random choices.
     """
 
@@ -50,7 +51,19 @@ class PoseOptions:
     lens: Lens = "OPENCV"
     long_edge_px: Count = 1600
     metres_per_unit: Positive | None = None
+    distance: Distance | None = None
+    markers: Markers | None = None
     seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        """Check that at most one thing tells the scale."""
+        told = [
+            name
+            for name in ("metres_per_unit", "distance", "markers")
+            if getattr(self, name) is not None
+        ]
+        if len(told) > 1:
+            raise InputError(f"{', '.join(told)}: each tells the scale; give one")
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,7 @@ class PoseEstimate:
         error_px: mean reprojection error.
         farthest: the two photographs that were taken farthest apart.
         distance: between these, in the unit of the poses.
+        scale: how this unit was found.
     """
 
     path: Path
@@ -74,6 +88,7 @@ class PoseEstimate:
     error_px: float
     farthest: tuple[str, str]
     distance: float
+    scale: Scale
 
 
 def estimate_poses(
@@ -85,9 +100,10 @@ def estimate_poses(
     """Estimate the poses of photographs, and write them beside copies of these.
 
     z points up, against the mean of the images' downward directions: photographs held
-    level on average are needed for that. The origin is the mean of the cameras. The
-    unit is arbitrary, as photographs do not tell it, unless `metres_per_unit` does;
-    the JSON file's `units` says which. Photographs that their EXIF data turn are
+    level on average are needed for that, or markers that lie flat. The origin is the
+    mean of the cameras, with flat markers on the ground below. The unit is arbitrary,
+    as photographs do not tell it, unless an option does; the JSON file's `units` says
+    which. Photographs that their EXIF data turn are
     stored upright.
 
     Args:
@@ -99,9 +115,10 @@ def estimate_poses(
         progress: called with stage, done and total.
 
     Raises:
-        InputError: too few photographs, an unreadable one, or too few could be
-            placed. Nothing is written then.
-        SetupError: pycolmap failed or crashed; nothing is written either.
+        InputError: too few photographs, an unreadable one, too few could be placed, or
+            markers are not seen or contradict each other. Nothing is written then.
+        SetupError: pycolmap failed or crashed, or markers need OpenCV, which is not
+            installed; nothing is written either.
     """
     options = options or PoseOptions()
     root = Path(photographs)
@@ -123,8 +140,9 @@ def estimate_poses(
             options.seed,
             progress,
         )
-        found = upright(found, options.metres_per_unit or 1.0)
-        return _write(Path(output), staged, found, names, options)
+        told = options.markers or options.distance or options.metres_per_unit
+        found, scale = align(found, staged, told, progress)
+        return _write(Path(output), staged, found, names, scale)
 
 
 def _check_output(output: Path) -> None:
@@ -135,35 +153,12 @@ def _check_output(output: Path) -> None:
     files.check_writable(existing / "transforms.json")
 
 
-def upright(found: Structure, scale: float) -> Structure:
-    """Turn z up, move the origin to the cameras' mean, and scale lengths.
-
-    Raises:
-        InputError: the cameras have no common up.
-    """
-    poses = found.camera_to_world
-    up = -poses[:, :3, 1].mean(0)
-    length = np.linalg.norm(up)
-    if length < _LEAST_UP:
-        raise InputError(
-            "photographs: their upward directions cancel, so that z cannot point up; "
-            "turn the photographs upright first"
-        )
-    turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
-    centre = poses[:, :3, 3].mean(0)
-    result = poses.copy()
-    result[:, :3, :3] = turn @ poses[:, :3, :3]
-    result[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ turn.T
-    points = scale * (found.points - centre) @ turn.T
-    return replace(found, camera_to_world=result, points=points)
-
-
 def _write(
     output: Path,
     staged: Path,
     found: Structure,
     names: Sequence[str],
-    options: PoseOptions,
+    scale: Scale,
 ) -> PoseEstimate:
     path = begin_posed(output)
     for name in found.names:
@@ -173,7 +168,7 @@ def _write(
         output / "points.safetensors", {"points": found.points.astype(np.float32)}
     )
     left_out = tuple(name for name in names if name not in set(found.names))
-    units = "arbitrary" if options.metres_per_unit is None else "metre"
+    units = "arbitrary" if scale.metres_per_unit is None else "metre"
     extra = {
         "units": units,
         "points_file": "points.safetensors",
@@ -193,4 +188,5 @@ def _write(
         found.error_px,
         (found.names[a], found.names[b]),
         float(apart[a, b]),
+        scale,
     )

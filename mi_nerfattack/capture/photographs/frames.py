@@ -18,10 +18,12 @@ from mi_nerfattack.io.video import MAX_VIDEO_BYTES, decode_video
 from mi_nerfattack.ranges import Count, Positive, checked
 
 _SMALL_PX = 256  # longer edge at which sharpness and motion are measured
-_TILES = 4  # each way, of which the motion is the median
+_TILES = 4  # each way
 _SLACK = 0.4  # a frame may lie that much before or after its place, in baselines
 _RENEWED = 0.02  # shift to the reference frame from which on another is taken
-_DENSER = 1.15  # baselines grow by this until there are few enough frames
+_RATIO = 1.15  # by which a baseline grows or shrinks until the frames are few or many
+_FEW, _FINEST = 20, 0.2  # frames below which it shrinks, and to which share of it
+_MOVING = 75.0  # percentile of tiles: around a thing, the picture's middle stands still
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class FrameOptions:
     Attributes:
         frames: at most.
         baseline: how far the picture moves between two of them, in shares of its
-            longer edge; it is larger if there would be too many.
+            longer edge, in a quarter of it or more; it is larger if there would be too
+            many, and down to a fifth if there would be fewer than 20.
     """
 
     frames: Count = 150
@@ -71,8 +74,15 @@ def choose_frames(motion: Motion, options: FrameOptions) -> list[int]:
     baseline = options.baseline
     found = _spaced(motion, baseline)
     while len(found) > options.frames:
-        baseline *= _DENSER
+        baseline *= _RATIO
         found = _spaced(motion, baseline)
+    few, finest = min(_FEW, options.frames), _FINEST * options.baseline
+    while len(found) < few and baseline > finest:
+        baseline /= _RATIO
+        finer = _spaced(motion, baseline)
+        if len(finer) > options.frames:
+            break
+        found = finer
     return found
 
 
@@ -81,7 +91,7 @@ def _spaced(motion: Motion, baseline: float) -> list[int]:
     start = 0
     while True:  # each of them is later, as its place is not the last one's
         away = np.linalg.norm(motion.place[start:] - motion.place[start], axis=2)
-        moved = np.median(away, axis=1) / baseline
+        moved = np.percentile(away, _MOVING, axis=1) / baseline
         near = 1 - _SLACK if found else 0.0
         beyond = np.flatnonzero(moved > near + 2 * _SLACK)
         if found and not len(beyond):

@@ -16,10 +16,10 @@ from mi_nerfattack import cli
 from mi_nerfattack.capture.colmap.follow import Stages
 from mi_nerfattack.capture.colmap.process import MARK
 from mi_nerfattack.capture.colmap.reconstruct import Structure
+from mi_nerfattack.capture.photographs.alignment import upright
 from mi_nerfattack.capture.photographs.estimate import (
     PoseOptions,
     estimate_poses,
-    upright,
 )
 from mi_nerfattack.capture.photographs.staging import (
     copy_upright,

@@ -1,0 +1,133 @@
+"""Metric scale, upright axes and origin of a world of arbitrary frame and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack.capture.colmap.follow import StageCallback
+from mi_nerfattack.capture.colmap.reconstruct import Structure
+from mi_nerfattack.capture.photographs.markers import Markers, find_markers
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.ranges import Positive, checked
+
+_LEAST_UP = 0.2  # length of the mean of unit vectors
+
+
+@dataclass(frozen=True)
+@checked("distance")
+class Distance:
+    """Metres between the places where two photographs were taken, by their names."""
+
+    first: str
+    second: str
+    metres: Positive
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How the metric scale was found.
+
+    Attributes:
+        metres_per_unit: of the unit before; None where nothing told it.
+        spread: relative standard deviation between markers; None without.
+        markers: number of photographs that show each marker, by id.
+    """
+
+    metres_per_unit: float | None = None
+    spread: float | None = None
+    markers: Mapping[int, int] = field(default_factory=dict)
+
+
+def align(
+    found: Structure,
+    folder: Path,
+    told: float | Distance | Markers | None,
+    progress: StageCallback = lambda stage, done, total: None,
+) -> tuple[Structure, Scale]:
+    """Scale lengths to metres, turn z up and move the origin.
+
+    z points up, against the mean of the images' downward directions, and the origin is
+    the mean of the cameras; where markers lie flat, z = 0 is their plane.
+
+    Args:
+        found: with poses in any frame and unit.
+        folder: of the photographs.
+        told: metres of one unit, or what tells them; None keeps the unit.
+        progress: called with stage, done and total.
+
+    Raises:
+        InputError: the cameras have no common up, markers are not seen or contradict
+            each other, or a photograph with a known place was not placed.
+        SetupError: markers need OpenCV, which is not installed.
+    """
+    if isinstance(told, Markers):
+        seen = find_markers(folder, found, told, progress)
+        metres, spread = seen.scale(told.edge_m)
+        scale = Scale(metres, spread, dict(seen.views))
+        if told.flat:
+            return _on_ground(found, metres, *seen.ground()), scale
+        return upright(found, metres), scale
+    metres = _between(found, told) if isinstance(told, Distance) else told
+    return upright(found, metres or 1.0), Scale(metres)
+
+
+def _between(found: Structure, distance: Distance) -> float:
+    places = []
+    for name in (distance.first, distance.second):
+        if name not in found.names:
+            raise InputError(
+                f"distance: {name!r} is not one of the {len(found.names)} photographs "
+                f"that were placed ({', '.join(found.names[:3])}, ...); give the names "
+                "of two of them"
+            )
+        places.append(found.camera_to_world[found.names.index(name), :3, 3])
+    apart = float(np.linalg.norm(places[0] - places[1]))
+    if apart == 0:
+        raise InputError(
+            f"distance: {distance.first} and {distance.second} were taken at one "
+            "place; give two that are far apart"
+        )
+    return distance.metres / apart
+
+
+def upright(found: Structure, scale: float) -> Structure:
+    """Turn z up, move the origin to the cameras' mean, and scale lengths.
+
+    Raises:
+        InputError: the cameras have no common up.
+    """
+    poses = found.camera_to_world
+    up = -poses[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < _LEAST_UP:
+        raise InputError(
+            "photographs: their upward directions cancel, so that z cannot point up; "
+            "turn the photographs upright first, or lay markers flat on the ground"
+        )
+    return _moved(found, scale, up, poses[:, :3, 3].mean(0))
+
+
+def _on_ground(
+    found: Structure, scale: float, point: np.ndarray, normal: np.ndarray
+) -> Structure:
+    """Make a plane z = 0, the cameras above it and their mean above the origin."""
+    centre = found.camera_to_world[:, :3, 3].mean(0)
+    height = float((centre - point) @ normal)
+    return _moved(
+        found, scale, normal * np.sign(height or 1.0), centre - height * normal
+    )
+
+
+def _moved(
+    found: Structure, scale: float, up: np.ndarray, origin: np.ndarray
+) -> Structure:
+    turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
+    result = found.camera_to_world.copy()
+    result[:, :3, :3] = turn @ result[:, :3, :3]
+    result[:, :3, 3] = scale * (result[:, :3, 3] - origin) @ turn.T
+    points = scale * (found.points - origin) @ turn.T
+    return replace(found, camera_to_world=result, points=points)
