@@ -34,6 +34,7 @@ class Report:
         from tempfile import TemporaryDirectory
 
         from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.page.folders import read_folders
         from mi_nerfattack.experiment.page.write import write_page
@@ -43,8 +44,12 @@ class Report:
             raise InputError(f"--output: {self.output}; name an .html file")
         files.check_writable(self.output)
         variant.ensure()
-        with TemporaryDirectory() as scratch:
-            parts = read_folders(self.folders, Path(scratch))
+        with StageBars() as bars, TemporaryDirectory() as scratch:
+
+            def say(label: str) -> None:
+                bars.say(f"reading {label}")
+
+            parts = read_folders(self.folders, Path(scratch), say)
             write_page(self.output, parts, Path(scratch), self.title)
         size = self.output.stat().st_size / 1e6
         print(f"Written: {self.output.resolve()} ({size:.1f} MB)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mi_nerfattack.errors import InputError
@@ -21,12 +21,17 @@ _KINDS = (
 _RETRAINED = {"policy", "runs", "held_out", "left_out", "table"}
 
 
-def read_folders(paths: Sequence[Path], scratch: Path) -> Parts:
+def read_folders(
+    paths: Sequence[Path],
+    scratch: Path,
+    on_run: Callable[[str], None] = lambda label: None,
+) -> Parts:
     """Read finished runs, sweeps, transfers and retrainings.
 
     Args:
         paths: folders, and files of retrainings.
         scratch: folder for plots that are made for the page.
+        on_run: told the label of each run before it is read, and its objects rendered.
 
     Raises:
         InputError: none or one twice, one is of another kind or not finished, or a
@@ -38,12 +43,13 @@ def read_folders(paths: Sequence[Path], scratch: Path) -> Parts:
     runs, sweeps, transfers, retrainings = [], [], [], []
     for path, label in zip(paths, folder_labels(paths), strict=True):
         if (path / RESULTS).is_file():
-            sweeps.append(read_sweep(path, label, scratch))
+            sweeps.append(read_sweep(path, label, scratch, on_run))
         elif (path / DOCUMENT).is_file():
             transfers.append(_transfer(path, label))
         elif path.is_file():
             retrainings.append(_retraining(path))
         elif (path / SCENARIO).is_file():
+            on_run(label)
             runs.append(read_run(path, label))
         elif (path / "cells").is_dir():
             raise InputError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,16 @@ CASES = (NO_OBJECT, RANDOM, ATTACK)
 _LABELS = ("cell", "route", "objects", "method", "budget", "seed")
 
 
-def read_sweep(folder: Path, label: str, scratch: Path) -> SweepPart:
+def read_sweep(
+    folder: Path, label: str, scratch: Path, on_run: Callable[[str], None]
+) -> SweepPart:
     """Read a sweep's table, and of each route and method the cell of middle damage.
 
     Args:
         folder: of the sweep, or a copy of its table alone.
         label: that tells it from others on the page.
         scratch: folder for plots that are made for the page.
+        on_run: told the label of each cell before its objects are rendered.
 
     Raises:
         InputError: the table or the folder of a cell is damaged.
@@ -58,7 +61,7 @@ def read_sweep(folder: Path, label: str, scratch: Path) -> SweepPart:
         label,
         summarise(rows, read_attacks(folder, rows)),
         attacks,
-        _shown(cells, [row for row in attacks if row["cell"] in present]),
+        _shown(cells, [row for row in attacks if row["cell"] in present], on_run),
         _pictures(cells, rows, present, scratch, notes),
         notes,
     )
@@ -104,7 +107,9 @@ def _attacks(
     return found
 
 
-def _shown(cells: Path, attacks: Sequence[Mapping[str, Any]]) -> list[RunPart]:
+def _shown(
+    cells: Path, attacks: Sequence[Mapping[str, Any]], on_run: Callable[[str], None]
+) -> list[RunPart]:
     """Read the cell of middle damage in the surrogate of each route and method."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in attacks:
@@ -118,6 +123,7 @@ def _shown(cells: Path, attacks: Sequence[Mapping[str, Any]]) -> list[RunPart]:
         label = " ".join(str(word) for word in key if word is not None)
         label += f", {middle['objects']}, seed {middle['seed']}"
         label += f" (the middle one of {len(own)})"
+        on_run(label)
         found.append(read_run(cells / middle["cell"], label, middle["repeat"]))
     return found
 
