@@ -12,6 +12,8 @@ import tyro
 
 from mi_nerfattack.errors import InputError
 
+_SHOWN = 10  # photographs to take again; capture.json lists all
+
 if TYPE_CHECKING:
     from mi_nerfattack.capture.photographs.estimate import PoseEstimate
     from mi_nerfattack.capture.photographs.markers import Markers
@@ -144,14 +146,30 @@ class PhotographArguments:
         return Markers(self.marker_m, self.marker_family, self.markers_flat)
 
     def tell(self, result: PoseEstimate) -> None:
-        """Print what was found."""
+        """Print what was found, and draw the cameras."""
+        from mi_nerfattack.capture.photographs.quality import FEW_PLACED, retake
+        from mi_nerfattack.report.plots.fit import write_cameras_above
+
         total = len(result.placed) + len(result.left_out)
         print(
             f"Placed {len(result.placed)} of {total} photographs, mean reprojection "
             f"error {result.error_px:.2f} px; wrote {result.path}"
         )
-        if result.left_out:
-            print(f"Not placed: {', '.join(result.left_out)}")
+        if len(result.placed) < FEW_PLACED * total:
+            print(
+                "Few were placed: take more between those far apart, each part of the "
+                "scene in three or more, with texture, sharp, of nothing that moves."
+            )
+        again = retake(result.qualities)
+        for name, why in list(again.items())[:_SHOWN]:
+            print(f"Take again: {name}, {why}")
+        if len(again) > _SHOWN:
+            print(f"and {len(again) - _SHOWN} more")
+        picture, table = (
+            result.path.with_name(name) for name in ("cameras.png", "capture.json")
+        )
+        write_cameras_above(picture, result.found, set(again))
+        print(f"{picture}: the cameras from above; {table}: what each photograph gave")
         scale = result.scale
         if scale.spread is not None:
             print(

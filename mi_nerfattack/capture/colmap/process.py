@@ -153,7 +153,14 @@ def _reconstruct(
     _match(pycolmap, database, task["matching"], count)
     models = _map(pycolmap, database, folder, task)
     found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    return None if found is None else _summary(found)
+    if found is None:
+        return None
+    with pycolmap.Database.open(database) as table:
+        features = {
+            image.name: table.num_keypoints_for_image(image.image_id)
+            for image in table.read_all_images()
+        }
+    return {**_summary(found), "features": features}
 
 
 def _end_with_parent() -> None:
@@ -198,6 +205,10 @@ def _summary(model: Any) -> dict[str, Any]:
         (model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name
     )
     poses = [image.cam_from_world().inverse().matrix().tolist() for image in images]
+    seen = [
+        [model.points3D[p.point3D_id].error for p in image.points2D if p.has_point3D()]
+        for image in images
+    ]
     points = [
         point.xyz.tolist()
         for point in model.points3D.values()
@@ -209,6 +220,8 @@ def _summary(model: Any) -> dict[str, Any]:
         "cameras": _cameras(model),
         "camera_ids": [image.camera_id for image in images],
         "points": points,
+        "points_seen": [len(errors) for errors in seen],
+        "errors_px": [sum(errors) / max(1, len(errors)) for errors in seen],
         "error_px": model.compute_mean_reprojection_error(),
     }
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +30,9 @@ class Structure:
         cameras: n, of the images; equal where these were taken by the same.
         points: (m, 3), seen in at least three images each.
         error_px: mean reprojection error.
+        points_seen: n numbers of points that the images show.
+        errors_px: n mean reprojection errors of these.
+        features: number found in each image by name, in those without a pose, too.
     """
 
     names: tuple[str, ...]
@@ -37,6 +40,9 @@ class Structure:
     cameras: tuple[Camera, ...]
     points: np.ndarray
     error_px: float
+    points_seen: tuple[int, ...] = ()
+    errors_px: tuple[float, ...] = ()
+    features: Mapping[str, int] = field(default_factory=dict)
 
 
 def reconstruct(
@@ -115,4 +121,7 @@ def _structure(found: dict[str, Any] | None, count: int) -> Structure:
         tuple(known[i] for i in found["camera_ids"]),
         np.array(found["points"], np.float64).reshape(-1, 3),
         found["error_px"],
+        tuple(found["points_seen"]),
+        tuple(found["errors_px"]),
+        found["features"],
     )

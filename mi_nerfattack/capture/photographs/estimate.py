@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mi_nerfattack.capture.colmap.reconstruct import (
 )
 from mi_nerfattack.capture.photographs.alignment import Distance, Scale, align
 from mi_nerfattack.capture.photographs.markers import Markers
+from mi_nerfattack.capture.photographs.quality import Quality, assess, quality_table
 from mi_nerfattack.capture.photographs.staging import (
     check_in_place,
     list_photographs,
@@ -79,6 +80,8 @@ class PoseEstimate:
         farthest: the two photographs that were taken farthest apart.
         distance: between these, in the unit of the poses.
         scale: how this unit was found.
+        found: poses and points as they were written.
+        qualities: of all photographs.
     """
 
     path: Path
@@ -89,6 +92,8 @@ class PoseEstimate:
     farthest: tuple[str, str]
     distance: float
     scale: Scale
+    found: Structure
+    qualities: tuple[Quality, ...]
 
 
 def estimate_poses(
@@ -110,7 +115,8 @@ def estimate_poses(
         photographs: folder of at least 3 JPEG, PNG or WebP images; at least 3 of each
             camera, of each of its focal lengths, and of each way that it was held.
             Their EXIF data and sizes tell these apart.
-        output: folder for `transforms.json`, `images` and `points.safetensors`.
+        output: folder for `transforms.json`, `images`, `points.safetensors` and
+            `capture.json`, which says what each photograph gave.
         options: None for the defaults.
         progress: called with stage, done and total.
 
@@ -169,6 +175,9 @@ def _write(
     )
     left_out = tuple(name for name in names if name not in set(found.names))
     units = "arbitrary" if scale.metres_per_unit is None else "metre"
+    qualities = assess(staged, names, found)
+    table = quality_table(found, qualities, asdict(scale))
+    files.write_json(output / "capture.json", table)
     extra = {
         "units": units,
         "points_file": "points.safetensors",
@@ -189,4 +198,6 @@ def _write(
         (found.names[a], found.names[b]),
         float(apart[a, b]),
         scale,
+        found,
+        qualities,
     )

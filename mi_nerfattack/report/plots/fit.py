@@ -1,13 +1,15 @@
-"""Plots of a fit: how it went, and how its held-out views are spread."""
+"""Plots of a fit: where its views stood, how it went, how the held-out ones score."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.fit.options import FitProgress
 from mi_nerfattack.fit.scores import ViewScore
 from mi_nerfattack.report.plots.charts import BLUE, GREY, ORANGE, chart
@@ -50,6 +52,41 @@ def write_curve(
         grid[1, 0].set_xlabel("step")
         grid[1, 1].set_xlabel("time (minutes)")
         figure.align_ylabels()
+
+
+def write_cameras_above(
+    path: str | Path, found: Structure, flagged: AbstractSet[str]
+) -> None:
+    """Draw the path of cameras, where they look, and sparse points, from above.
+
+    Args:
+        path: PNG file.
+        found: with z up.
+        flagged: names of images to take again.
+    """
+    eyes = found.camera_to_world[:, :3, 3]
+    ahead = found.camera_to_world[:, :3, 2]
+    reach = 0.04 * max(float(np.ptp(eyes[:, :2], axis=0).max()), 1e-9)
+    bad = np.array([name in flagged for name in found.names])
+    with chart(path, 5.0) as figure:
+        axes = figure.subplots()
+        low, high = np.percentile(np.concatenate([found.points, eyes]), [2, 98], axis=0)
+        inside = ((found.points >= low) & (found.points <= high)).all(1)
+        axes.scatter(*found.points[inside, :2].T, s=0.4, color=GREY, alpha=0.4)
+        axes.plot(*eyes[:, :2].T, color=BLUE, linewidth=0.8, alpha=0.6)
+        for mask, colour, label in (
+            (~bad, BLUE, f"cameras ({(~bad).sum()})"),
+            (bad, ORANGE, f"take again ({bad.sum()})"),
+        ):
+            axes.scatter(*eyes[mask, :2].T, s=14, color=colour, label=label, zorder=3)
+            ends = eyes[mask] + reach * ahead[mask]
+            lines = np.stack([eyes[mask, :2], ends[:, :2]], axis=1)
+            axes.plot(*lines.transpose(2, 1, 0), color=colour, linewidth=1.4)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x")
+        axes.set_ylabel("y")
+        axes.legend(fontsize=8)
+        axes.set_title("Cameras from above", loc="left")
 
 
 def write_histogram(path: str | Path, scores: Sequence[ViewScore]) -> None:

@@ -154,6 +154,17 @@ class TestCorner:
         copied = (root / "out/images/0.png").read_bytes()
         assert copied == (root / "photographs/0.png").read_bytes()
 
+    def test_report_says_what_each_gave(self, corner):
+        table = json.loads((corner[0] / "out/capture.json").read_text())
+        assert (table["placed"], table["photographs"]) == (COUNT, COUNT + 1)
+        assert table["scale"]["metres_per_unit"] == 2.0
+        assert table["retake"]["flat.png"].startswith("not placed")
+        *placed, flat = table["frames"]
+        assert flat["features"] < 10 and flat["points"] == 0
+        for frame in placed:
+            assert 20 < frame["points"] < frame["features"]
+            assert 0 < frame["error_px"] < 1
+
     def test_progress_ends_every_stage(self, corner):
         _, _, stages = corner
         ends = {stage: (done, total) for stage, done, total in stages}
@@ -172,7 +183,8 @@ class TestCorner:
         )
         out = capsys.readouterr().out
         assert code == 0 and f"Placed {COUNT} of {COUNT + 1} photographs" in out
-        assert "Not placed: flat.png" in out and "--metres-per-unit" in out
+        assert "Take again: flat.png, not placed" in out and "--metres-per-unit" in out
+        assert files.read_image(tmp_path / "cameras.png").shape[2] >= 3
         table = json.loads((tmp_path / "transforms.json").read_text())
         assert table["units"] == "arbitrary"
 
