@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from bench.table2.rows import (
     COLUMNS,
     FLOOR,
+    NAMES,
+    PAPER,
     STEPS,
     TITLES,
     Figures,
@@ -43,6 +45,10 @@ from the line more, one that strays towards it less. In brackets: (total - {FLOO
 {FLOOR:,} + {STEPS} x mean is what that count would come to if all of it led away from
 the line, the most that it could be; in brackets the mean. Scenes, policies and control
 periods differ: compare within a row, not between the rows."""
+_RETRAIN = (
+    "mi-nerfattack retrain FOLDER/cells/* -o retrained.safetensors --data DATA "
+    "--more FRAMES  # those of the bundled policy's training"
+)
 _AGAINST = [
     *("environment", "route", "ratio", "difference (m)", "spread over seeds (m)"),
     *("random out", "gradient out", "p (McNemar)"),
@@ -83,7 +89,7 @@ def page(
     if retrained:
         parts.append(_retraining(retrained))
     parts.append(_section("All figures", "", _DETAILS, detail_rows(table)))
-    parts.append(_provenance(summary, rows, made))
+    parts.append(_provenance(summary, rows, made, bool(retrained)))
     return "\n\n".join(parts) + "\n"
 
 
@@ -108,14 +114,21 @@ def _retraining(retrained: Table) -> str:
     stages = [f"{s} {c}" for c in (NO_OBJECT, ATTACK) for s in (BEFORE, AFTER)]
     rows = (
         (name, route or "all", *(cell(retrained[route, name, case]) for case in stages))
-        for route, name in dict.fromkeys(key[:2] for key in retrained)
+        for name in NAMES.values()
+        for route in (*PAPER, None)
+        if (route, name, stages[0]) in retrained
     )
-    text = "Drives of both policies from the same starts, which no run has seen."
+    text = (
+        "Drives of both policies from the same starts, which no run has seen. Those "
+        "without\nobjects are the same for all attacks of a route."
+    )
     header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
     return _section("Before and after retraining", text, header, rows)
 
 
-def _provenance(summary: Figures, rows: Iterable[Figures], made: Figures) -> str:
+def _provenance(
+    summary: Figures, rows: Iterable[Figures], made: Figures, has_retrained: bool
+) -> str:
     versions, contents = {}, {}
     for row in rows:
         if row["versions"] is not None:
@@ -130,6 +143,7 @@ def _provenance(summary: Figures, rows: Iterable[Figures], made: Figures) -> str
         "## How it was made\n",
         "```",
         "mi-nerfattack sweep scenes/table2.toml -o FOLDER",
+        *([_RETRAIN] if has_retrained else []),
         made["command"],
         "mi-nerfattack replay docs/table2 --rows 10  # any row comes back",
         "```\n",
