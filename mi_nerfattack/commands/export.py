@@ -1,4 +1,4 @@
-"""``mi-nerfattack export``: an object as a mesh, as pictures or as a smaller field."""
+"""``mi-nerfattack export``: an object as a mesh, as pictures, as a field, on paper."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from mi_nerfattack.commands.shared.box_options import BoxOptions
 
 if TYPE_CHECKING:
     from mi_nerfattack.fields.grid import GridField
@@ -19,11 +21,14 @@ class Export:
     Or write the field anew: files of earlier versions become smaller and show the same.
     A run folder of attack holds its attacked objects as fields, objects/ID.safetensors.
     Colours are radiance: reflectance times the light that the object was captured in.
+    The attacked cube of a run folder is also put on paper (--print, to cut, fold and
+    glue) and on a monitor (--monitor), at its physical size.
     """
 
     field: tyro.conf.Positional[Path]
-    """Field of an object (.safetensors), as asset and attack write them."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Field of an object (.safetensors), as asset and attack write them; with --print
+    and --monitor a run folder of attack."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json;
     FILE.safetensors for a field, which may be the same file."""
     mesh: Path | None = None
@@ -39,6 +44,7 @@ class Export:
     """Of --mesh: turn about the vertical."""
     pixels_per_m: float | None = None
     """Of the pictures; 256 pixels along the longest edge by default."""
+    box: Annotated[BoxOptions, tyro.conf.arg(name="")] = BoxOptions()
 
     def run(self) -> int:
         """Read, sample the surface or look at the sides, and write."""
@@ -47,33 +53,60 @@ class Export:
         from mi_nerfattack.fields.io import load_grid
         from mi_nerfattack.io import files
 
-        suffix = self.output.suffix.lower()
+        if self.box.is_asked:
+            return self._write_box()
+        if self.output is None:
+            raise InputError("give -o, or, for a run folder, --print or --monitor")
+        if self.box != BoxOptions():
+            raise InputError(
+                "--object, --size-mm and the options after them: are for --print and "
+                "--monitor"
+            )
+        output, suffix = self.output, self.output.suffix.lower()
         if suffix not in (".glb", ".safetensors", ""):
             raise InputError(
-                f"{self.output}: give FILE.glb, FILE.safetensors or a folder's name"
+                f"{output}: give FILE.glb, FILE.safetensors or a folder's name"
             )
-        self._refuse_unused(is_mesh=suffix == ".glb")
+        self._refuse_unused(output, is_mesh=suffix == ".glb")
         variant.ensure()
         grid = load_grid(self.field)
         if suffix == "":
-            return self._write_faces(grid)
-        files.check_writable(self.output)
+            return self._write_faces(grid, output)
+        files.check_writable(output)
         if suffix == ".safetensors":
-            return self._write_field(grid)
-        return self._write_mesh(grid)
+            return self._write_field(grid, output)
+        return self._write_mesh(grid, output)
 
-    def _write_field(self, grid: GridField) -> int:
+    def _write_box(self) -> int:
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.errors import InputError
+
+        if self.output is not None:
+            raise InputError(
+                f"-o {self.output}: --print and --monitor name their own files; give "
+                "-o by itself, with the field of an object"
+            )
+        if self.mesh is not None or self.pixels_per_m is not None:
+            raise InputError("--mesh and --pixels-per-m: are for -o")
+        variant.ensure()
+        with StageBars() as bars:
+            told = self.box.write(self.field, bars.counter("printing", "page "))
+        print("\n".join(told))
+        return 0
+
+    def _write_field(self, grid: GridField, output: Path) -> int:
         from mi_nerfattack.fields.io import save_field
 
         before = self.field.stat().st_size
-        save_field(self.output, grid)
+        save_field(output, grid)
         print(
-            f"Wrote {self.output}: {grid.held_vertices().sum()} of {grid.n_vertices} "
-            f"vertices, {self.output.stat().st_size} bytes; {self.field} had {before}"
+            f"Wrote {output}: {grid.held_vertices().sum()} of {grid.n_vertices} "
+            f"vertices, {output.stat().st_size} bytes; {self.field} had {before}"
         )
         return 0
 
-    def _write_mesh(self, grid: GridField) -> int:
+    def _write_mesh(self, grid: GridField, output: Path) -> int:
         from mi_nerfattack.capture.mesh.gltf_writer import write_glb
         from mi_nerfattack.capture.mesh.surface import field_surface, painted_mesh
         from mi_nerfattack.capture.object_views import Placement
@@ -83,36 +116,36 @@ class Export:
         else:
             placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
             mesh = painted_mesh(grid, placement.mesh(self.mesh))
-        write_glb(self.output, mesh)
+        write_glb(output, mesh)
         print(
-            f"Wrote {self.output}: {len(mesh.faces)} triangles, "
+            f"Wrote {output}: {len(mesh.faces)} triangles, "
             f"{len(mesh.vertices)} vertices"
         )
         return 0
 
-    def _write_faces(self, grid: GridField) -> int:
+    def _write_faces(self, grid: GridField, output: Path) -> int:
         from mi_nerfattack.capture.mesh.cube_faces import render_faces, write_faces
         from mi_nerfattack.errors import InputError
 
-        if self.output.is_file():
-            raise InputError(f"{self.output}: is a file; give a folder's name")
+        if output.is_file():
+            raise InputError(f"{output}: is a file; give a folder's name")
         faces = render_faces(grid, self.pixels_per_m)
-        write_faces(self.output, faces)
+        write_faces(output, faces)
         edges = " x ".join(f"{edge:.3f}" for edge in faces.upper - faces.lower)
         print(
-            f"Wrote {self.output}: 6 pictures of a box of {edges} m, "
+            f"Wrote {output}: 6 pictures of a box of {edges} m, "
             f"{faces.pixels_per_m:.0f} pixels a metre"
         )
         return 0
 
-    def _refuse_unused(self, is_mesh: bool) -> None:
+    def _refuse_unused(self, output: Path, is_mesh: bool) -> None:
         """Raise InputError for an option that the kind of output has no use for."""
         from mi_nerfattack.errors import InputError
 
         if not is_mesh and self.mesh is not None:
-            raise InputError(f"--mesh: is for FILE.glb, not for {self.output}")
-        if self.output.suffix and self.pixels_per_m is not None:
-            raise InputError(f"--pixels-per-m: is for pictures, not for {self.output}")
+            raise InputError(f"--mesh: is for FILE.glb, not for {output}")
+        if output.suffix and self.pixels_per_m is not None:
+            raise InputError(f"--pixels-per-m: is for pictures, not for {output}")
         for name, value in (
             ("height-m", self.height_m),
             ("longest-m", self.longest_m),

@@ -17,10 +17,13 @@ from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.io import files
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import March, Rays
 
 _LONGEST_PX = 256
 _MAX_PX = 8192
+_COARSE_PX = 32  # of a side that is looked at for its shape
+_RIM_PX = 3
+_FLAT_VOXELS = 5  # how far a fitted surface lies from the object's
 OBJECT_BOX = ("provenance.object_lower", "provenance.object_upper")
 """Header entries of the box of the object that a field was fitted to."""
 
@@ -117,19 +120,60 @@ def write_faces(folder: str | Path, faces: CubeFaces) -> None:
     files.write_json(root / "faces.json", table)
 
 
+def flat_share(field: GridField) -> float:
+    """Return how much of the sides of an object's box is its surface, of 1.
+
+    1 for a box whatever its colours; a ball covers a part of its box's sides, and lies
+    behind most of that. A tenth at each rim does not count, where a coarse grid fades,
+    nor does the underside, which no view has shown of what stands on the ground.
+    """
+    lower, upper = object_box(field)
+    posed, voxel = PosedField(field), _voxel(field)
+    good = []
+    for axes in [axes for name, axes in CUBE_FACES.items() if name != "nz"]:
+        seen, distance = _look(posed, lower, upper, axes, (_COARSE_PX, _COARSE_PX))
+        opacity, moment = seen.opacity.numpy(), seen.moment.numpy()
+        depth = moment / np.maximum(opacity, 1e-6)
+        flat = np.abs(depth - distance) < _FLAT_VOXELS * voxel
+        whole = ((opacity > 0.5) & flat).reshape(_COARSE_PX, _COARSE_PX)
+        good.append(whole[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
+    return float(np.mean(good))
+
+
+def _voxel(field: GridField) -> float:
+    return float((field.upper - field.lower).max()) / field.layout.max_resolution
+
+
 def _render(
     posed: PosedField, lower: np.ndarray, upper: np.ndarray, scale: float, axes: Any
 ) -> np.ndarray:
+    _, right, up = np.abs(np.array(axes))
+    extent = upper - lower
+    width, height = (max(1, round(scale * float(v @ extent))) for v in (right, up))
+    seen, _ = _look(posed, lower, upper, axes, (height, width))
+    return straight_rgba(
+        seen.radiance.numpy().T.reshape(height, width, 3),
+        seen.opacity.numpy().reshape(height, width, 1),
+    )
+
+
+def _look(
+    posed: PosedField,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    axes: Any,
+    shape: tuple[int, int],
+) -> tuple[March, float]:
+    """March (height * width) rays against one side; also the distance to it, metres."""
     normal, right, up = map(np.array, axes)
-    extent, middle = upper - lower, 0.5 * (lower + upper)
+    (height, width), extent, middle = shape, upper - lower, 0.5 * (lower + upper)
     across, high = float(abs(right @ extent)), float(abs(up @ extent))
-    width, height = (max(1, round(scale * edge)) for edge in (across, high))
     column = ((np.arange(width) + 0.5) / width - 0.5) * across
     row = (0.5 - (np.arange(height) + 0.5) / height) * high
-    away = float(
+    away = 1.1 * float(
         np.abs(np.stack([posed.field.lower, posed.field.upper]) - middle).max()
     )
-    eye = middle + 1.1 * away * normal
+    eye = middle + away * normal
     origin = eye + row[:, None, None] * up + column[:, None] * right
     half = mi.Float(0.5)
     dr.make_opaque(half)
@@ -141,7 +185,4 @@ def _render(
         )
         seen = march(posed, rays)
         dr.eval(seen)
-    return straight_rgba(
-        seen.radiance.numpy().T.reshape(height, width, 3),
-        seen.opacity.numpy().reshape(height, width, 1),
-    )
+    return seen, away - 0.5 * float(abs(normal @ extent))

@@ -1,0 +1,127 @@
+"""Options of ``export``: an attacked box on paper or on a monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.robot.attacked import AttackedBox
+    from mi_nerfattack.robot.monitor import Screen
+
+
+@dataclass(frozen=True)
+class BoxOptions:
+    """How an attacked box leaves the computer."""
+
+    print: Path | None = None
+    """FILE.pdf: the six faces of an attacked box of a run folder, as a net to fold."""
+    monitor: Path | None = None
+    """FILE.png or FILE.html: one face of it, for a monitor, at its physical size."""
+    object: str | None = None
+    """Of --print and --monitor: id of the box; the only one by default."""
+    size_mm: float | None = None
+    """Of --print and --monitor: longest edge; as large as in the run by default."""
+    paper: Literal["a4", "a3", "letter"] = "a4"
+    """Of --print: several pages, if the net is larger."""
+    dpi: int = 300
+    """Of --print: pixels an inch."""
+    face: Literal["front", "right", "back", "left", "top", "bottom"] | None = None
+    """Of --monitor: as the box itself is turned, front towards -y; the one that the
+    run's drives saw most by default."""
+    diagonal_in: float = 27.0
+    """Of --monitor: inches."""
+    aspect: str = "16:9"
+    """Of --monitor: width to height, WIDTH:HEIGHT."""
+    pixels: str = "2560x1440"
+    """Of --monitor: WIDTHxHEIGHT."""
+    background: tuple[int, int, int] = (0, 0, 0)
+    """Of --monitor: around the face, 0 to 255."""
+    gamma: float | None = None
+    """Of --monitor: exponent of its curve; that of sRGB by default."""
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether there is anything to write."""
+        return self.print is not None or self.monitor is not None
+
+    def write(self, run: Path, on_page: Callable[[int, int], None]) -> list[str]:
+        """Check, read the box and write what is asked for; return what to tell.
+
+        Raises:
+            InputError: an option or file that cannot be used.
+        """
+        from mi_nerfattack.io import files
+        from mi_nerfattack.robot.attacked import read_box, seen_most
+
+        screen = self._checked()
+        for path in (self.print, self.monitor):
+            if path is not None:
+                files.check_writable(path)
+        box, views = read_box(run, self.object)
+        told = []
+        if self.print is not None:
+            told.append(self._print(self.print, box, on_page))
+        if self.monitor is not None:
+            face = self.face or seen_most(box, views)
+            told.append(self._show(self.monitor, box, face, screen))
+        return told
+
+    def _checked(self) -> Screen:
+        """Refuse wrong names and numbers before anything is read."""
+        from mi_nerfattack.robot.monitor import Screen
+
+        if self.print is not None and self.print.suffix.lower() != ".pdf":
+            raise InputError(f"--print: {self.print}; give FILE.pdf")
+        if self.monitor is not None and self.monitor.suffix.lower() not in _SHOWN:
+            raise InputError(f"--monitor: {self.monitor}; give FILE.png or FILE.html")
+        across, down = _pair("--aspect", self.aspect, ":")
+        width, height = map(round, _pair("--pixels", self.pixels, "x"))
+        return Screen(width, height, self.diagonal_in, across / down, self.gamma)
+
+    def _print(
+        self, path: Path, box: AttackedBox, on_page: Callable[[int, int], None]
+    ) -> str:
+        from mi_nerfattack.robot.paper import write_net
+
+        edges = box.edges_mm(self.size_mm)
+        count = write_net(path, box, edges, self.paper, self.dpi, on_page)
+        size = " x ".join(f"{edge:.1f}" for edge in edges)
+        pages = "page" if count == 1 else "pages"
+        return f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
+
+    def _show(self, path: Path, box: AttackedBox, face: str, screen: Screen) -> str:
+        from mi_nerfattack.io import files
+        from mi_nerfattack.robot.monitor import screen_image, screen_page
+        from mi_nerfattack.robot.net import Net
+
+        spot = Net(box.edges_mm(self.size_mm)).faces[face]
+        size = spot.width, spot.height
+        image = screen_image(screen, box.images[face], size, self.background)
+        if path.suffix.lower() == ".png":
+            files.write_image(path, image)
+        else:
+            about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
+            files.write_text(path, screen_page(image, about))
+        return (
+            f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm on "
+            f"{self.pixels} pixels, {25.4 * screen.px_per_mm[0]:.1f} an inch"
+        )
+
+
+_SHOWN = (".png", ".html")
+
+
+def _pair(name: str, text: str, mark: str) -> tuple[float, float]:
+    """Read two positive numbers with a mark between them."""
+    try:
+        first, second = map(float, text.lower().split(mark))
+    except ValueError as err:
+        raise InputError(f"{name}: {text!r}; two numbers, as in 16{mark}9") from err
+    if not (0 < first < 1e6 and 0 < second < 1e6):
+        raise InputError(f"{name}: {text}; must be positive")
+    return first, second

@@ -1,0 +1,121 @@
+"""Boxes of run folders, and the commands that put them on paper and screens."""
+
+from __future__ import annotations
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import boxes
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack import cli
+from mi_nerfattack.capture.mesh.cube_faces import flat_share
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import save_field
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
+from mi_nerfattack.robot.attacked import FACES, Views, read_box, seen_most
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    mi.set_variant("llvm_ad_rgb")
+    return boxes.attacked_run(tmp_path_factory.mktemp("cube"), boxes.cube_field())
+
+
+def call(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main(["export", *map(str, arguments)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_box_of_a_run(run):
+    """Pose with the attack's, size with the scale, pictures as the field is seen."""
+    box, views = read_box(run, texture_px=24)
+    pose = json.loads((run / "metrics.json").read_text())["object_poses"]["ball"]
+    np.testing.assert_allclose(box.pose.translation, pose["position_m"], atol=1e-6)
+    np.testing.assert_allclose(box.pose.rotation, pose["rotation"], atol=1e-6)
+    assert np.abs(box.pose.translation - [7, 4.2, 1.6]).max() > 1e-4
+    np.testing.assert_allclose(box.edges_m, 1.5, atol=1e-6)
+    assert box.edges_mm(40.0) == pytest.approx([40, 40, 40])
+    assert set(box.images) == set(FACES) and len(views.camera_to_world) == 3
+    # colours rise with x, y and z: of the front, red to the right and blue upwards
+    front = box.images["front"].astype(int)
+    assert front.shape == (24, 24, 3) and front.min() > 5
+    assert (front[:, -4, 0] - front[:, 3, 0]).mean() > 30
+    assert (front[3, :, 2] - front[-4, :, 2]).mean() > 30
+
+
+def test_the_face_that_is_seen_most():
+    turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    box = boxes.made_box()
+    camera, mount = from_fov(64, 32, 90.0), CameraMount()
+    for face in FACES:
+        corner, across, down = box.plane(face)
+        middle = corner + (across + down) / 2
+        out = np.cross(down, across)
+        eyes = [middle + 4 * turn @ out, middle + 3 * out + 0.3]
+        poses = np.stack([look_at(eye, middle) for eye in eyes])
+        assert seen_most(box, Views(camera, mount, poses)) == face
+    away = look_at(np.array([5.0, 0, 0]), np.array([9.0, 0, 0]))[None]
+    with pytest.raises(InputError, match=r"1 views .* shows cube; choose with --face"):
+        seen_most(box, Views(camera, mount, away))
+
+
+def test_paper_and_screen(run, tmp_path, capsys):
+    pdf, png, page = (tmp_path / name for name in ("a.pdf", "a.png", "a.html"))
+    options = ("--size-mm", 60, "--dpi", 40, "--face", "left", "--pixels", "640x360")
+    code, out, err = call(capsys, run, "--print", pdf, "--monitor", png, *options)
+    assert code == 0, err
+    assert "60.0 x 60.0 x 60.0 mm" in out and "left of ball" in out
+    assert pdf.read_bytes().startswith(b"%PDF") and b"run" in pdf.read_bytes()
+    image = files.read_image(png)
+    wide = np.count_nonzero(image[180].any(1)) / 640 * 27 * 25.4 * 16 / 337**0.5
+    assert wide == pytest.approx(60, abs=0.9)  # a pixel is 0.93 mm
+    code, _, err = call(capsys, run, "--monitor", page, *options)
+    assert code == 0, err
+    assert "data:image/png;base64," in page.read_text()
+
+
+def test_refused(run, tmp_path, capsys):
+    field = run / "objects" / "ball.safetensors"
+    out = tmp_path / "a.pdf"
+    for arguments, message in (
+        ((run,), "give -o, or, for a run folder, --print or --monitor"),
+        ((field, "-o", tmp_path / "a.glb", "--dpi", 9), "are for --print and"),
+        ((run, "--print", out, "-o", "a.glb"), "name their own files"),
+        ((run, "--print", out, "--pixels-per-m", 3), "are for -o"),
+        ((run, "--print", tmp_path / "a.png"), "--print: "),
+        ((run, "--monitor", tmp_path / "a.jpg"), "give FILE.png or FILE.html"),
+        ((run, "--print", tmp_path / "no" / "a.pdf"), "does not exist"),
+        ((tmp_path, "--print", out), "holds no finished attack"),
+        ((run, "--print", out, "--object", "car"), "--object: 'car'; "),
+        ((run, "--monitor", tmp_path / "a.png", "--pixels", "9"), "two numbers"),
+        ((run, "--monitor", tmp_path / "a.png", "--aspect", "9:0"), "--aspect"),
+        ((run, "--monitor", tmp_path / "a.png"), "at most 336.2 mm across fit"),
+    ):
+        code, shown, error = call(capsys, *arguments)
+        assert (code, shown) == (2, ""), error
+        assert message in error and error.count("\n") == 1, error
+        assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_box_is_refused(run, tmp_path, monkeypatch):
+    def ball(at):
+        return 0.5 - np.linalg.norm(at, axis=1)
+
+    assert flat_share(boxes.cube_field()) > 0.97
+    field = boxes.solid(ball, [-0.5] * 3, [0.5] * 3)
+    assert flat_share(field) < 0.8
+    path = run / "objects" / "ball.safetensors"
+    before = path.read_bytes()
+    try:
+        save_field(path, field)
+        with pytest.raises(InputError, match=r"no box was attacked: .* ball to \d+ %"):
+            read_box(run)
+    finally:
+        path.write_bytes(before)
