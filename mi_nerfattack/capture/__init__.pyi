@@ -3,8 +3,12 @@ from .camera_path import route_path as route_path
 from .object_views import Placement as Placement
 from .object_views import read_views as read_views
 from .object_views import render_views as render_views
+from .photographs.alignment import Distance as Distance
 from .photographs.estimate import PoseOptions as PoseOptions
 from .photographs.estimate import estimate_poses as estimate_poses
+from .photographs.frames import FrameOptions as FrameOptions
+from .photographs.frames import extract_frames as extract_frames
+from .photographs.markers import Markers as Markers
 from .posed_images import PosedImages as PosedImages
 from .posed_images import load_images as load_images
 from .scene import capture_scene as capture_scene

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.capture.photographs.frames import (
     FrameOptions,
     Motion,
+    _upright,
     choose_frames,
     extract_frames,
     measure_motion,
@@ -118,6 +120,18 @@ def test_sharp_frames_are_written_in_order(tmp_path):
     shown = files.read_image(tmp_path / "frames" / names[0])
     assert shown.shape == (HEIGHT, WIDTH, 3)
     assert ("motion", 80, 80) in seen and seen[-1] == ("frames", *[len(names)] * 2)
+
+
+def test_films_that_a_phone_turned_are_shown_upright():
+    left = np.zeros((4, 6, 3), np.uint8)
+    left[:, :3] = 255
+
+    def to_ndarray(format: str) -> np.ndarray:
+        return left
+
+    for angle, bright in ((0, np.s_[:, 0]), (-90, np.s_[0]), (90, np.s_[-1])):
+        shown = _upright(SimpleNamespace(rotation=angle, to_ndarray=to_ndarray))
+        assert shown[bright].min() == 255 and shown.mean() == 127.5
 
 
 class TestUnusable:
