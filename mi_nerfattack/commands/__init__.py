@@ -19,6 +19,7 @@ from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
+from mi_nerfattack.commands.overlay import OverlayCommand
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
@@ -53,6 +54,7 @@ COMMANDS: dict[str, type[Command]] = {
     "replay": Replay,
     "transfer": Transfer,
     "retrain": Retrain,
+    "overlay": OverlayCommand,
     "report": Report,
 }
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import boxes
+from helpers.posed_folders import write_transforms
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack import cli
@@ -15,6 +17,7 @@ from mi_nerfattack.capture.mesh.cube_faces import flat_share
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
+from mi_nerfattack.io.video import write_video
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
 from mi_nerfattack.robot.attacked import FACES, Views, read_box, seen_most
 
@@ -102,6 +105,47 @@ def test_refused(run, tmp_path, capsys):
         assert (code, shown) == (2, ""), error
         assert message in error and error.count("\n") == 1, error
         assert not list(tmp_path.iterdir())
+
+
+def test_overlay_of_recordings(run, tmp_path, capsys):
+    """In every frame, from folders and videos; poses and sizes that do not fit."""
+    box, _ = read_box(run, texture_px=24)
+    camera = from_fov(48, 32, 60.0)
+    middle = box.pose.translation
+    eyes = [middle + [-4, 0.3 * step, 0.5] for step in range(3)]
+    poses = np.stack([look_at(eye, middle) for eye in eyes])
+    green = np.zeros((3, 32, 48, 3), np.uint8)
+    green[:, 4:] = (40, 160, 60)
+    write_transforms(tmp_path / "drive", green, camera, poses, {})
+    write_video(tmp_path / "drive.mp4", green, 10)
+    shutil.copy(tmp_path / "drive" / "transforms.json", tmp_path / "drive.json")
+    for source, output in (("drive", "out"), ("drive.mp4", "out.mp4")):
+        words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
+        assert cli.main([str(word) for word in words]) == 0, capsys.readouterr().err
+        assert "3 frames with ball" in capsys.readouterr().out
+    for path in sorted((tmp_path / "out").iterdir()):
+        frame = files.read_image(path)
+        assert (frame[:4] == 0).all()  # above the target
+        assert (frame[14:18, 22:26] != (40, 160, 60)).any(-1).all()
+        assert (frame[30, 2] == (40, 160, 60)).all()
+    (tmp_path / "cut.mp4").write_bytes((tmp_path / "drive.mp4").read_bytes()[:400])
+    shutil.copy(tmp_path / "drive.json", tmp_path / "cut.json")
+    (tmp_path / "bare.mp4").write_bytes((tmp_path / "drive.mp4").read_bytes())
+    small = tmp_path / "small"
+    shutil.copytree(tmp_path / "drive", small)
+    files.write_image(next((small / "images").iterdir()), green[0, :9])
+    for source, output, message in (
+        ("cut.mp4", "b.mp4", "cut.mp4: "),
+        ("bare.mp4", "b.mp4", "no pose file beside it"),
+        ("small", "b.mp4", "px"),
+        ("drive", "b.avi", "give FILE.mp4 or a folder"),
+        ("drive", "drive", "is the recording"),
+    ):
+        words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
+        assert cli.main([str(word) for word in words]) == 2
+        error = capsys.readouterr().err
+        assert message in error and "Traceback" not in error, error
+        assert not (tmp_path / "b.mp4").exists()
 
 
 def test_what_is_no_box_is_refused(run, tmp_path, monkeypatch):

@@ -1,0 +1,89 @@
+"""``mi-nerfattack overlay``: an attacked box in what a real camera recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mi_nerfattack.deploy.replay.recording import AbstractRecording
+    from mi_nerfattack.robot.overlay import Overlay
+
+
+@dataclass(frozen=True)
+class OverlayCommand:
+    """Show the attacked cube of a run in a recorded drive, where a green target stands.
+
+    What stands before the target stays before the cube. Poses are the recording's own,
+    in metres and in the run's frame of the world.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Video with a pose file of the same name beside it, folder of images with
+    transforms.json, poses.csv or poses.toml, or .mcap log, as for replays."""
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Folder of a finished run of attack."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """FILE.mp4, or a folder for PNG images."""
+    object: str | None = None
+    """Id of the box; the only one by default."""
+    paste: bool = False
+    """Show it by its pose alone, with no green target; what the recording's depth, if
+    it has any, says is nearer stays before it."""
+
+    def run(self) -> int:
+        """Read, project and write."""
+        import numpy as np
+
+        from mi_nerfattack import variant
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.deploy.replay.environment import open_recording
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io import files
+        from mi_nerfattack.io.video import write_video
+        from mi_nerfattack.robot.attacked import read_box
+        from mi_nerfattack.robot.overlay import Overlay
+
+        is_video = self.output.suffix.lower() == ".mp4"
+        if self.output.suffix and not is_video:
+            raise InputError(f"-o: {self.output}; give FILE.mp4 or a folder's name")
+        if is_video:
+            files.check_writable(self.output)
+        elif self.output.resolve() == self.recording.resolve():
+            raise InputError(f"-o: {self.output}; is the recording, choose another")
+        variant.ensure()
+        box, views = read_box(self.run_folder, self.object)
+        recording = open_recording(self.recording, views.camera, views.mount)
+        overlay = Overlay(box, recording.camera, keyed=not self.paste)
+        times = recording.track.times
+        with StageBars() as bars:
+            told = bars.counter("overlaying", "frame ")
+            frames = self._frames(recording, overlay, told)
+            if is_video:
+                fps = 1 / float(np.median(np.diff(times))) if len(times) > 1 else 10
+                write_video(self.output, frames, fps)
+            else:
+                files.make_folder(self.output)
+                for index, frame in enumerate(frames):
+                    files.write_image(self.output / f"{index:05d}.png", frame)
+        recording.close()
+        print(f"Wrote {self.output}: {len(times)} frames with {box.name}")
+        return 0
+
+    def _frames(
+        self,
+        recording: AbstractRecording,
+        overlay: Overlay,
+        on_frame: Callable[[int, int], None],
+    ) -> Iterator[np.ndarray]:
+        poses = recording.track.camera_to_world
+        for index, pose in enumerate(poses):
+            depth = recording.depth(index) if self.paste else None
+            yield overlay.apply(recording.image(index), pose, depth)
+            on_frame(index + 1, len(poses))
