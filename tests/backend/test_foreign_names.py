@@ -33,7 +33,7 @@ DETAIL = {
     "drjit.detail.malloc_watermark",
     "mitsuba.detail.add_variant_callback",
 }
-PYTHON = {"_exit"}  # documented under this name
+PYTHON = {"_asdict", "_exit", "_replace"}  # documented under these names
 ROOTS = {"dr": dr, "drjit": dr, "mi": mi, "mitsuba": mi}
 
 

@@ -93,14 +93,6 @@ UNUSABLE = {
         with_infinity,
         rf"{MATRIX}\[0\]\[2\]: 1e999 is not a JSON number",
     ),
-    "mixed sizes, each with its intrinsics": (
-        nerfstudio,
-        lambda folder: (
-            image_of_width("images/frame_00001.png", 14)(folder),
-            change_frame(w=14)(folder),
-        ),
-        "frame_00001.png: 14 x 8 px, but .*frame_00000.png has 12 x 8 px",
-    ),
     "size against intrinsics of a frame": (
         nerfstudio,
         change_frame(w=1080),

@@ -156,7 +156,7 @@ def test_report_folder(tmp_path):
     ]
     text = files.read_text(page)
     assert "A &lt;fit&gt;" in text and "Not good enough" in text
-    assert text.count("data:image/png;base64,") == 4
+    assert text.count("data:image/webp;base64,") == 4
     assert not re.search(r"(src|href)=\"(?!data:)", text)
     assert not re.search(r"\b(nan|inf)\b", page_text(page))
     metrics = files.read_json(folder / "metrics.json")
