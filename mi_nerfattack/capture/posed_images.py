@@ -59,6 +59,8 @@ class PosedImages:
     def __post_init__(self) -> None:
         """Check shapes and poses."""
         n = len(self.images)
+        if not n:
+            raise InputError("images: none; give at least one")
         if self.camera_to_world.shape != (n, 4, 4) or len(self.names) != n:
             raise InputError(
                 f"camera_to_world, names: shape {self.camera_to_world.shape} and "
@@ -78,7 +80,8 @@ class PosedImages:
         image, camera = self.images[index], self.camera_of(index)
         if image.dtype != np.uint8:
             raise InputError(f"images: {image.dtype}; must be uint8 sRGB")
-        if image.ndim != 3 or image.shape[2] != self.channels not in (3, 4):
+        channels = image.shape[2:]
+        if channels not in ((3,), (4,)) or channels != self.images[0].shape[2:]:
             raise InputError(
                 f"images: {self.names[index]} has shape {image.shape}; must be "
                 "(height, width, 3) in all, or (height, width, 4) in all"

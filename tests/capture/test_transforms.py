@@ -12,7 +12,12 @@ import pytest
 from helpers.kernels import nothing_compiled
 from helpers.posed_folders import render_views, write_transforms
 
-from mi_nerfattack.capture.posed_images import PosedImages, held_out, resize_area
+from mi_nerfattack.capture.posed_images import (
+    PosedImages,
+    held_out,
+    resize_area,
+    stacked,
+)
 from mi_nerfattack.capture.scene import capture_scene, drive_poses
 from mi_nerfattack.capture.transforms import (
     begin_posed,
@@ -201,6 +206,21 @@ class TestTransforms:
         poses[0, 1, 3] = np.nan
         with pytest.raises(InputError, match="first: .*NaN"):
             PosedImages(images, poses, CAMERA, ("first",))
+
+    @pytest.mark.parametrize("channels", [(3, 4), (4, 3), (2, 2)])
+    def test_channels_are_the_same(self, channels):
+        images, poses = some_frames(2)
+        images = stacked(
+            [np.resize(images[0], (*images[0].shape[:2], c)) for c in channels]
+        )
+        with pytest.raises(InputError, match="must be .height, width, 3. in all, or"):
+            PosedImages(images, poses, CAMERA, ("a", "b"))
+
+    def test_none(self):
+        with pytest.raises(InputError, match="at least one"):
+            PosedImages(
+                np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 4, 4)), CAMERA, ()
+            )
 
     def test_real_photographs(self, data_folder):
         read = read_transforms(data_folder / "fox", long_edge_px=96, skip_missing=True)

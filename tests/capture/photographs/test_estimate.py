@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +10,6 @@ import pytest
 from PIL import ExifTags, Image
 
 from mi_nerfattack import cli
-from mi_nerfattack.capture.colmap.follow import Stages
-from mi_nerfattack.capture.colmap.process import MARK
-from mi_nerfattack.capture.colmap.reconstruct import Structure
-from mi_nerfattack.capture.photographs.alignment import upright
 from mi_nerfattack.capture.photographs.estimate import (
     PoseOptions,
     estimate_poses,
@@ -189,38 +182,6 @@ class TestCorner:
         assert table["units"] == "arbitrary"
 
 
-class TestUpright:
-    def structure(self, poses) -> Structure:
-        names = tuple(str(i) for i in range(len(poses)))
-        cameras = (CAMERA,) * len(poses)
-        return Structure(names, poses, cameras, np.zeros((0, 3)), 0.5)
-
-    @pytest.mark.parametrize(
-        "up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.3, -0.8, 0.2], [0, -1, 0]]
-    )
-    def test_any_up_becomes_z(self, up):
-        up = np.array(up, float) / np.linalg.norm(up)
-        side = np.cross(up, [0.36, 0.48, 0.8])
-        side /= np.linalg.norm(side)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([side, -up, np.cross(side, -up)], axis=1)
-        poses = np.stack([pose, pose])
-        poses[1, :3, 3] = [2, 4, 4]
-        result = upright(self.structure(poses), 0.5)
-        np.testing.assert_allclose(
-            result.camera_to_world[:, :3, 1], [[0, 0, -1]] * 2, atol=1e-12
-        )
-        eyes = result.camera_to_world[:, :3, 3]
-        np.testing.assert_allclose(eyes.sum(0), 0, atol=1e-12)
-        assert np.linalg.norm(eyes[1] - eyes[0]) == pytest.approx(3)  # half of 6
-        assert np.linalg.det(result.camera_to_world[0]) == pytest.approx(1)
-
-    def test_opposite_cameras_have_no_up(self):
-        poses = np.stack([np.eye(4), np.diag([1.0, -1, -1, 1])])
-        with pytest.raises(InputError, match="upward directions cancel"):
-            upright(self.structure(poses), 1.0)
-
-
 class TestUnusable:
     def photographs(self, folder: Path, count: int) -> Path:
         folder.mkdir()
@@ -293,90 +254,6 @@ class TestUnusable:
         with pytest.raises(InputError, match="0.jpg: its EXIF data turn it"):
             estimate_poses(folder, tmp_path)
         assert (folder / "0.jpg").read_bytes() == before
-
-
-class TestProcess:
-    """pycolmap's process, with modules of its name that fail on purpose."""
-
-    @pytest.fixture
-    def poses(self, tmp_path, monkeypatch):
-        """Estimate poses with a pycolmap whose extract_features is the given code."""
-        folder = TestUnusable().photographs(tmp_path / "p", 3)
-
-        def call(code: str, progress=lambda *_: None) -> None:
-            lines = [
-                "import os, pathlib, signal, sys, time",
-                "class CameraMode: SINGLE = 0",
-                "class logging: logtostderr = False",
-                "def set_random_seed(seed): pass",
-                "def ImageReaderOptions(**_): pass",
-                "def FeatureExtractionOptions(**_): pass",
-                "def extract_features(database, *_):",
-                *(f"    {line}" for line in code.splitlines()),
-            ]
-            (tmp_path / "pycolmap.py").write_text("\n".join(lines) + "\n")
-            monkeypatch.syspath_prepend(str(tmp_path))
-            estimate_poses(folder, tmp_path / "out", progress=progress)
-
-        return call
-
-    @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
-    @pytest.mark.parametrize("name", ["SIGBUS", "SIGKILL"])
-    def test_crash_is_a_message(self, poses, tmp_path, name):
-        code = f"print('E full', flush=True)\nos.kill(os.getpid(), signal.{name})"
-        message = f"ended by {name} at the stage 'features' .*E full.*--long-edge"
-        with pytest.raises(SetupError, match=message):
-            poses(code)
-        assert not (tmp_path / "out").exists()
-
-    def test_exception_is_a_message(self, poses):
-        with pytest.raises(SetupError, match="code 1 .*ZeroDivisionError: why"):
-            poses("raise ZeroDivisionError('why')")
-
-    def test_interrupt_ends_the_process(self, poses, tmp_path):
-        pid, woken = tmp_path / "pid", tmp_path / "woken"
-        code = (
-            f"pathlib.Path({str(pid)!r}).write_text(str(os.getpid()))\n"
-            "print('I Processed file [2/3]', flush=True)\n"
-            "time.sleep(100)\n"
-            f"pathlib.Path({str(woken)!r}).touch()"
-        )
-        seen = []
-
-        def interrupt(*call) -> None:
-            seen.append(call)
-            if call == ("features", 2, 3):
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            poses(code, interrupt)
-        with pytest.raises(ProcessLookupError):
-            os.kill(int(pid.read_text()), 0)
-        assert ("features", 0, 3) in seen and not woken.exists()
-
-    def test_process_ends_with_its_parent(self, tmp_path):
-        (tmp_path / "pycolmap.py").write_text("import time\ntime.sleep(100)\n")
-        command = [sys.executable, "-m", "mi_nerfattack.capture.colmap.process"]
-        task = json.dumps({"work": "", "folder": "", "groups": []})
-        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        result = subprocess.run(command, input=task + "\n", text=True, env=environment)
-        assert result.returncode == 1
-
-    @pytest.mark.parametrize(
-        ("line", "done"),
-        [
-            ("Processed file [3/4]", 45),
-            ("Processing image [3/4]", 30),
-            ("Processing block [1/3, 3/3]", 13),
-            ("Processing block [3/3, 1/3]", 40),
-        ],
-    )
-    def test_progress_of_a_log_line(self, line, done):
-        calls = []
-        stages = Stages(lambda *call: calls.append(call))
-        told = MARK + json.dumps({"stage": "s", "total": 60})
-        stages.follow([told, f"I2026 7 pairing.cc:2] {line}\n"])
-        assert calls == [("s", 0, 60), ("s", done, 60)]
 
 
 def write_turned(path: Path, image: np.ndarray) -> None:
