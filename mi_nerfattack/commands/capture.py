@@ -114,6 +114,7 @@ class PhotographArguments:
             FrameOptions,
             extract_frames,
         )
+        from mi_nerfattack.io import files
 
         def show(stage: str, done: int, total: int) -> None:
             bars.show(stage, done, total, f"{done} of {total}")
@@ -130,7 +131,11 @@ class PhotographArguments:
             seed,
         )
         if not is_video:
+            for name in ("frames", "baseline"):
+                if self._is_given(name):
+                    raise InputError(f"--{name}: not for {source}, which is no video")
             return estimate_poses(source, output, options, show)
+        files.check_folder(output)
         with tempfile.TemporaryDirectory() as folder:
             chosen = FrameOptions(self.frames, self.baseline)
             extract_frames(source, Path(folder), chosen, show)
@@ -142,8 +147,13 @@ class PhotographArguments:
         if self.marker_m is None:
             if self.markers_flat:
                 raise InputError("--markers-flat: needs the markers' edge, --marker-m")
+            if self._is_given("marker_family"):
+                raise InputError("--marker-family: needs the markers' edge, --marker-m")
             return None
         return Markers(self.marker_m, self.marker_family, self.markers_flat)
+
+    def _is_given(self, name: str) -> bool:
+        return getattr(self, name) != getattr(PhotographArguments(), name)
 
     def tell(self, result: PoseEstimate) -> None:
         """Print what was found, and draw the cameras."""

@@ -87,8 +87,10 @@ class Export:
                 f"-o {self.output}: --print and --monitor name their own files; give "
                 "-o by itself, with the field of an object"
             )
-        if self.mesh is not None or self.pixels_per_m is not None:
-            raise InputError("--mesh and --pixels-per-m: are for -o")
+        options = {"mesh": self.mesh, "pixels-per-m": self.pixels_per_m}
+        for name, value in (options | self._mesh_options()).items():
+            if value is not None:
+                raise InputError(f"--{name}: is for -o, not for --print and --monitor")
         variant.ensure()
         with StageBars() as bars:
             told = self.box.write(self.field, bars.counter("printing", "page "))
@@ -146,11 +148,15 @@ class Export:
             raise InputError(f"--mesh: is for FILE.glb, not for {output}")
         if output.suffix and self.pixels_per_m is not None:
             raise InputError(f"--pixels-per-m: is for pictures, not for {output}")
-        for name, value in (
-            ("height-m", self.height_m),
-            ("longest-m", self.longest_m),
-            ("up", self.up),
-            ("turn-deg", self.turn_deg or None),
-        ):
+        for name, value in self._mesh_options().items():
             if value is not None and self.mesh is None:
                 raise InputError(f"--{name}: needs --mesh")
+
+    def _mesh_options(self) -> dict[str, object]:
+        """Return the options that only --mesh has a use for, None if not given."""
+        return {
+            "height-m": self.height_m,
+            "longest-m": self.longest_m,
+            "up": self.up,
+            "turn-deg": self.turn_deg or None,
+        }

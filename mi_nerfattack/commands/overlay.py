@@ -30,7 +30,7 @@ class OverlayCommand:
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Folder of a finished run of attack."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """FILE.mp4, or a folder for PNG images."""
+    """FILE.mp4, or a new or empty folder for PNG images."""
     object: str | None = None
     """Id of the box; the only one by default."""
     paste: bool = False
@@ -39,42 +39,59 @@ class OverlayCommand:
 
     def run(self) -> int:
         """Read, project and write."""
+        from contextlib import closing
+
         import numpy as np
 
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.deploy.replay.environment import open_recording
-        from mi_nerfattack.errors import InputError
         from mi_nerfattack.io import files
-        from mi_nerfattack.io.video import write_video
+        from mi_nerfattack.io.video import check_fps, write_video
         from mi_nerfattack.robot.attacked import read_box
         from mi_nerfattack.robot.overlay import Overlay
 
-        is_video = self.output.suffix.lower() == ".mp4"
-        if self.output.suffix and not is_video:
-            raise InputError(f"-o: {self.output}; give FILE.mp4 or a folder's name")
-        if is_video:
-            files.check_writable(self.output)
-        elif self.output.resolve() == self.recording.resolve():
-            raise InputError(f"-o: {self.output}; is the recording, choose another")
+        is_video = self._check_output()
         variant.ensure()
         box, views = read_box(self.run_folder, self.object)
-        recording = open_recording(self.recording, views.camera, views.mount)
-        overlay = Overlay(box, recording.camera, keyed=not self.paste)
-        times = recording.track.times
-        with StageBars() as bars:
+        recording = open_recording(
+            self.recording, views.camera, views.mount, views.period
+        )
+        with closing(recording), StageBars() as bars:
+            overlay = Overlay(box, recording.camera, keyed=not self.paste)
+            times = recording.track.times
             told = bars.counter("overlaying", "frame ")
             frames = self._frames(recording, overlay, told)
             if is_video:
-                fps = 1 / float(np.median(np.diff(times))) if len(times) > 1 else 10
+                steps = np.diff(times) if len(times) > 1 else views.period
+                fps = 1 / float(np.median(steps))
+                check_fps(fps)
                 write_video(self.output, frames, fps)
             else:
                 files.make_folder(self.output)
                 for index, frame in enumerate(frames):
                     files.write_image(self.output / f"{index:05d}.png", frame)
-        recording.close()
         print(f"Wrote {self.output}: {len(times)} frames with {box.name}")
         return 0
+
+    def _check_output(self) -> bool:
+        """Refuse what would replace anything recorded; return whether it is a video."""
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io import files
+
+        path, output = self.output, self.output.resolve()
+        is_video = path.suffix.lower() == ".mp4"
+        if path.suffix and not is_video:
+            raise InputError(f"-o: {path}; give FILE.mp4 or a folder's name")
+        if self.recording.resolve() in (output, *output.parents):
+            raise InputError(f"-o: {path}; is the recording or in it, choose another")
+        if is_video:
+            files.check_writable(path)
+            return True
+        files.check_folder(path)
+        if path.is_dir() and any(path.iterdir()):
+            raise InputError(f"-o: {path}; is not an empty folder, choose another")
+        return False
 
     def _frames(
         self,

@@ -297,6 +297,12 @@ def check_writable(path: str | Path) -> None:
             probe.unlink(missing_ok=True)
 
 
+def check_folder(path: str | Path) -> None:
+    """Raise InputError if a folder could not be made or written to; none is made."""
+    parents = (Path(path).absolute() / ".probe").parents
+    check_writable(next(p for p in parents if os.path.exists(p)) / ".probe")
+
+
 @contextmanager
 def _reported(path: str | Path) -> Iterator[None]:
     try:

@@ -115,11 +115,13 @@ class Views:
         camera: intrinsics.
         mount: of the camera on the vehicle.
         camera_to_world: (n, 4, 4), OpenCV axes, metres; n is 0 without such drives.
+        period: of the drives, seconds between two frames.
     """
 
     camera: Camera
     mount: CameraMount
     camera_to_world: np.ndarray
+    period: float
 
 
 def read_box(
@@ -216,7 +218,8 @@ def _placed(found: FoundAttack) -> tuple[list[Pose], Views]:
         for path in sorted((found.folder / DRIVES).glob(pattern))
     ]
     states = np.concatenate([np.zeros((0, 3)), *driven])
-    return poses, Views(camera, mount, mount_matrix(states, mount))
+    matrices, period = mount_matrix(states, mount), scenario.vehicle.dt_s
+    return poses, Views(camera, mount, matrices, period)
 
 
 def _box(

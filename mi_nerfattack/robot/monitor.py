@@ -69,6 +69,7 @@ def screen_image(
     face: np.ndarray,
     size_mm: tuple[float, float],
     background: tuple[int, int, int] = (0, 0, 0),
+    longest_mm: float | None = None,
 ) -> np.ndarray:
     """Put a picture in the middle of a screen, at its size.
 
@@ -77,6 +78,8 @@ def screen_image(
         face: (h, w, 3), uint8 sRGB.
         size_mm: width and height that it is to have on the monitor.
         background: of the rest, as sent to the monitor.
+        longest_mm: longest edge of the box that it is a face of, by which a message
+            says what fits; that of the face by default.
 
     Returns:
         (height, width, 3), uint8, as sent to the monitor: sRGB, or of its gamma.
@@ -88,11 +91,12 @@ def screen_image(
     for given, most in zip(size_mm, screen.size_mm, strict=True):
         if not 0 < given <= most:
             wide, high = screen.size_mm
-            edge = size_mm[0] * min(wide / size_mm[0], high / size_mm[1])
+            share = min(wide / size_mm[0], high / size_mm[1])
+            edge = math.floor(10 * share * (longest_mm or max(size_mm))) / 10
             raise InputError(
-                f"--size-mm: the face is {size_mm[0]:.1f} x {size_mm[1]:.1f} mm, the "
-                f"screen {wide:.1f} x {high:.1f} mm; at most {edge:.1f} mm across fit: "
-                "give a smaller size, or a larger monitor (--diagonal-in)"
+                f"--size-mm: the face is {size_mm[0]:.1f} x {size_mm[1]:.1f} mm, "
+                f"the screen {wide:.1f} x {high:.1f} mm; give at most {edge:.1f} "
+                "mm, of the box's longest edge, or a larger monitor (--diagonal-in)"
             )
     if not all(0 <= level <= 255 for level in background):
         raise InputError(f"--background: {background}; three levels from 0 to 255")

@@ -181,8 +181,8 @@ class Overlay:
         pictures, corners = self._pictures[face], _corners(matrix)
         if (corners[:, 2] < 1e-3).any():
             return pictures[0]
-        (x, y), turned = self._pixels(corners).T, np.roll(self._pixels(corners), -1, 0)
-        area = 0.5 * abs(float(x @ turned[:, 1] - y @ turned[:, 0]))
+        x, y = self._pixels(corners).T
+        area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
         height, width = pictures[0].shape[:2]
         level = round(0.5 * np.log2(max(1.0, height * width / max(area, 1.0))))
         return pictures[min(level, len(pictures) - 1)]

@@ -77,23 +77,28 @@ def lay_out(net: Net, paper: str) -> Sheets:
         InputError: it would take more than 400 pages.
     """
     short, long = PAPERS[paper]
-    options = [_tiled(net, *size) for size in ((short, long), (long, short))]
-    best = min(options, key=lambda sheets: len(sheets.tiles))
-    if len(best.tiles) > _MAX_PAGES:
+    sizes = (short, long), (long, short)
+    options = [sheets for size in sizes if (sheets := _tiled(net, *size))]
+    best = min(options, key=lambda sheets: len(sheets.tiles), default=None)
+    if best is None or len(best.tiles) > _MAX_PAGES:
         raise InputError(
-            f"--size-mm: the net takes {len(best.tiles)} pages of {paper}, of which "
-            f"{_MAX_PAGES} are allowed; print it smaller, or on larger --paper"
+            f"--size-mm: the net takes more than the {_MAX_PAGES} pages of {paper} "
+            "that are allowed; print it smaller, or on larger --paper"
         )
     return best
 
 
-def _tiled(net: Net, width: float, height: float) -> Sheets:
+def _tiled(net: Net, width: float, height: float) -> Sheets | None:
+    """Tile it; None if rows or columns, each with a part of it, exceed the limit."""
     across, high = width - 2 * _MARGIN, height - 2 * _MARGIN - _FOOTER
     bounds = net.bounds
-    columns, rows = (
-        max(1, math.ceil((size + 2 * _PAD - _OVERLAP) / (page - _OVERLAP)))
+    counts = [
+        (size + 2 * _PAD - _OVERLAP) / (page - _OVERLAP)
         for size, page in ((bounds.width, across), (bounds.height, high))
-    )
+    ]
+    if not all(count <= _MAX_PAGES for count in counts):
+        return None
+    columns, rows = (max(1, math.ceil(count)) for count in counts)
     step_x, step_y = across - _OVERLAP, high - _OVERLAP
     left = bounds.left + (bounds.width - columns * step_x - _OVERLAP) / 2
     top = bounds.top - (bounds.height - rows * step_y - _OVERLAP) / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -17,8 +18,9 @@ from mi_nerfattack.capture.mesh.cube_faces import flat_share
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
-from mi_nerfattack.io.video import write_video
+from mi_nerfattack.io.video import open_video, write_video
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
+from mi_nerfattack.robot import attacked
 from mi_nerfattack.robot.attacked import FACES, Views, read_box, seen_most
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -63,16 +65,17 @@ def test_the_face_that_is_seen_most():
         out = np.cross(down, across)
         eyes = [middle + 4 * turn @ out, middle + 3 * out + 0.3]
         poses = np.stack([look_at(eye, middle) for eye in eyes])
-        assert seen_most(box, Views(camera, mount, poses)) == face
+        assert seen_most(box, Views(camera, mount, poses, 0.1)) == face
     away = look_at(np.array([5.0, 0, 0]), np.array([9.0, 0, 0]))[None]
     with pytest.raises(InputError, match=r"1 views .* shows cube; choose with --face"):
-        seen_most(box, Views(camera, mount, away))
+        seen_most(box, Views(camera, mount, away, 0.1))
 
 
 def test_paper_and_screen(run, tmp_path, capsys):
     pdf, png, page = (tmp_path / name for name in ("a.pdf", "a.png", "a.html"))
-    options = ("--size-mm", 60, "--dpi", 40, "--face", "left", "--pixels", "640x360")
-    code, out, err = call(capsys, run, "--print", pdf, "--monitor", png, *options)
+    options = ("--size-mm", 60, "--face", "left", "--pixels", "640x360")
+    both = ("--print", pdf, "--dpi", 40, "--monitor", png)
+    code, out, err = call(capsys, run, *both, *options)
     assert code == 0, err
     assert "60.0 x 60.0 x 60.0 mm" in out and "left of ball" in out
     assert pdf.read_bytes().startswith(b"%PDF") and b"run" in pdf.read_bytes()
@@ -91,7 +94,10 @@ def test_refused(run, tmp_path, capsys):
         ((run,), "give -o, or, for a run folder, --print or --monitor"),
         ((field, "-o", tmp_path / "a.glb", "--dpi", 9), "are for --print and"),
         ((run, "--print", out, "-o", "a.glb"), "name their own files"),
-        ((run, "--print", out, "--pixels-per-m", 3), "are for -o"),
+        ((run, "--print", out, "--pixels-per-m", 3), "--pixels-per-m: is for -o"),
+        ((run, "--print", out, "--turn-deg", 3), "--turn-deg: is for -o"),
+        ((run, "--print", out, "--face", "top"), "--face: needs --monitor"),
+        ((run, "--monitor", tmp_path / "a.png", "--dpi", 9), "--dpi: needs --print"),
         ((run, "--print", tmp_path / "a.png"), "--print: "),
         ((run, "--monitor", tmp_path / "a.jpg"), "give FILE.png or FILE.html"),
         ((run, "--print", tmp_path / "no" / "a.pdf"), "does not exist"),
@@ -99,7 +105,8 @@ def test_refused(run, tmp_path, capsys):
         ((run, "--print", out, "--object", "car"), "--object: 'car'; "),
         ((run, "--monitor", tmp_path / "a.png", "--pixels", "9"), "two numbers"),
         ((run, "--monitor", tmp_path / "a.png", "--aspect", "9:0"), "--aspect"),
-        ((run, "--monitor", tmp_path / "a.png"), "at most 336.2 mm across fit"),
+        ((run, "--monitor", tmp_path / "a.png"), "give at most 336.2 mm"),
+        ((run, "--print", out, "--monitor", tmp_path / "a.png"), "at most 336.2 mm"),
     ):
         code, shown, error = call(capsys, *arguments)
         assert (code, shown) == (2, ""), error
@@ -109,6 +116,7 @@ def test_refused(run, tmp_path, capsys):
 
 def test_overlay_of_recordings(run, tmp_path, capsys):
     """In every frame, from folders and videos; poses and sizes that do not fit."""
+    pytest.importorskip("cv2")
     box, _ = read_box(run, texture_px=24)
     camera = from_fov(48, 32, 60.0)
     middle = box.pose.translation
@@ -140,12 +148,41 @@ def test_overlay_of_recordings(run, tmp_path, capsys):
         ("small", "b.mp4", "px"),
         ("drive", "b.avi", "give FILE.mp4 or a folder"),
         ("drive", "drive", "is the recording"),
+        ("drive", "drive/images", "is the recording or in it"),
+        ("drive.mp4", "drive.mp4", "is the recording"),
+        ("drive", "out", "is not an empty folder"),
+        ("drive", "drive.mp4/b", "drive.mp4"),
     ):
+        before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
         words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
         assert cli.main([str(word) for word in words]) == 2
         error = capsys.readouterr().err
         assert message in error and "Traceback" not in error, error
-        assert not (tmp_path / "b.mp4").exists()
+        after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+        assert after == before
+
+
+@pytest.mark.parametrize("period", [0.2, 1e-4])
+def test_folders_without_times_have_the_runs_period(
+    run, tmp_path, capsys, monkeypatch, period
+):
+    pytest.importorskip("cv2")
+    box, views = read_box(run, texture_px=24)
+    found = box, replace(views, period=period)
+    monkeypatch.setattr(attacked, "read_box", lambda *given: found)
+    pose = look_at(box.pose.translation + [-4, 0, 0.5], box.pose.translation)
+    frames = np.zeros((3, 32, 48, 3), np.uint8)
+    camera = from_fov(48, 32, 60.0)
+    write_transforms(tmp_path / "drive", frames, camera, np.stack([pose] * 3), {})
+    out = tmp_path / "a.mp4"
+    code = cli.main(["overlay", str(tmp_path / "drive"), str(run), "-o", str(out)])
+    if period < 1e-3:
+        assert code == 2 and "fps: " in capsys.readouterr().err
+        assert not out.exists()
+    else:
+        with open_video(out.read_bytes()) as container:
+            rate = container.streams.video[0].average_rate
+        assert rate == pytest.approx(1 / period)
 
 
 def test_what_is_no_box_is_refused(run, tmp_path, monkeypatch):

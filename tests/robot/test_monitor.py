@@ -61,8 +61,10 @@ def test_gamma_and_background():
 
 
 def test_refused():
-    with pytest.raises(InputError, match=r"at most 336\.\d mm across fit"):
+    with pytest.raises(InputError, match=r"at most 336\.\d mm"):
         screen_image(Screen(), FACE, (400.0, 400.0))
+    with pytest.raises(InputError, match=r"at most 672\.\d mm"):  # of a longer box
+        screen_image(Screen(), FACE, (400.0, 400.0), longest_mm=800.0)
     with pytest.raises(InputError, match="--background"):
         screen_image(Screen(), FACE, (100.0, 100.0), (0, 256, 0))
     for change in ({"width_px": 0}, {"diagonal_in": -1.0}, {"gamma": 0.0}):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from helpers.boxes import flat_images, made_box
@@ -15,6 +14,8 @@ from mi_nerfattack.render.camera.intrinsics import Camera, look_at
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.robot.attacked import FACES
 from mi_nerfattack.robot.overlay import Overlay, green_share
+
+cv2 = pytest.importorskip("cv2")
 
 PINHOLE = Camera(183, 94, 90.0, 86.0, 90.0, 48.0)
 LENS = Camera(183, 94, 90.0, 86.0, 90.0, 48.0, -0.28, 0.07, 0.002, -0.003)

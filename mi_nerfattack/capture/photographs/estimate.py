@@ -108,8 +108,7 @@ def estimate_poses(
     level on average are needed for that, or markers that lie flat. The origin is the
     mean of the cameras, with flat markers on the ground below. The unit is arbitrary,
     as photographs do not tell it, unless an option does; the JSON file's `units` says
-    which. Photographs that their EXIF data turn are
-    stored upright.
+    which. Photographs that their EXIF data turn are stored upright.
 
     Args:
         photographs: folder of at least 3 JPEG, PNG or WebP images; at least 3 of each
@@ -129,7 +128,7 @@ def estimate_poses(
     options = options or PoseOptions()
     root = Path(photographs)
     names = list_photographs(root)
-    _check_output(Path(output))
+    files.check_folder(output)
     with tempfile.TemporaryDirectory() as folder:
         staged, work = Path(folder) / "images", Path(folder) / "work"
         staged.mkdir()
@@ -149,14 +148,6 @@ def estimate_poses(
         told = options.markers or options.distance or options.metres_per_unit
         found, scale = align(found, staged, told, progress)
         return _write(Path(output), staged, found, names, scale)
-
-
-def _check_output(output: Path) -> None:
-    """Check that a folder can be written to, without making it."""
-    existing = output.absolute()
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
-    files.check_writable(existing / "transforms.json")
 
 
 def _write(

@@ -63,18 +63,28 @@ class BoxOptions:
             if path is not None:
                 files.check_writable(path)
         box, views = read_box(run, self.object)
-        told = []
-        if self.print is not None:
-            told.append(self._print(self.print, box, on_page))
+        show = None
         if self.monitor is not None:
             face = self.face or seen_most(box, views)
-            told.append(self._show(self.monitor, box, face, screen))
+            show = self._shown(self.monitor, box, face, screen)
+        told = []
+        if self.print is not None:  # checks by itself before it writes
+            told.append(self._print(self.print, box, on_page))
+        if show is not None:
+            told.append(show())
         return told
 
     def _checked(self) -> Screen:
         """Refuse wrong names and numbers before anything is read."""
         from mi_nerfattack.robot.monitor import Screen
 
+        usual = BoxOptions()
+        for needed, names in _NEEDED.items():
+            for name in names:
+                given = getattr(self, name) != getattr(usual, name)
+                if given and getattr(self, needed) is None:
+                    option = name.replace("_", "-")
+                    raise InputError(f"--{option}: needs --{needed}")
         if self.print is not None and self.print.suffix.lower() != ".pdf":
             raise InputError(f"--print: {self.print}; give FILE.pdf")
         if self.monitor is not None and self.monitor.suffix.lower() not in _SHOWN:
@@ -94,26 +104,39 @@ class BoxOptions:
         pages = "page" if count == 1 else "pages"
         return f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
 
-    def _show(self, path: Path, box: AttackedBox, face: str, screen: Screen) -> str:
+    def _shown(
+        self, path: Path, box: AttackedBox, face: str, screen: Screen
+    ) -> Callable[[], str]:
+        """Make the picture; return what writes it and says so."""
         from mi_nerfattack.io import files
         from mi_nerfattack.robot.monitor import screen_image, screen_page
         from mi_nerfattack.robot.net import Net
 
-        spot = Net(box.edges_mm(self.size_mm)).faces[face]
+        edges = box.edges_mm(self.size_mm)
+        spot = Net(edges).faces[face]
         size = spot.width, spot.height
-        image = screen_image(screen, box.images[face], size, self.background)
-        if path.suffix.lower() == ".png":
-            files.write_image(path, image)
-        else:
-            about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
-            files.write_text(path, screen_page(image, about))
-        return (
-            f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm on "
-            f"{self.pixels} pixels, {25.4 * screen.px_per_mm[0]:.1f} an inch"
-        )
+        longest = float(edges.max())
+        image = screen_image(screen, box.images[face], size, self.background, longest)
+
+        def write() -> str:
+            if path.suffix.lower() == ".png":
+                files.write_image(path, image)
+            else:
+                about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
+                files.write_text(path, screen_page(image, about))
+            return (
+                f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm "
+                f"on {self.pixels} pixels, {25.4 * screen.px_per_mm[0]:.1f} an inch"
+            )
+
+        return write
 
 
 _SHOWN = (".png", ".html")
+_NEEDED = {
+    "print": ("paper", "dpi"),
+    "monitor": ("face", "diagonal_in", "aspect", "pixels", "background", "gamma"),
+}
 
 
 def _pair(name: str, text: str, mark: str) -> tuple[float, float]:

@@ -84,8 +84,9 @@ def _read_json(path: Path, image_shape: tuple[int, ...] | None) -> PoseTable:
     table, frames = read_table(path)
     if table.get("units") == "arbitrary":
         raise InputError(
-            f"{path}: units: 'arbitrary'; a drive is replayed in metres: measure a "
-            "length in it and run 'mi-nerfattack capture' with --metres-per-unit"
+            f"{path}: units: 'arbitrary'; a drive is replayed in metres: tell "
+            "'mi-nerfattack capture' the scale by --marker-m, --distance or "
+            "--metres-per-unit"
         )
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):

@@ -165,7 +165,18 @@ class TestCommand:
         told = self.told(capsys, "walk.mp4", "-o", out, "--views", "8")
         assert "--views: not for walk.mp4, which is no scene" in told
         assert "--routes: missing" in self.told(capsys, "a.xml", "-o", out)
+        told = self.told(capsys, str(tmp_path), "-o", out, "--frames", "9")
+        assert "--frames: not for" in told and "no video" in told
+        told = self.told(capsys, "walk.mp4", "-o", out, "--marker-family", "4x4_50")
+        assert "--marker-family: needs" in told
         assert not (tmp_path / "out").exists()
+
+    def test_output_is_checked_before_the_film_is_read(self, tmp_path, capsys):
+        (tmp_path / "walk.mp4").write_bytes(b"no film")
+        (tmp_path / "file").write_text("")
+        out = str(tmp_path / "file")
+        told = self.told(capsys, str(tmp_path / "walk.mp4"), "-o", out)
+        assert "file" in told and "walk.mp4" not in told
 
     @pytest.mark.slow
     def test_a_film_is_placed(self, tmp_path, capsys):
