@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -32,20 +31,25 @@ class BenchTable2:
         from bench.table2.page import page
         from bench.table2.rows import read_retrained
         from mi_nerfattack.experiment.sweep.summary import SUMMARY
-        from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
+        from mi_nerfattack.experiment.sweep.table import (
+            MAX_TABLE_BYTES,
+            RESULTS,
+            read_table,
+        )
         from mi_nerfattack.io import files
 
         summary = files.read_json(self.folder / SUMMARY)
         rows = read_table(self.folder / RESULTS)
         retrained, words = {}, ["python -m bench table2 FOLDER -o docs/table2"]
         if self.retrained is not None:
-            retrained = read_retrained(self.retrained)
+            retrained = read_retrained(self.retrained, {row["cell"] for row in rows})
             words.append("--retrained DATA")
         text = page(summary, rows, retrained, results.stamp({}, words))
         files.make_folder(self.output)
         if self.output.resolve() != self.folder.resolve():
             for name in (RESULTS, SUMMARY):
-                shutil.copyfile(self.folder / name, self.output / name)
+                raw = files.read_bytes(self.folder / name, MAX_TABLE_BYTES)
+                files.write_bytes(self.output / name, raw)
         files.write_text(self.output / "README.md", text)
         print(f"{self.output / 'README.md'}: written")
         return 0

@@ -111,16 +111,26 @@ def _flags(summary: Figures) -> str:
 
 
 def _retraining(retrained: Table) -> str:
-    stages = [f"{s} {c}" for c in (NO_OBJECT, ATTACK) for s in (BEFORE, AFTER)]
+    clean, attacked = (
+        [f"{stage} {case}" for stage in (BEFORE, AFTER)] for case in (NO_OBJECT, ATTACK)
+    )
+    stages = clean + attacked
     rows = (
-        (name, route or "all", *(cell(retrained[route, name, case]) for case in stages))
+        (
+            *(name, route or "all"),
+            *(
+                f"{retrained[route, name, case]['cross_track_mean_m']:.3f}"
+                for case in clean
+            ),
+            *(cell(retrained[route, name, case]) for case in attacked),
+        )
         for name in NAMES.values()
         for route in (*PAPER, None)
         if (route, name, stages[0]) in retrained
     )
     text = (
         "Drives of both policies from the same starts, which no run has seen. Those "
-        "without\nobjects are the same for all attacks of a route."
+        "without\nobjects are the same for all attacks of a route: the mean alone."
     )
     header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
     return _section("Before and after retraining", text, header, rows)
@@ -147,7 +157,7 @@ def _provenance(
         made["command"],
         "mi-nerfattack replay docs/table2 --rows 10  # any row comes back",
         "```\n",
-        f"- {made['date']}; {machine}",
+        f"- page written on {made['date']}; {machine}",
         *(f"- attacked with: {text}" for text in told),
         f"- {done} of {len(summary['attacks'])} attacks converged",
         *(f"- {key}: SHA-256 {digest}" for digest, key in contents.items()),

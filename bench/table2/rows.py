@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,23 +64,30 @@ Figures = Mapping[str, Any]
 Table = dict[tuple[str | None, str, str], Figures]
 
 
-def read_retrained(data: Path) -> Table:
+def read_retrained(data: Path, cells: Collection[str]) -> Table:
     """Read what `mi-nerfattack retrain` drove past the attacks that it trained on.
 
     Args:
         data: its ``--data``.
+        cells: of the sweep, whose attacks they must be.
 
     Returns:
         figures of `over_attacks` of drives without objects and past attacks, before
         and after; cases are ``before no_object``, ``after attack`` and so on.
 
     Raises:
-        InputError: a file is missing or damaged.
+        InputError: a file is missing or damaged, or an attack is of no such cell.
     """
     found: Table = {}
     for stage in (BEFORE, AFTER):
-        document = files.read_json(data / f"{OLD}_{stage}" / "transfer.json")
+        path = data / f"{OLD}_{stage}" / "transfer.json"
+        document = files.read_json(path)
         routes = {about["label"]: about["route"] for about in document["attacks"]}
+        if others := sorted(routes.keys() - cells):
+            raise InputError(
+                f"{path}: {', '.join(others)}: no cells of the sweep; give the --data "
+                "of a retraining on FOLDER/cells/*"
+            )
         rows: dict[tuple[str | None, str, str], list[Figures]] = {}
         for row in document["rows"]:
             for route in (routes[row["attack"]], None):
@@ -224,11 +231,12 @@ def aim_rows(
             if labels != (environment, GRADIENT, RANDOM):
                 continue
             ratio, where = row["effect"]["ratio"], row["route"] or "all routes"
+            told = "" if ratio is None else f"{ratio:.2f}"
             yield (
                 f"{where}: mean error at least {least:g} times that of random, "
                 f"{environment}",
-                f"{ratio:.2f}{_interval(row['effect']['ratio_ci95'])}",
-                _met(ratio >= least),
+                told + _interval(row["effect"]["ratio_ci95"]),
+                _met(ratio is not None and ratio >= least),
             )
     attack = table[None, DEPLOYMENT, ATTACK]
     half = 2 * attack["attacks_out"] >= attack["attacks"]

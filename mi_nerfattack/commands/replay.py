@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +67,7 @@ class Replay:
             raise InputError(f"--cores: {self.cores}; more than 0")
         variant.ensure()
         wanted = read_replay(self.folder, self.row, self.rows, self.seed)
-        with self._place() as place:
+        with self._place({cell.id for cell in wanted.cells}) as place:
             output = Path(place)
             if self.drives_only:
                 take_checkpoints(wanted, self.folder, output)
@@ -80,14 +80,22 @@ class Replay:
             print(*sentences(found), sep="\n")
         return int(bool(errors) or self._is_exceeded(found))
 
-    def _place(self) -> AbstractContextManager[str | Path]:
+    def _place(self, wanted: Collection[str]) -> AbstractContextManager[str | Path]:
         """Return the folder of the repetition, which may be for a while."""
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
 
         if self.output is None:
             return tempfile.TemporaryDirectory()
         if self.output.resolve() == self.folder.resolve():
             raise InputError(f"{self.output}: the sweep's own folder; choose another")
+        if (path := self.output / RESULTS).exists():
+            held = {row["cell"] for row in read_table(path, ["cell"])}
+            if others := held.difference(wanted):
+                raise InputError(
+                    f"{path}: has rows of other cells, such as {min(others)}, which "
+                    "would be lost; choose another folder"
+                )
         return nullcontext(self.output)
 
     def _workers(self) -> Processes:

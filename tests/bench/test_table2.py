@@ -10,6 +10,7 @@ from bench.table2.page import page
 from bench.table2.rows import read_retrained
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.summary import summarise
+from mi_nerfattack.rollout.drive import RANDOM
 
 #: Mean errors by environment and route: without objects, past random looks, and past
 #: the attacks of two seeds.
@@ -50,8 +51,8 @@ def write_retrained(folder):
             case: {"cross_track_mean_m": value, "wheel_out_s": 0.0}
             for case, value in zip(("no_object", "attack"), values, strict=True)
         }
-        row = {"attack": "a", "environment": "mitsuba", "cases": cases}
-        document = {"attacks": [{"label": "a", "route": "right"}], "rows": [row]}
+        row = {"attack": "right-0", "environment": "mitsuba", "cases": cases}
+        document = {"attacks": [{"label": "right-0", "route": "right"}], "rows": [row]}
         (folder / f"old_{stage}").mkdir()
         path = folder / f"old_{stage}" / "transfer.json"
         path.write_text(json.dumps(document))
@@ -63,7 +64,7 @@ def lines(text, begin):
 
 
 def test_rows_by_hand(tmp_path):
-    retrained = read_retrained(write_retrained(tmp_path))
+    retrained = read_retrained(write_retrained(tmp_path), {"right-0", "right-1"})
     text = page(summarise(rows()), rows(), retrained, MADE)
     # 0.3 and 0.5 m; Wilson's intervals of 0 and 1 of 2; deployment comes first
     deployed, driven, paper, *_ = lines(text, "right")
@@ -75,6 +76,12 @@ def test_rows_by_hand(tmp_path):
     assert "| 2101 ± 75 (+1.502 m) | 1307 (+0.178 m) |" in paper
     ours = [line for line in lines(text, "") if "ours, deployment" in line]
     assert "| 1320 ± 0 (0.200 m) | 1500 ± 85 (0.500 m) | 1254 (0.090 m) |" in ours[1]
+    # without objects there is one drive, whatever the attack
+    driven, _ = lines(text, "mitsuba")
+    assert driven == (
+        "| mitsuba | right | 0.080 | 0.100 | 0.400 (1); 0/1 out [0, 79] "
+        "| 0.090 (1); 0/1 out [0, 79] |"
+    )
     # in all 0.4 m, of which 0.2 m by chance; 0.01 m more without objects
     aims = [line for line in text.splitlines() if line.endswith("met** |")]
     assert aims.pop(0).startswith("| straight: mean error at least 2 times")
@@ -101,6 +108,22 @@ def test_flags_and_failures_are_told():
     assert "- **noise larger:** the effect of the attack" in text
     assert "- **failed:** left-0: no room" in text
     assert "after retraining, " not in text
+
+
+def test_without_chance_there_is_no_ratio():
+    """Where random looks have no error, no ratio is told, and none is met."""
+    some = [
+        row | {"cross_track_mean_m": 0.0} for row in rows() if row["case"] == RANDOM
+    ]
+    some += [row for row in rows() if row["case"] != RANDOM]
+    text = page(summarise(some), some, {}, MADE)
+    aims = [line for line in text.splitlines() if "times that of random" in line]
+    assert len(aims) == 6 and all(line.endswith("|  | **not met** |") for line in aims)
+
+
+def test_other_retrainings_are_refused(tmp_path):
+    with pytest.raises(InputError, match="right-0: no cells of the sweep; give"):
+        read_retrained(write_retrained(tmp_path), {"left-0"})
 
 
 def test_other_sweeps_are_refused():

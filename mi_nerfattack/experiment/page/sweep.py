@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,8 @@ def read_sweep(
     rows = read_table(folder / RESULTS)
     cells = folder / "cells"
     known = {row["cell"] for row in rows}
-    present = {name for name in sorted(known) if (cells / name / METRICS).is_file()}
+    done = {row["cell"] for row in rows if row["status"] == "complete"}
+    present = {name for name in sorted(done) if (cells / name / METRICS).is_file()}
     notes = []
     begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
     if begun:
@@ -62,7 +64,7 @@ def read_sweep(
         summarise(rows, read_attacks(folder, rows)),
         attacks,
         _shown(cells, [row for row in attacks if row["cell"] in present], on_run),
-        _pictures(cells, rows, present, scratch, notes),
+        _pictures(cells, rows, present, Path(tempfile.mkdtemp(dir=scratch)), notes),
         notes,
     )
 
@@ -139,7 +141,7 @@ def _pictures(
             own[row["cell"]] = cells / row["cell"]
     found = {}
     for name, folders in groups.items():
-        path = scratch / f"above_{cells.parent.name}_{len(found)}.png"
+        path = scratch / f"above_{len(found)}.png"
         try:
             draw_above(path, list(folders.values()))
         except InputError as err:  # scenarios name files of the machine that made them

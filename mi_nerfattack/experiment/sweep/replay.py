@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,15 +77,16 @@ def take_checkpoints(replay: Replay, folder: Path, output: Path) -> None:
         InputError: a cell's checkpoint is missing, or cannot be copied.
     """
     for cell in replay.cells:
-        there, here = folder_of(folder, cell) / CHECKPOINT, folder_of(output, cell)
+        there, own = folder_of(folder, cell) / CHECKPOINT, folder_of(output, cell)
+        here = own / CHECKPOINT
         if not there.exists():
             raise InputError(
                 f"{there}: there is none; without --drives-only, the attack is repeated"
             )
         if not here.exists():
-            files.make_folder(here)
-            files.write_text(here / SCENARIO, cell.text)
-            shutil.copyfile(there, here / CHECKPOINT)
+            files.make_folder(own)
+            files.write_text(own / SCENARIO, cell.text)
+            files.write_bytes(here, files.read_bytes(there, files.MAX_TENSOR_BYTES))
 
 
 def compare_rows(

@@ -226,8 +226,8 @@ def _black_box(attacks: Iterable[Mapping[str, Any]]) -> Iterator[str]:
                 told.setdefault(key, []).append(list(black_box_better(*curves)))
     for (route, method), flags in told.items():
         if better := list(chain.from_iterable(flags)):
-            share = f"{len(better)} of {len(flags)}"
-            yield f"{better[0]}; {method} is better at {share} places of {route}"
+            share = f"{len(better)} of {len(flags)} comparisons on {route}"
+            yield f"{better[0]}; {method} is better in {share}"
 
 
 def _noise(comparisons: Iterable[Mapping[str, Any]]) -> Iterator[str]:

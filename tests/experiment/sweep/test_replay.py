@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from helpers.page_reader import PageReader
@@ -10,6 +11,8 @@ from helpers.page_reader import PageReader
 from mi_nerfattack import cli
 from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.page import sweep as page_sweep
+from mi_nerfattack.experiment.page.folders import read_folders
 from mi_nerfattack.experiment.sweep.cell import folder_of
 from mi_nerfattack.experiment.sweep.grid import load_cells
 from mi_nerfattack.experiment.sweep.replay import (
@@ -96,6 +99,7 @@ def test_rows_come_back_to_the_bit(swept, command, tmp_path):
 def test_drives_alone_come_back(swept, command, tmp_path):
     folder, _, cell = swept
     out = tmp_path / "out"
+    folder_of(out, cell).mkdir(parents=True)  # killed before the checkpoint was there
     code, told = command(folder, "--rows", 3, "--drives-only", "--json", "-o", out)
     found = json.loads(told)
     assert code == 0 and len(found["rows"]) == 3
@@ -130,6 +134,21 @@ def test_the_sweep_on_one_page(swept, tmp_path):
     assert f"2 of 2 cells have no folder in {copy / 'cells'}" in reader.text
 
 
+def test_sweeps_of_one_name_on_a_page(swept, tmp_path, monkeypatch):
+    """Each has plots of its own; a failed cell has none, whatever it left."""
+    folder, _, cell = swept
+    monkeypatch.setattr(page_sweep, "_shown", lambda *_: [])  # no turning objects
+    paths = [tmp_path / name / "sweep" for name in "abc"]
+    for path in paths:
+        shutil.copytree(folder, path)
+    failed = {"status": "failed", "error": "no room", "cell": cell.id}
+    write_table(paths[2] / "results.parquet", [failed])
+    one, two, three = read_folders(paths, tmp_path).sweeps
+    files_of = [set(part.pictures.values()) for part in (one, two)]
+    assert len(files_of[0] | files_of[1]) == 2
+    assert not three.pictures and any("or failed" in note for note in three.notes)
+
+
 def test_what_differs_is_told(swept):
     """Versions, drives that there are none of, failures; made by hand."""
     folder, copy, cell = swept
@@ -160,6 +179,8 @@ def test_rows_that_cannot_be_repeated(swept, command, scenario_folder, tmp_path)
         read_replay(copy, [], 99)
     assert command(copy)[0] == 2
     assert command(folder, 0, "-o", folder)[0] == 2
+    with pytest.raises(InputError, match="rows of other cells, such as other"):
+        Replay(folder, ("0",), output=copy).run()
     assert command(copy, 0, "--drives-only", "-o", tmp_path / "out")[0] == 2
     route = scenario_folder / "routes.json"
     text = route.read_text()

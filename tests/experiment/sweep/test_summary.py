@@ -150,7 +150,7 @@ def test_flags_of_the_sweep():
         "black box better: after 30 frames, blocks (right-blocks-0) had come to an "
         "objective of -6, the gradient to -5 "
     )
-    assert better.endswith("blocks is better at 1 of 2 places of right")
+    assert better.endswith("blocks is better in 1 of 2 comparisons on right")
     # by blocks: 0.3 less 0.3 and 0.5 less 0.1, on average less than they differ
     assert (
         noise.startswith("noise larger: ") and "right blocks 100 (m), is 0.2" in noise
