@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.options import given
 from mi_nerfattack.errors import InputError
 
 _SHOWN = 10  # photographs to take again; capture.json lists all
@@ -131,9 +132,8 @@ class PhotographArguments:
             seed,
         )
         if not is_video:
-            for name in ("frames", "baseline"):
-                if self._is_given(name):
-                    raise InputError(f"--{name}: not for {source}, which is no video")
+            if option := given(self, ("frames", "baseline")):
+                raise InputError(f"{option}: not for {source}, which is no video")
             return estimate_poses(source, output, options, show)
         files.check_folder(output)
         with tempfile.TemporaryDirectory() as folder:
@@ -145,15 +145,10 @@ class PhotographArguments:
         from mi_nerfattack.capture.photographs.markers import Markers
 
         if self.marker_m is None:
-            if self.markers_flat:
-                raise InputError("--markers-flat: needs the markers' edge, --marker-m")
-            if self._is_given("marker_family"):
-                raise InputError("--marker-family: needs the markers' edge, --marker-m")
+            if option := given(self, ("markers_flat", "marker_family")):
+                raise InputError(f"{option}: needs the markers' edge, --marker-m")
             return None
         return Markers(self.marker_m, self.marker_family, self.markers_flat)
-
-    def _is_given(self, name: str) -> bool:
-        return getattr(self, name) != getattr(PhotographArguments(), name)
 
     def tell(self, result: PoseEstimate) -> None:
         """Print what was found, and draw the cameras."""
@@ -228,12 +223,11 @@ class Capture:
 
         is_scene = self.source.suffix.lower() == ".xml"
         other = self.photographs if is_scene else self.scene
-        for name, value in vars(other).items():
-            if value != getattr(type(other)(), name):
-                raise InputError(
-                    f"--{name.replace('_', '-')}: not for {self.source}, which is "
-                    f"{'a scene' if is_scene else 'no scene (.xml)'}; leave it out"
-                )
+        if option := given(other, vars(other)):
+            kind = "a scene" if is_scene else "no scene (.xml)"
+            raise InputError(
+                f"{option}: not for {self.source}, which is {kind}; leave it out"
+            )
         with StageBars() as bars:
             if is_scene:
                 path = self.scene.write(self.source, self.output, self.seed, bars)

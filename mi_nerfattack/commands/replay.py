@@ -8,12 +8,9 @@ from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
-
-if TYPE_CHECKING:
-    from mi_nerfattack.system.workers import Processes
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,11 @@ class Replay:
     def run(self) -> int:
         """Read, repeat, compare and tell."""
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.cells import do_cells
+        from mi_nerfattack.commands.shared.cells import (
+            cells_at_a_time,
+            do_cells,
+        )
+        from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.replay import (
             compare_rows,
@@ -60,18 +61,19 @@ class Replay:
             take_checkpoints,
         )
         from mi_nerfattack.experiment.sweep.table import read_table
+        from mi_nerfattack.system.workers import Processes
 
         if self.rows < 0 or not (self.row or self.rows):
             raise InputError("replay: no row; give ROW, or --rows 1 or more")
-        if not self.cores > 0:
-            raise InputError(f"--cores: {self.cores}; more than 0")
+        check_positive(self, "cores")
+        workers = Processes(cells_at_a_time(self.workers, self.cores), pieces_each=1)
         variant.ensure()
         wanted = read_replay(self.folder, self.row, self.rows, self.seed)
         with self._place({cell.id for cell in wanted.cells}) as place:
             output = Path(place)
             if self.drives_only:
                 take_checkpoints(wanted, self.folder, output)
-            sweep = do_cells(wanted.cells, output, self.cores, self._workers())
+            sweep = do_cells(wanted.cells, output, self.cores, workers)
             errors = {wanted.cells[i].id: told for i, told in sweep.errors.items()}
             found = compare_rows(wanted, read_table(sweep.table), errors)
         if self.json:
@@ -97,14 +99,6 @@ class Replay:
                     "would be lost; choose another folder"
                 )
         return nullcontext(self.output)
-
-    def _workers(self) -> Processes:
-        from mi_nerfattack.system.workers import Processes, available_cores
-
-        count = self.workers
-        if count is None:
-            count = max(1, available_cores() // self.cores)
-        return Processes(count, pieces_each=1)
 
     def _is_exceeded(self, found: Mapping[str, Any]) -> bool:
         """Whether a row differs by more than was allowed, or is not there."""

@@ -56,26 +56,22 @@ class Sweep:
     def run(self) -> int:
         """Check the grid, or do its cells."""
         from mi_nerfattack import variant
-        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.experiment.sweep.grid import load_cells
 
-        for name in ("cores", "memory_gb", "minutes"):
-            if not getattr(self, name) > 0:
-                option = name.replace("_", "-")
-                raise InputError(f"--{option}: {getattr(self, name)}; more than 0")
+        check_positive(self, "cores", "memory_gb", "minutes")
         workers = self._workers()
         variant.ensure()
         cells = load_cells(self.grid)
         return self._check(cells) if self.check else self._run(cells, workers)
 
     def _count(self) -> int:
-        from mi_nerfattack.system.workers import MOST, available_cores
+        from mi_nerfattack.commands.shared.cells import cells_at_a_time
+        from mi_nerfattack.system.workers import MOST
 
-        if self.workers is not None:
-            return self.workers
-        if self.submitit is not None:
+        if self.workers is None and self.submitit is not None:
             return MOST
-        return max(1, available_cores() // self.cores)
+        return cells_at_a_time(self.workers, self.cores)
 
     def _workers(self) -> AbstractWorkers:
         from mi_nerfattack.errors import InputError

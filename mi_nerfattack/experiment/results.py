@@ -16,7 +16,7 @@ from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.pictures.write import write_images
 from mi_nerfattack.experiment.replayed import control_changes, write_control_changes
-from mi_nerfattack.experiment.run_folder import object_path
+from mi_nerfattack.experiment.run_folder import METRICS, object_path
 from mi_nerfattack.experiment.stages import OnProgress
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.io import files
@@ -51,7 +51,7 @@ def write_results(
         the document that ``metrics.json`` holds.
     """
     history = [asdict(record) for record in done.attack.history]
-    path = output / "metrics.json"
+    path = output / METRICS
     _write_tables(output, done, history)
     document = _describe(done, effort)
     files.write_json(path, document)

@@ -16,6 +16,7 @@ from mi_nerfattack.capture.mesh.cube_faces import (
     render_faces,
 )
 from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
+from mi_nerfattack.deploy.roadside.view import project
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import DRIVES, object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
@@ -179,7 +180,7 @@ def seen_most(box: AttackedBox, views: Views) -> str:
         area = np.cross(down, across) / len(points)  # outward
         for matrix in matrices:
             seen = (points - matrix[:3, 3]) @ matrix[:3, :3]
-            inside = _in_image(views.camera, seen)
+            _, inside = project(views.camera, seen)
             away = matrix[:3, 3] - points[inside]
             facing = np.maximum(away @ area, 0)
             angles[face] += float((facing / np.linalg.norm(away, axis=1) ** 3).sum())
@@ -190,16 +191,6 @@ def seen_most(box: AttackedBox, views: Views) -> str:
             f"{box.name}; choose with --face {'|'.join(FACES)}"
         )
     return best
-
-
-def _in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Tell which points (n, 3) of the camera's frame are in view, (n,)."""
-    x, y, z = points.T
-    ahead = np.maximum(z, 1e-9)
-    column = camera.cx + camera.fx * x / ahead
-    row = camera.cy + camera.fy * y / ahead
-    within = (column >= 0) & (column < camera.width) & (row >= 0)
-    return (z > 0) & within & (row < camera.height)
 
 
 def _placed(found: FoundAttack) -> tuple[list[Pose], Views]:

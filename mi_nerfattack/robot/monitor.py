@@ -14,8 +14,8 @@ from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.capture.posed_images import resize_area
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.report.pages.elements import render
+from mi_nerfattack.robot.net import MM
 
-_MM = 25.4  # in an inch
 _MAX_PX = 16384
 
 
@@ -54,7 +54,7 @@ class Screen:
     @property
     def size_mm(self) -> tuple[float, float]:
         """Width and height."""
-        height = self.diagonal_in * _MM / math.hypot(self.aspect, 1)
+        height = self.diagonal_in * MM / math.hypot(self.aspect, 1)
         return self.aspect * height, height
 
     @property

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+#: In an inch.
+MM = 25.4
 _TAB_MM = 15.0
 _TAB_SHARE = 0.2  # of the shortest edge, at most
 
@@ -18,6 +21,12 @@ class Rectangle:
     bottom: float
     width: float
     height: float
+
+    @classmethod
+    def around(cls, points: Sequence[tuple[float, float]]) -> Rectangle:
+        """Return the smallest one that holds all points."""
+        low, high = np.min(points, 0).tolist(), np.max(points, 0).tolist()
+        return cls(low[0], low[1], high[0] - low[0], high[1] - low[1])
 
     @property
     def right(self) -> float:
@@ -106,9 +115,7 @@ class Net:
     @property
     def bounds(self) -> Rectangle:
         """The box around faces and tabs."""
-        points = np.array([point for line in self.cuts for point in line])
-        low, high = points.min(0).tolist(), points.max(0).tolist()
-        return Rectangle(low[0], low[1], high[0] - low[0], high[1] - low[1])
+        return Rectangle.around([point for line in self.cuts for point in line])
 
 
 def _tab(

@@ -20,10 +20,9 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.report.plots.charts import RC
 from mi_nerfattack.robot.attacked import AttackedBox
-from mi_nerfattack.robot.net import Net, Rectangle
+from mi_nerfattack.robot.net import MM, Net, Rectangle
 
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MM = 25.4  # in an inch
 _MARGIN = 10.0  # what printers leave white, millimetres
 _FOOTER = 14.0  # of each page: ruler and small print
 _OVERLAP = 10.0  # of neighbouring pages
@@ -107,14 +106,9 @@ def _tiled(net: Net, width: float, height: float) -> Sheets | None:
         for r in range(rows)
         for c in range(columns)
     ]
-    drawn = [*net.faces.values(), *(_bounds(tab.outline) for tab in net.tabs)]
+    drawn = [*net.faces.values(), *(Rectangle.around(tab.outline) for tab in net.tabs)]
     used = [t for t in tiles if any(part.common(t.part) for part in drawn)]
     return Sheets(width, height, columns, rows, tuple(used))
-
-
-def _bounds(points: tuple[tuple[float, float], ...]) -> Rectangle:
-    low, high = np.min(points, 0).tolist(), np.max(points, 0).tolist()
-    return Rectangle(low[0], low[1], high[0] - low[0], high[1] - low[1])
 
 
 def write_net(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from mi_nerfattack.commands.shared.options import given
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,13 +79,9 @@ class BoxOptions:
         """Refuse wrong names and numbers before anything is read."""
         from mi_nerfattack.robot.monitor import Screen
 
-        usual = BoxOptions()
         for needed, names in _NEEDED.items():
-            for name in names:
-                given = getattr(self, name) != getattr(usual, name)
-                if given and getattr(self, needed) is None:
-                    option = name.replace("_", "-")
-                    raise InputError(f"--{option}: needs --{needed}")
+            if getattr(self, needed) is None and (option := given(self, names)):
+                raise InputError(f"{option}: needs --{needed}")
         if self.print is not None and self.print.suffix.lower() != ".pdf":
             raise InputError(f"--print: {self.print}; give FILE.pdf")
         if self.monitor is not None and self.monitor.suffix.lower() not in _SHOWN:
@@ -110,7 +107,7 @@ class BoxOptions:
         """Make the picture; return what writes it and says so."""
         from mi_nerfattack.io import files
         from mi_nerfattack.robot.monitor import screen_image, screen_page
-        from mi_nerfattack.robot.net import Net
+        from mi_nerfattack.robot.net import MM, Net
 
         edges = box.edges_mm(self.size_mm)
         spot = Net(edges).faces[face]
@@ -126,7 +123,7 @@ class BoxOptions:
                 files.write_text(path, screen_page(image, about))
             return (
                 f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm "
-                f"on {self.pixels} pixels, {25.4 * screen.px_per_mm[0]:.1f} an inch"
+                f"on {self.pixels} pixels, {MM * screen.px_per_mm[0]:.1f} an inch"
             )
 
         return write

@@ -1,4 +1,4 @@
-"""The cells of a sweep done, with a bar."""
+"""The cells of a sweep: how many at a time, and done with a bar."""
 
 from __future__ import annotations
 
@@ -10,6 +10,13 @@ if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
     from mi_nerfattack.experiment.sweep.sweep import Sweep
     from mi_nerfattack.system.workers import AbstractWorkers
+
+
+def cells_at_a_time(workers: int | None, cores: int) -> int:
+    """Return `workers`, by default how many of so many cores have room here."""
+    from mi_nerfattack.system.workers import available_cores
+
+    return max(1, available_cores() // cores) if workers is None else workers
 
 
 def do_cells(

@@ -11,12 +11,11 @@ from mi_nerfattack.experiment.kept_drives import read_drive
 from mi_nerfattack.experiment.run_folder import DRIVES, SCENARIO, read_finished
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.report.pages.parts import SHOWN_CASES
 from mi_nerfattack.report.plots.drives import overhead
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM, Drive, Lane
+from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.scenario.world import driven_route, object_footprints
-
-CASES = (NO_OBJECT, RANDOM, ATTACK)
 
 
 def draw_above(path: Path, folders: Sequence[Path]) -> None:
@@ -44,7 +43,7 @@ def draw_above(path: Path, folders: Sequence[Path]) -> None:
         closed = {environment for cases in routes for environment in cases}
         for file in sorted((folder / DRIVES).glob("*_0000.safetensors")):
             drive = read_drive(file, route.name)
-            if drive.case in CASES and drive.environment in closed:
+            if drive.case in SHOWN_CASES and drive.environment in closed:
                 drives.append(drive)
     if not drives:
         raise InputError(f"{folders[0] / DRIVES}: no drives; they were removed")

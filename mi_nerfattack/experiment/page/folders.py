@@ -9,6 +9,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.page.run import read_run
 from mi_nerfattack.experiment.page.sweep import read_sweep
 from mi_nerfattack.experiment.run_folder import SCENARIO, folder_labels
+from mi_nerfattack.experiment.sweep.cell import CELLS
 from mi_nerfattack.experiment.sweep.table import RESULTS
 from mi_nerfattack.experiment.transfer.run import DOCUMENT, QUALITY
 from mi_nerfattack.io import files
@@ -51,7 +52,7 @@ def read_folders(
         elif (path / SCENARIO).is_file():
             on_run(label)
             runs.append(read_run(path, label))
-        elif (path / "cells").is_dir():
+        elif (path / CELLS).is_dir():
             raise InputError(
                 f"{path}: is of a sweep of which no cell is done, {RESULTS} is "
                 "missing; the sweep's command goes on with it"

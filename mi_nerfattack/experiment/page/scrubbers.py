@@ -13,12 +13,11 @@ import numpy as np
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io import files
+from mi_nerfattack.report.pages.parts import SHOWN_CASES
 from mi_nerfattack.report.pages.scrubber import Pane, Scrubber, make_pane
 from mi_nerfattack.report.plots.around import turntable
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
+from mi_nerfattack.rollout.drive import ATTACK
 
-#: Beside each other.
-CASES = (NO_OBJECT, RANDOM, ATTACK)
 MOST_FRAMES = 60
 VIEWS = 12  # of a turntable
 VIEW_PX = 256  # longer edge
@@ -75,7 +74,7 @@ def _seen(
     period_s: float,
 ) -> Scrubber | None:
     """Show the drives of an environment; None where there are no frames."""
-    frames = {case: _frames(folder, environment, case) for case in CASES}
+    frames = {case: _frames(folder, environment, case) for case in SHOWN_CASES}
     frames = {case: own for case, own in frames.items() if own}
     if not frames:
         return None

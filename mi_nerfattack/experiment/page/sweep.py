@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +13,12 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.page.above import draw_above
 from mi_nerfattack.experiment.page.run import read_run
-from mi_nerfattack.experiment.run_folder import METRICS
-from mi_nerfattack.experiment.sweep.cell import COMPLETE
+from mi_nerfattack.experiment.sweep.cell import CELLS, COMPLETE
 from mi_nerfattack.experiment.sweep.summary import read_attacks, summarise
-from mi_nerfattack.experiment.sweep.table import RESULTS, Row, read_table
-from mi_nerfattack.io import files
-from mi_nerfattack.report.pages.parts import RunPart, SweepPart
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
+from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
+from mi_nerfattack.report.pages.parts import SHOWN_CASES, RunPart, SweepPart
+from mi_nerfattack.rollout.drive import ATTACK
 from mi_nerfattack.scenario.deployment import SURROGATE
-
-CASES = (NO_OBJECT, RANDOM, ATTACK)
-_LABELS = ("cell", "route", "objects", "method", "budget", "seed")
 
 
 def read_sweep(
@@ -42,10 +37,10 @@ def read_sweep(
         SetupError: pyarrow is not installed.
     """
     rows = read_table(folder / RESULTS)
-    cells = folder / "cells"
+    cells = folder / CELLS
     known = {row["cell"] for row in rows}
-    done = {row["cell"] for row in rows if row["status"] == "complete"}
-    present = {name for name in sorted(done) if (cells / name / METRICS).is_file()}
+    told = read_attacks(folder, rows)
+    sections = {attack["cell"]: attack["section"] for attack in told}
     notes = []
     begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
     if begun:
@@ -53,24 +48,24 @@ def read_sweep(
             f"{label} is not finished: {len(begun)} cells were begun and are not "
             "complete; the sweep's command goes on with them."
         )
-    if len(present) < len(known):
+    if len(sections) < len(known):
         notes.append(
-            f"{len(known) - len(present)} of {len(known)} cells have no folder in "
+            f"{len(known) - len(sections)} of {len(known)} cells have no folder in "
             f"{cells}, or failed: there is nothing of them but their rows."
         )
-    attacks = _attacks(folder, rows, present)
+    attacks = _attacks(folder, rows, sections)
     return SweepPart(
         label,
-        summarise(rows, read_attacks(folder, rows)),
+        summarise(rows, told),
         attacks,
-        _shown(cells, [row for row in attacks if row["cell"] in present], on_run),
-        _pictures(cells, rows, present, Path(tempfile.mkdtemp(dir=scratch)), notes),
+        _shown(cells, [row for row in attacks if row["cell"] in sections], on_run),
+        _pictures(cells, rows, sections, Path(tempfile.mkdtemp(dir=scratch)), notes),
         notes,
     )
 
 
 def _attacks(
-    folder: Path, rows: Sequence[Row], present: set[str]
+    folder: Path, rows: Sequence[Row], sections: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Return a row for each cell and environment, in the table's order.
 
@@ -80,19 +75,15 @@ def _attacks(
         `section` (`attack` of its scenario, None without its folder), and `repeat`, a
         command.
     """
-    sections = {
-        name: files.read_json(folder / "cells" / name / METRICS)["scenario"]["attack"]
-        for name in present
-    }
     groups: dict[tuple[str, str | None], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["cell"], row["environment"]), []).append(row)
     found = []
     for (cell, environment), own in groups.items():
-        by_case = {case: [r for r in own if r["case"] == case] for case in CASES}
+        by_case = {case: [r for r in own if r["case"] == case] for case in SHOWN_CASES}
         name = shlex.quote(f"{cell}:{environment}:{ATTACK}:0")
         found.append(
-            {key: own[0][key] for key in (*_LABELS, "environment", "error")}
+            {key: own[0][key] for key in (*LABELS, "environment", "error")}
             | {
                 "cases": {
                     case: float(np.mean([row["cross_track_mean_m"] for row in some]))
@@ -131,7 +122,11 @@ def _shown(
 
 
 def _pictures(
-    cells: Path, rows: Sequence[Row], present: set[str], scratch: Path, notes: list[str]
+    cells: Path,
+    rows: Sequence[Row],
+    present: Container[str],
+    scratch: Path,
+    notes: list[str],
 ) -> dict[str, Path]:
     """Plot the drives of all cells of each route and method from above."""
     groups: dict[str, dict[str, Path]] = {}

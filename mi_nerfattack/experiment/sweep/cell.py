@@ -18,6 +18,8 @@ from mi_nerfattack.io import files, locks
 from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.scenario.scenario import Scenario
 
+#: Folder of the cells, in that of the sweep.
+CELLS = "cells"
 #: Empty file in the folder of a cell that is done.
 COMPLETE = "_complete"
 #: What a cell was done of: its row of the grid, digests and versions.
@@ -72,7 +74,7 @@ class Cell:
 
 def folder_of(sweep: Path, cell: Cell) -> Path:
     """Return the run folder of a cell."""
-    return sweep / "cells" / cell.id
+    return sweep / CELLS / cell.id
 
 
 def is_complete(sweep: Path, cell: Cell) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.run_folder import CHECKPOINT, SCENARIO
 from mi_nerfattack.experiment.sweep.cell import Cell, changed, folder_of
-from mi_nerfattack.experiment.sweep.table import RESULTS, Row, read_table
+from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
 from mi_nerfattack.io import files
 
 #: What is compared.
@@ -61,7 +61,9 @@ def read_replay(
     drawn = np.random.default_rng(seed).choice(len(whole), count, replace=False)
     indices = dict.fromkeys([*indices, *(whole[i] for i in sorted(drawn))])
     first = {table[i]["cell"]: table[i] for i in indices}
-    cells = tuple(_cell(path, row) for row in first.values())
+    scenarios = read_table(path, ["cell", "scenario"], first)
+    texts = {row["cell"]: row["scenario"] for row in scenarios}
+    cells = tuple(_cell(row, texts[name]) for name, row in first.items())
     return Replay(table, tuple(indices), cells)
 
 
@@ -198,11 +200,9 @@ def _find(path: Path, table: Sequence[Row], name: str) -> int:
     return index
 
 
-def _cell(path: Path, row: Row) -> Cell:
+def _cell(row: Row, text: str) -> Cell:
     """Return the cell of a row, as it was done; findings of its checks are told."""
-    name = row["cell"]
-    text = read_table(path, ["cell", "scenario"], name)[0]["scenario"]
-    labels = {key: row[key] for key in ("route", "objects", "method", "budget", "seed")}
+    name, labels = row["cell"], {key: row[key] for key in LABELS[1:]}
     cell = Cell(**labels, text=text, digests=json.loads(row["digests"]), anyway=True)
     if wrong := changed(cell):
         made = json.loads(row["versions"])["mi_nerfattack"]

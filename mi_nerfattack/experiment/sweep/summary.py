@@ -24,7 +24,9 @@ from mi_nerfattack.evaluation.pairs import (
     compare_departures,
     over_attacks,
 )
-from mi_nerfattack.experiment.sweep.table import RESULTS, Row, read_table
+from mi_nerfattack.experiment.run_folder import METRICS
+from mi_nerfattack.experiment.sweep.cell import CELLS
+from mi_nerfattack.experiment.sweep.table import LABELS, RESULTS, Row, read_table
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, RANDOM
 
@@ -34,7 +36,6 @@ SUMMARY = "summary.json"
 GRADIENT = "gradient"
 #: Their curves are a gradient's, or of another loop than the gradient's.
 _NOT_COMPARED = (GRADIENT, "open_loop", "single_frame")
-_LABELS = ("cell", "route", "objects", "method", "budget", "seed")
 _ERROR = "cross_track_mean_m"
 _SEED = 0  # of the resampling
 
@@ -82,15 +83,20 @@ def read_attacks(folder: Path, rows: Iterable[Row]) -> list[dict[str, Any]]:
     Args:
         folder: of the sweep.
         rows: of its table.
+
+    Returns:
+        a row each, in the table's order: labels, `section` (`attack` of the
+        scenario), `attack_method` (its own word), `converged`, `flags` and `curve`.
     """
     cells = {row["cell"]: row for row in rows if row["status"] == "complete"}
     found = []
     for cell, row in cells.items():
-        path = folder / "cells" / cell / "metrics.json"
+        path = folder / CELLS / cell / METRICS
         if path.exists():
             document = files.read_json(path)
-            attack = {name: row[name] for name in _LABELS}
-            attack["attack_method"] = document["scenario"]["attack"]["method"]
+            attack = {name: row[name] for name in LABELS}
+            section = document["scenario"]["attack"]
+            attack |= {"section": section, "attack_method": section["method"]}
             attack |= {key: document[key] for key in ("converged", "flags")}
             found.append(attack | {"curve": document.get("curve")})
     return found
@@ -114,11 +120,14 @@ def summarise(
         "flags": [*_black_box(attacks), *_noise(compared), *_own_flags(attacks)],
         "cells": len(cells),
         "complete": len(cells) - len(failed),
-        "failed": [{k: row[k] for k in (*_LABELS, "error")} for row in failed],
+        "failed": [{k: row[k] for k in (*LABELS, "error")} for row in failed],
         "departed_s": DEPARTED_S,
         "groups": [_about(group, own) for group, own in groups.items()],
         "comparisons": compared,
-        "attacks": [dict(attack) for attack in attacks],
+        "attacks": [
+            {key: value for key, value in attack.items() if key != "section"}
+            for attack in attacks
+        ],
     }
 
 

@@ -13,6 +13,7 @@ import drjit as dr
 from mi_nerfattack import variant
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import (
+    CELLS,
     Cell,
     folder_of,
     is_complete,
@@ -111,7 +112,7 @@ class Sweep:
         """
         require_parquet()
         work = self.work
-        for name in ("cells", FAILED):
+        for name in (CELLS, FAILED):
             files.make_folder(work.folder / name)
         with locks.exclusive(work.folder):
             for index, cell in enumerate(work.cells):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.run_folder import METRICS
 from mi_nerfattack.experiment.sweep.cell import PROVENANCE, Cell, folder_of
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, RANDOM
@@ -40,6 +41,8 @@ SCHEMA = {
     "versions": "string",
     "scenario": "category",
 }
+#: Columns that tell cells apart.
+LABELS = ("cell", "route", "objects", "method", "budget", "seed")
 Row = dict[str, Any]
 
 
@@ -59,7 +62,7 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
         InputError: a file of the cell's folder is missing or damaged.
     """
     folder = folder_of(sweep, cell)
-    document = files.read_json(folder / "metrics.json")
+    document = files.read_json(folder / METRICS)
     about = files.read_json(folder / PROVENANCE)
     frames = _frames(document)
     labels = _labels(cell) | {"versions": json.dumps(about["versions"])}
@@ -108,14 +111,14 @@ def write_table(path: Path, rows: Iterable[Row]) -> None:
 
 
 def read_table(
-    path: Path, columns: Sequence[str] | None = None, cell: str | None = None
+    path: Path, columns: Sequence[str] | None = None, cells: Iterable[str] | None = None
 ) -> list[Row]:
     """Read a table, row by row.
 
     Args:
         path: of the file.
         columns: names; by default all but the scenarios, which are long.
-        cell: whose rows are wanted; by default all.
+        cells: whose rows are wanted; by default all.
 
     Raises:
         InputError: there is none, or it is damaged, too large, or not a sweep's table.
@@ -130,8 +133,9 @@ def read_table(
             _check(path, file.schema_arrow, file.metadata.num_rows, _schema(pa))
             names = [name for name in SCHEMA if name != "scenario"]
             table = file.read(columns=columns or names)
-            if cell is not None:
-                table = table.filter(pa.compute.field("cell") == cell)
+            if cells is not None:
+                wanted = pa.compute.field("cell").isin(list(cells))
+                table = table.filter(wanted)
             return table.to_pylist()
     except (pa.ArrowException, OSError, ValueError) as err:
         if isinstance(err, InputError):

@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from mi_nerfattack.report.pages.scrubber import Scrubber
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
 
+#: Cases that stand beside each other.
+SHOWN_CASES = (NO_OBJECT, RANDOM, ATTACK)
 #: Sections of a page that have pictures of each run, with what the folder may lack.
 ABOVE, COST, SEEN, TEXTURES, WHEN = "above", "cost", "seen", "textures", "when"
 

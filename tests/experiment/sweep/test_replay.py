@@ -24,6 +24,7 @@ from mi_nerfattack.experiment.sweep.summary import summarise
 from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
 from mi_nerfattack.experiment.sweep.table import read_table, write_table
 from mi_nerfattack.io import files
+from mi_nerfattack.system import workers
 from mi_nerfattack.system.workers import InThisProcess
 
 pytest.importorskip(
@@ -63,7 +64,7 @@ def swept(scenario_folder, tmp_path_factory):
 @pytest.fixture
 def command(monkeypatch, capsys):
     """Return what runs the command in this process: exit code, output."""
-    monkeypatch.setattr(Replay, "_workers", lambda self: InThisProcess())
+    monkeypatch.setattr(workers, "Processes", lambda *_, **__: InThisProcess())
 
     def run(*words):
         code = cli.main(["replay", *map(str, words)])
