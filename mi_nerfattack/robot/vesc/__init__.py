@@ -1,0 +1,1 @@
+"""A car's motor controller: a VESC at a serial port."""
