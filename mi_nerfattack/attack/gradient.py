@@ -117,7 +117,7 @@ class GradientAttack(AbstractAttack):
         A measurement is a drive, after which an update takes a pass back.
         """
         records = [*self.history, *([self._last] if self._last else [])]
-        drive = self.rollout.horizon * len(self.initial[0])
+        drive = self.rollout.frames * len(self.initial[0])
         frames = [
             drive * (1 + k * (1 + backward_multiple)) for k in range(len(records))
         ]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from mi_nerfattack.errors import InputError
@@ -19,12 +20,11 @@ class NominalSensor(AbstractDifferentiableSensor):
     """Shows what is seen from given states, wherever the vehicle is.
 
     With the states of an unattacked drive, a loop through it is open: textures are
-    optimised on the observations along the nominal path. With one state, it shows one
-    frame all the time.
+    optimised on the observations along the nominal path.
 
     Args:
         sensor: that looks.
-        states: (m, n) a control period, or one for all.
+        states: (m, n) a control period.
     """
 
     def __init__(
@@ -32,13 +32,10 @@ class NominalSensor(AbstractDifferentiableSensor):
     ) -> None:
         self.sensor, self.states = sensor, states
 
-    def _at(self, step: int) -> Any:
-        return self.states[min(step, len(self.states) - 1)]
-
     def observe(self, state: Any, step: int) -> Observation:
         """See :meth:`AbstractSensor.observe`; `state` counts for nothing."""
         del state
-        return self.sensor.observe(self._at(step), step)
+        return self.sensor.observe(self.states[step], step)
 
     def keep(self, observation: Observation) -> Any:
         """See :meth:`AbstractDifferentiableSensor.keep`."""
@@ -47,7 +44,7 @@ class NominalSensor(AbstractDifferentiableSensor):
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """See :meth:`AbstractDifferentiableSensor.restore`."""
         del state
-        return self.sensor.restore(self._at(step), step, kept)
+        return self.sensor.restore(self.states[step], step, kept)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -98,6 +95,77 @@ class NominalSensor(AbstractDifferentiableSensor):
         return self.sensor.offset_gradients()
 
 
+class StillSensor(NominalSensor):
+    """Shows one frame of a drive all the time, which is rendered once.
+
+    Args:
+        sensor: that looks.
+        states: (m, n) a control period.
+        frame: the period.
+    """
+
+    def __init__(
+        self, sensor: AbstractDifferentiableSensor, states: Sequence[Any], frame: int
+    ) -> None:
+        super().__init__(sensor, states)
+        self.frame = frame
+        self._seen: Observation | None = None
+        self._d_image: Any = None  # of all periods, which go back at once
+
+    def frames(self, horizon: int) -> int:
+        """See :meth:`AbstractSensor.frames`."""
+        del horizon
+        return 1
+
+    def observe(self, state: Any, step: int) -> Observation:
+        """See :meth:`AbstractSensor.observe`; a drive's first period renders."""
+        if step == 0 or self._seen is None:
+            self._seen = super().observe(state, self.frame)
+        return self._seen
+
+    def keep(self, observation: Observation) -> Any:
+        """See :meth:`AbstractDifferentiableSensor.keep`."""
+        return observation
+
+    def restore(self, state: Any, step: int, kept: Any) -> Observation:
+        """See :meth:`AbstractDifferentiableSensor.restore`."""
+        del state, step
+        return kept
+
+    def vjp(
+        self, observation: Observation, state: Any, d_image: Any, attached: bool
+    ) -> Any:
+        """See :meth:`NominalSensor.vjp`."""
+        if attached:
+            return super().vjp(observation, state, d_image, attached)
+        self._seen = observation
+        self._d_image = d_image if self._d_image is None else self._d_image + d_image
+        dr.eval(self._d_image)
+        return None
+
+    def start_gradient(self, poses: bool = False) -> None:
+        """See :meth:`AbstractDifferentiableSensor.start_gradient`."""
+        self._d_image = None
+        super().start_gradient(poses)
+
+    def texture_gradients(self) -> list[Any]:
+        """See :meth:`AbstractDifferentiableSensor.texture_gradients`."""
+        self._finish()
+        return super().texture_gradients()
+
+    def offset_gradients(self) -> np.ndarray:
+        """See :meth:`AbstractDifferentiableSensor.offset_gradients`."""
+        self._finish()
+        return super().offset_gradients()
+
+    def _finish(self) -> None:
+        d_image, self._d_image = self._d_image, None
+        if d_image is not None:
+            assert self._seen is not None
+            state = self.states[self.frame]
+            self.sensor.vjp(self._seen, state, d_image, False)
+
+
 def open_loop(rollout: Rollout, initial: Any, frame: int | None = None) -> Rollout:
     """Return a rollout whose images are those of the present textures' drive.
 
@@ -107,7 +175,7 @@ def open_loop(rollout: Rollout, initial: Any, frame: int | None = None) -> Rollo
     Args:
         rollout: in a closed loop; one drive is made with it.
         initial: (m, n) initial states, as the attack's.
-        frame: show this one alone, at all times; None for all.
+        frame: show this one alone, at all times, rendered once; None for all.
 
     Raises:
         InputError: the frame lies beyond the drive.
@@ -117,6 +185,9 @@ def open_loop(rollout: Rollout, initial: Any, frame: int | None = None) -> Rollo
         raise InputError(f"frame: {frame}; the drive has {rollout.horizon}, from 0 on")
     sensor = differentiable(rollout.loop)
     states = rollout.measure(initial).trajectory.states[:-1]
-    shown = states if frame is None else states[frame : frame + 1]
-    loop = replace(rollout.loop, sensor=NominalSensor(sensor, shown))
-    return replace(rollout, loop=loop)
+    shown = (
+        NominalSensor(sensor, states)
+        if frame is None
+        else StillSensor(sensor, states, frame)
+    )
+    return replace(rollout, loop=replace(rollout.loop, sensor=shown))

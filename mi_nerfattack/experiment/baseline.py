@@ -63,7 +63,8 @@ class Baseline:
         section, strict = scenario.baseline, scenario.attack.deterministic
         is_timed = attack.sweeps > 1 and not strict
         multiple = effort.backward_multiple if is_timed else attack.sweeps - 1.0
-        count = section.textures or equal_count(attack.iteration, multiple)
+        drives = attack.iteration * attack.rollout.frames / attack.rollout.horizon
+        count = section.textures or equal_count(drives, multiple)
         deployed = min(count, section.deployment_textures)
         draws = world.fields, attack.freedom, section.kind, scenario.seed
         looks = RandomLooks(*draws)

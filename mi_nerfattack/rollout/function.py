@@ -64,6 +64,11 @@ class Rollout:
     adjoint: AbstractAdjoint = field(default_factory=Replay)
     attached: bool = False
 
+    @property
+    def frames(self) -> int:
+        """Frames that are rendered for a drive of one vehicle."""
+        return self.loop.sensor.frames(self.horizon)
+
     def run(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
         """Drive with the textures and offsets that the sensor has.
 

@@ -81,6 +81,10 @@ class AbstractMethod(Section):
             frames: of the drives of one of them.
         """
 
+    def rendered(self, horizon: int) -> int:
+        """Return how many frames are rendered for a drive of so many periods."""
+        return horizon
+
 
 class AbstractGradientMethod(AbstractMethod):
     """Adam along a gradient."""
@@ -118,10 +122,15 @@ class GradientMethod(AbstractGradientMethod):
 
 
 class FrameMethod(AbstractGradientMethod):
-    """Of one frame of an unattacked drive, which is shown all the time."""
+    """Of one frame of an unattacked drive: rendered once, it is shown all the time."""
 
     method: Literal["single_frame"]
     frame: Whole = 0  # of the drive
+
+    def rendered(self, horizon: int) -> int:
+        """See :meth:`AbstractMethod.rendered`."""
+        del horizon
+        return 1
 
     def _rollout(self, task: Task) -> Rollout:
         return open_loop(task.rollout, task.initial, self.frame)

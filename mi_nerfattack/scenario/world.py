@@ -236,7 +236,8 @@ def judged_frames(scenario: Scenario) -> int:
     """
     vehicle = scenario.vehicle
     route = driven_route(scenario, vehicle.motion())
-    return scenario.drive.steps(route, vehicle.dt_s) * scenario.attack.poses
+    steps = scenario.drive.steps(route, vehicle.dt_s)
+    return scenario.attack.method.rendered(steps) * scenario.attack.poses
 
 
 def build_surrogate(scenario: Scenario) -> FieldSensor:

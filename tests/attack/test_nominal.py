@@ -54,6 +54,16 @@ def test_one_frame_is_shown_at_all_times(closed):
     np.testing.assert_allclose(controls.controls_numpy(), expected, atol=1e-6)
 
 
+def test_one_frame_is_rendered_once(closed):
+    rollout, initial, _ = closed
+    sensor = rollout.loop.sensor
+    opened = open_loop(rollout, initial, 3)
+    before = sensor.renders
+    opened.measure(initial)
+    assert (sensor.renders - before, opened.frames) == (2, 1)  # two vehicles
+    assert open_loop(rollout, initial).frames == rollout.frames == HORIZON
+
+
 @pytest.mark.parametrize("frame", [None, 2])
 def test_its_gradient_is_its_derivative(closed, frame):
     rollout, initial, field = closed

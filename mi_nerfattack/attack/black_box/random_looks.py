@@ -81,7 +81,7 @@ class RandomSearch(AbstractSearch):
         self._number += 1
 
 
-def equal_count(iterations: int, backward_multiple: float) -> int:
+def equal_count(iterations: float, backward_multiple: float) -> int:
     """Return how many drives cost what the iterations of an attack do.
 
     Args:

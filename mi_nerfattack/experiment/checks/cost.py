@@ -59,7 +59,9 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     forward, backward, update, disk = _iteration(world)
     section = scenario.attack
     count = section.method.iterations(horizon * section.poses)
-    looks = scenario.baseline.textures or equal_count(count, backward / forward)
+    rendered = section.method.rendered(horizon)
+    equal = equal_count(count * rendered / horizon, backward / forward)
+    looks = scenario.baseline.textures or equal
     iteration = horizon * (forward + backward) + update
     periods = {SURROGATE: 4 * scenario.drive.runs + looks}
     for label in world.deployments:
@@ -71,12 +73,13 @@ def estimate(world: World, drive_s: Mapping[str, float]) -> Cost:
     wall = passes * iteration + horizon * ((looks + 1) * forward + drives)
     kept = isinstance(section.adjoint.build(), KeptBackgrounds)
     again = 1 if kept or not backward else 2
-    frames = section.poses * (again * passes + looks + 1) + sum(periods.values())
+    frames = section.poses * (again * passes * rendered + (looks + 1) * horizon)
+    frames += sum(periods.values()) * horizon
     return Cost(
         count,
         looks,
         horizon,
-        frames * horizon,
+        frames,
         wall,
         peak_memory_mb() + _kept_mb(world),
         disk + _PICTURES_MB,

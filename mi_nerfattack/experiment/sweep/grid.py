@@ -41,7 +41,7 @@ class AbstractChoice(Section):
 
 
 class Choice(AbstractChoice):
-    """A route or a method."""
+    """A route."""
 
 
 class ObjectsChoice(AbstractChoice):
@@ -68,13 +68,19 @@ class ObjectsChoice(AbstractChoice):
         return self
 
 
+class MethodChoice(AbstractChoice):
+    """A method, with what a pass back of its own costs."""
+
+    backward_multiple: NonNegative | None = None  # in drives; by default the grid's
+
+
 class Grid(Section):
     """A grid file."""
 
     scenario: File  # what the choices change
     routes: tuple[Choice, ...] = ()
     objects: tuple[ObjectsChoice, ...] = ()
-    methods: tuple[Choice, ...] = ()
+    methods: tuple[MethodChoice, ...] = ()
     budgets: tuple[Count, ...] = ()  # rendered frames; as the scenario says
     backward_multiple: NonNegative | None = None  # cost of a pass back, in drives
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
@@ -148,7 +154,7 @@ class GridReader:
                 no place.
         """
         grid = self.grid
-        methods = grid.methods or (Choice(name=self.base.attack.method.method),)
+        methods = grid.methods or (MethodChoice(name=self.base.attack.method.method),)
         budgets = grid.budgets or (None,)
         for i, j in self._places_of():
             route, these = self._routes[i], self._objects[j]
@@ -161,7 +167,10 @@ class GridReader:
                     layers["objects", j, "set"] = these.set | {"objects": drawn}
                 layers["methods", k, "set"] = method.set
                 labels = route.name, name, method.name, budget, seed
-                made = self._scenario(layers, budget, seed)
+                multiple = method.backward_multiple
+                if multiple is None:
+                    multiple = grid.backward_multiple
+                made = self._scenario(layers, seed, budget, multiple)
                 yield Cell(*labels, *made, grid.anyway, grid.pictures)
 
     @functools.cached_property
@@ -202,7 +211,11 @@ class GridReader:
             ) from err
 
     def _scenario(
-        self, layers: Mapping[Location, Any], budget: int | None, seed: int
+        self,
+        layers: Mapping[Location, Any],
+        seed: int,
+        budget: int | None,
+        multiple: float | None,
     ) -> tuple[str, dict[str, str]]:
         """Return the text of a cell's scenario, and its digests."""
         values = self.values
@@ -214,7 +227,9 @@ class GridReader:
             values = values | {"attack": kept}
         scenario = self._read(values, layers)
         if budget is not None:
-            values = _merged(values, {"attack": self._length(scenario, budget)})
+            values = _merged(
+                values, {"attack": self._length(scenario, budget, multiple)}
+            )
             scenario = self._read(values, layers)
         text = portable_text(scenario, tomlkit.dumps(values))
         return text, scenario.digests(self._content)
@@ -244,12 +259,13 @@ class GridReader:
         rest = tell(self.base_path, self.base_text, there) if there else ""
         return "\n".join(filter(None, (told, rest)))
 
-    def _length(self, scenario: Scenario, budget: int) -> dict[str, int]:
+    def _length(
+        self, scenario: Scenario, budget: int, multiple: float | None
+    ) -> dict[str, int]:
         """Return the key that says how long an attack is, for a budget of frames."""
         method, frames = scenario.attack.method, judged_frames(scenario)
         if not method.needs_derivatives:
             return {"frames": budget}
-        multiple = self.grid.backward_multiple
         if multiple is None:
             raise InputError(
                 f"{self.path}: backward_multiple: is missing; budgets of gradients "

@@ -10,6 +10,7 @@ import pytest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import grid as module
 from mi_nerfattack.experiment.sweep.grid import load_cells
+from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -166,6 +167,17 @@ def test_what_is_wrong_is_told_where_it_stands(write_grid, old, new, message):
     with pytest.raises(InputError) as error:
         load_cells(write_grid((old, new)))
     assert re.search(message, str(error.value)), error.value
+
+
+def test_a_method_has_a_multiple_of_its_own(write_grid):
+    def lengths(*changes):
+        cells = load_cells(write_grid(*changes))
+        attacks = [parse_toml("cell", cell.text)["attack"] for cell in cells]
+        return {attack.get("max_iterations") for attack in attacks}
+
+    assert lengths() == {None, 4, 3}  # 40 / 2.5 over 4 and 5 frames a drive
+    own = ('"gradient"', '"gradient"\nbackward_multiple = 4.0')
+    assert lengths(own) == {None, 2, 1}
 
 
 def test_a_grid_without_end_is_refused(write_grid, monkeypatch):
