@@ -142,6 +142,10 @@ class AbstractTracker(ABC):
             DeviceLostError: no more will come.
         """
 
+    def explain(self, body: str) -> str:
+        """Say why no new pose of a body comes, as far as is known, for a message."""
+        return f"nothing new of {body!r} comes from the tracker"
+
     @abstractmethod
     def close(self) -> None:
         """Let go of the connection; more than once does no harm."""
