@@ -4,3 +4,4 @@ from .monitor import Screen as Screen
 from .monitor import screen_image as screen_image
 from .overlay import Overlay as Overlay
 from .paper import write_net as write_net
+from .vesc.motor import VescMotor as VescMotor

@@ -78,6 +78,14 @@ def _grid(folder: Path) -> list[tuple[Path, Read]]:
     return [(path, load_cells)]
 
 
+def _motor(folder: Path) -> list[tuple[Path, Read]]:
+    from mi_nerfattack.robot.vesc import calibration
+
+    path = folder / "car.toml"
+    calibration.write_calibration(path, calibration.Calibration())
+    return [(path, calibration.read_calibration)]
+
+
 def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
     from mi_nerfattack.commands.shared.evaluate_options import (
         PolicyOptions,
@@ -334,6 +342,7 @@ FORMATS: dict[str, Format] = {
     "scenario": Format(_scenario, _TEXT),
     "grid": Format(_grid, _TEXT),
     "policy_toml": Format(_policy_toml, _TEXT),
+    "motor": Format(_motor, _TEXT),
     "field": Format(_field, _TENSORS),
     "glb": Format(_gltf, one_of(of_glb, of_glb, of_bytes)),
     "gltf": Format(_gltf_text, _JSON_OR_BYTES),

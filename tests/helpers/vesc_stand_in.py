@@ -321,6 +321,14 @@ class StandIn:
             time.sleep(0.02)
         raise TimeoutError(f"{self.path}: never {wanted}")
 
+    def wait_for_event(self, event: str) -> None:
+        """Return once a line of the log has this event."""
+        deadline = time.monotonic() + 30
+        while not any(line["event"] == event for line in self.log()):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{self.path}: never {event}")
+            time.sleep(0.02)
+
     def close(self) -> None:
         """End it."""
         self.process.kill()

@@ -142,6 +142,18 @@ def get_values(*names: str) -> bytes:
     return struct.pack(">BI", Id.GET_VALUES_SELECTIVE, mask)
 
 
+#: What the motor asks for while it drives.
+VALUES_QUESTION = get_values(
+    "motor_current_a",
+    "erpm",
+    "input_voltage_v",
+    "tachometer",
+    "tachometer_absolute",
+    "fault",
+    "status",
+)
+
+
 def parse_values(payload: bytes) -> Values:
     """Read an answer to `get_values` as far as it goes: firmwares differ at its end."""
     mask, offset = _ALL, 1

@@ -1,0 +1,94 @@
+"""What a car's metres and radians are to its motor controller: a TOML file."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Acute, Share
+from mi_nerfattack.robot.devices import Command
+from mi_nerfattack.scenario.section import Section, read_section, refuse
+
+_THOUSAND = 1000  # steps of the servo's range, as the controller takes them
+
+
+class Calibration(Section):
+    """Scales and limits of a car; the defaults are those of a RACECAR/J.
+
+    Attributes:
+        erpm_per_ms: electrical turns a minute of the motor at 1 m/s forward.
+        servo_per_rad: change of the servo's position (0 to 1) for a radian to the left.
+        servo_centre: its position straight ahead.
+        servo_least, servo_most: ends that the servo is never sent beyond.
+        erpm_most: fastest that the motor is told to turn, either way.
+        steering_most_rad: largest steering angle, either way.
+        brake_current_a: amperes through the motor to brake with.
+        timeout_ms: how long the controller goes on without a command.
+    """
+
+    erpm_per_ms: Annotated[float, Field(ge=100, le=100_000)] = 4614.0
+    servo_per_rad: Annotated[float, Field(ge=-10, le=10)] = -1.2135
+    servo_centre: Share = 0.5304
+    servo_least: Share = 0.15
+    servo_most: Share = 0.85
+    erpm_most: Annotated[int, Field(ge=1, le=200_000)] = 9228
+    steering_most_rad: Acute = 0.34
+    brake_current_a: Annotated[float, Field(ge=1, le=200)] = 20.0
+    timeout_ms: Annotated[int, Field(ge=50, le=300)] = 250
+
+    @model_validator(mode="after")
+    def _check(self) -> Calibration:
+        if abs(self.servo_per_rad) < 0.1:
+            refuse("servo_per_rad", f"{self.servo_per_rad}: the servo hardly moves")
+        if not self.servo_least < self.servo_centre < self.servo_most:
+            span = f"{self.servo_least} to {self.servo_most}"
+            refuse("servo_centre", f"{self.servo_centre} is not within {span}")
+        return self
+
+    def encode(self, command: Command) -> tuple[int, int]:
+        """Return electrical turns a minute and thousandths of the servo's range.
+
+        Both are within the limits, whatever the command.
+        """
+        fastest = self.erpm_most
+        erpm = _clipped(command.speed_ms * self.erpm_per_ms, -fastest, fastest)
+        limit = self.steering_most_rad
+        steering = _clipped(command.steering_rad, -limit, limit)
+        servo = self.servo_centre + self.servo_per_rad * steering
+        least = math.ceil(self.servo_least * _THOUSAND)
+        most = math.floor(self.servo_most * _THOUSAND)
+        return round(erpm), round(_clipped(servo * _THOUSAND, least, most))
+
+    def decode(self, erpm: int, servo: int) -> Command:
+        """Return the command that turns and thousandths are."""
+        steering = (servo / _THOUSAND - self.servo_centre) / self.servo_per_rad
+        return Command(erpm / self.erpm_per_ms, steering)
+
+
+def _clipped(value: float, least: float, most: float) -> float:
+    return min(most, max(least, value))
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration; what the file does not say has its default.
+
+    Raises:
+        InputError: the file cannot be read, or a value is not plausible.
+    """
+    path = Path(path)
+    return read_section(str(path), Calibration, files.read_toml(path), path.parent)
+
+
+def write_calibration(path: str | Path, calibration: Calibration) -> None:
+    """Write a calibration.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    lines = [f"{name} = {value!r}" for name, value in calibration.model_dump().items()]
+    head = "# motor controller and steering servo of one car: docs/robot.md"
+    files.write_text(path, "\n".join([head, *lines, ""]))

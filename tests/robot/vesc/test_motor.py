@@ -1,0 +1,212 @@
+"""A car that must stop by itself, against a stand-in that was written without us."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+
+import pytest
+from helpers import vesc_host
+from helpers.vesc_stand_in import StandIn
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.robot.devices import Command, DeviceLostError
+from mi_nerfattack.robot.vesc.calibration import Calibration
+from mi_nerfattack.robot.vesc.link import Link
+from mi_nerfattack.robot.vesc.motor import VescMotor
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Return what starts a stand-in with options of its command line."""
+    started = []
+
+    def start(*options: str) -> StandIn:
+        started.append(StandIn(tmp_path / f"{len(started)}.jsonl", *options))
+        return started[-1]
+
+    yield start
+    for stand_in in started:
+        stand_in.close()
+
+
+def drive_to_speed(motor: VescMotor) -> None:
+    """Drive straight on until the car moves at 1 m/s."""
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        motor.send(Command(1.0, 0.0))
+        values = motor.read()
+        if values is not None and (values.speed_ms or 0.0) > 0.97:
+            return
+        time.sleep(0.03)
+    raise TimeoutError
+
+
+def check_stopped(car: StandIn) -> None:
+    """Check that the car braked at its timeout, and stopped within half a metre."""
+    lines = car.wait_for(speed_ms=0.0, timed_out=True)
+    last, end = lines[0], lines[-1]
+    assert last["event"] == "command 8" and last["speed_ms"] > 0.95
+    assert end["way_m"] - last["way_m"] < 0.5
+    (fired,) = [line for line in lines if line["event"] == "timeout"]
+    assert fired["time_s"] - last["time_s"] <= 0.25 + 0.02
+    assert fired["mode"] == "brake"
+
+
+def test_a_car_that_nobody_commands_stops(start):
+    car = start()
+    with closing(VescMotor(car.port)) as motor:
+        assert motor.firmware.minor == 5
+        with pytest.raises(InputError, match="not armed"):
+            motor.send(Command(1.0, 0.0))
+        motor.arm()
+        events = [line["event"] for line in car.log()]
+        assert events.count("memory") == 1 and "flash" not in events
+        drive_to_speed(motor)
+        check_stopped(car)  # though its values are asked for
+        values = motor.read()
+        while values is None or not values.has_timed_out:
+            values = motor.read()
+        assert values.input_voltage_v == 15.8 and values.fault_name == "none"
+
+
+def test_what_is_sent(start):
+    car = start("--timeout-ms", "250", "--brake-a", "20")
+    with closing(VescMotor(car.port)) as motor:
+        motor.arm()
+        assert "memory" not in [line["event"] for line in car.log()]  # it was right
+        sent = motor.send(Command(0.1, 0.1))
+        assert sent.speed_ms == pytest.approx(461 / 4614)
+        assert sent.steering_rad == pytest.approx((0.409 - 0.5304) / -1.2135)
+        car.wait_for(servo=0.409)
+        with pytest.raises(InputError, match="finite"):
+            motor.send(Command(0.1, float("nan")))
+        motor.brake()
+        assert car.wait_for(servo=0.53)[-1]["mode"] == "brake"
+        car.tell("fault 2")
+        values = motor.read()
+        while values is None or not values.fault:
+            values = motor.read()
+        assert (values.fault, values.fault_name) == (2, "under voltage")
+        car.tell("mute")
+        with pytest.raises(DeviceLostError, match=r"no answer for 0\.\d\d s"):
+            while True:
+                motor.read()
+                time.sleep(0.02)
+        with pytest.raises(InputError, match="not armed"):
+            motor.send(Command(1.0, 0.0))
+
+
+def test_a_pulled_plug(start):
+    car = start()
+    with closing(VescMotor(car.port)) as motor:
+        motor.arm()
+        drive_to_speed(motor)
+        car.tell("unplug")
+        with pytest.raises(DeviceLostError, match="check its cable"):
+            while True:
+                motor.send(Command(1.0, 0.0))
+        with pytest.raises(DeviceLostError):
+            motor.read()
+        check_stopped(car)
+
+
+@pytest.fixture
+def host(start):
+    """A program of its own that drives a car, and the car."""
+    car = start()
+    command = [sys.executable, vesc_host.__file__, car.port]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        yield process, car
+        process.kill()
+
+
+def wait_until_driving(process: subprocess.Popen[str]) -> None:
+    assert process.stdout is not None and process.stdout.readline() == "driving\n"
+
+
+def test_a_killed_program(host):
+    process, car = host
+    wait_until_driving(process)
+    process.send_signal(signal.SIGKILL)
+    check_stopped(car)
+
+
+@pytest.mark.slow
+def test_a_stopped_and_a_hung_program(host):
+    process, car = host
+    wait_until_driving(process)
+    process.send_signal(signal.SIGSTOP)
+    check_stopped(car)
+    process.send_signal(signal.SIGCONT)
+    wait_until_driving(process)
+    process.stdin.write("hang\n")
+    process.stdin.flush()
+    check_stopped(car)
+    process.stdin.write("go on\n")
+    process.stdin.flush()
+    wait_until_driving(process)
+
+
+REFUSED = {
+    "locked": (["--flaw", "locked"], "timeout stays 1000 ms with 0 A .* VESC Tool"),
+    "scribbling": (["--flaw", "scribbling"], "more of its configuration"),
+    "deaf": (["--flaw", "deaf"], "no answer to SET_APPCONF_NO_STORE"),
+    "endless": (["--flaw", "endless"], "300 ms after the last command it does not"),
+    "coasting": (["--flaw", "coasting"], "the wheels turn on at"),
+    "dumb": (["--flaw", "dumb"], "does not say whether its timeout has fired"),
+    "declined": (["--firmware", "5.03"], "5.03 on 410 keeps its timeout of 1000 ms"),
+    "older": (["--firmware", "3.57"], r"3\.57 .* known of 3\.58 to 7\.x alone"),
+    "newer": (["--firmware", "8.00"], r"8\.00 .* cannot be armed"),
+    "short": (["--config-bytes", "14"], "configuration of 14 bytes"),
+}
+
+
+SLOW = {"deaf": [pytest.mark.slow], "coasting": [pytest.mark.slow]}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=SLOW.get(name, [])) for name in REFUSED]
+)
+def test_what_is_not_armed(start, name):
+    options, message = REFUSED[name]
+    car = start(*options)
+    with closing(VescMotor(car.port)) as motor:
+        with pytest.raises(InputError, match=message):
+            motor.arm()
+        with pytest.raises(InputError, match="not armed"):
+            motor.send(Command(1.0, 0.0))
+        car.wait_for_event("command 7")  # it brakes, as well as it can
+
+
+def test_flash_is_written_once_and_after_a_question(start):
+    car = start("--firmware", "5.03")
+    asked = []
+
+    def confirm(question: str) -> bool:
+        asked.append(question)
+        return True
+
+    with closing(VescMotor(car.port, Calibration(timeout_ms=200), confirm)) as motor:
+        motor.arm()
+        motor.arm()
+    (question,) = asked
+    assert "1000 ms with 0 A. Write 200 ms with 20 A to its flash" in question
+    assert [line["event"] for line in car.log()].count("flash") == 1
+
+
+def test_ports_that_are_none(start, tmp_path):
+    with pytest.raises(InputError, match="gone: .* ports: "):
+        VescMotor(str(tmp_path / "gone"))
+    car = start("--firmware", "3.39")
+    with pytest.raises(InputError, match=r"firmware 3\.39"):
+        VescMotor(car.port)
+    with closing(Link(car.port)), pytest.raises(InputError, match="other programs"):
+        VescMotor(car.port)
+    car.tell("mute")
+    with pytest.raises(DeviceLostError, match="no answer to FW_VERSION"):
+        VescMotor(car.port)
