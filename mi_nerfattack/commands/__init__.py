@@ -14,6 +14,7 @@ from mi_nerfattack.commands.attack import Attack
 from mi_nerfattack.commands.bake import Bake
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.check import Check
+from mi_nerfattack.commands.compare_drives import CompareDrives
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
 from mi_nerfattack.commands.evaluate import Evaluate
@@ -55,6 +56,7 @@ COMMANDS: dict[str, type[Command]] = {
     "transfer": Transfer,
     "retrain": Retrain,
     "overlay": OverlayCommand,
+    "compare-drives": CompareDrives,
     "report": Report,
 }
 

@@ -12,13 +12,13 @@ import numpy as np
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.replay.folder import FolderRecording
 from mi_nerfattack.deploy.replay.mcap import McapRecording
-from mi_nerfattack.deploy.replay.recording import AbstractRecording
+from mi_nerfattack.deploy.replay.recording import AbstractRecording, vehicle_states
 from mi_nerfattack.deploy.replay.video import VideoRecording
 from mi_nerfattack.deploy.vehicle import require_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.video import VIDEO_SUFFIXES
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -57,8 +57,7 @@ class ReplayEnvironment(AbstractEnvironment):
         self.period, self.max_control = period, max_control
         self.control_unit = control_unit
         self.controls: list[float] = []
-        to_body = np.linalg.inv(mount_matrix(np.zeros((1, 3)), mount)[0])
-        self._bodies = recording.track.camera_to_world @ to_body
+        self._states = vehicle_states(recording.track, mount)
         self._paster = Paster(self.camera, ())
         self._index = -1
 
@@ -93,9 +92,7 @@ class ReplayEnvironment(AbstractEnvironment):
         """State (3,): x, y, heading of the vehicle that the frame was recorded from."""
         if self._index < 0:
             raise InputError("environment 'replay': it has a state only after reset")
-        body = self._bodies[self._index]
-        heading = math.atan2(body[1, 0], body[0, 0])
-        return np.array([body[0, 3], body[1, 3], heading])
+        return self._states[self._index].copy()
 
     @property
     def is_over(self) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.render.camera.pose import check_rigid
 from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 
@@ -47,6 +47,19 @@ class Track:
                     f"{self.where}: pose of frame {index} is at "
                     f"{matrix[:3, 3].tolist()}; at most {LARGEST_M:g} m"
                 )
+
+
+def vehicle_states(track: Track, mount: CameraMount) -> np.ndarray:
+    """Return x, y (metres) and heading (radians) of the vehicle, (n, 3).
+
+    Args:
+        track: poses of its camera.
+        mount: of the camera on it.
+    """
+    to_body = np.linalg.inv(mount_matrix(np.zeros((1, 3)), mount)[0])
+    bodies = track.camera_to_world @ to_body
+    headings = np.arctan2(bodies[:, 1, 0], bodies[:, 0, 0])
+    return np.column_stack([bodies[:, :2, 3], headings])
 
 
 def check_times(where: str, times: np.ndarray) -> None:
