@@ -12,6 +12,7 @@ from typing import Protocol
 from mi_nerfattack.commands.asset import Asset
 from mi_nerfattack.commands.attack import Attack
 from mi_nerfattack.commands.bake import Bake
+from mi_nerfattack.commands.calibrate import Calibrate
 from mi_nerfattack.commands.capture import Capture
 from mi_nerfattack.commands.check import Check
 from mi_nerfattack.commands.compare_drives import CompareDrives
@@ -57,6 +58,7 @@ COMMANDS: dict[str, type[Command]] = {
     "retrain": Retrain,
     "overlay": OverlayCommand,
     "compare-drives": CompareDrives,
+    "calibrate": Calibrate,
     "report": Report,
 }
 

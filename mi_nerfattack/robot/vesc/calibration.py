@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -48,6 +49,15 @@ class Calibration(Section):
             span = f"{self.servo_least} to {self.servo_most}"
             refuse("servo_centre", f"{self.servo_centre} is not within {span}")
         return self
+
+    def changed(self, values: Mapping[str, float]) -> Calibration:
+        """Return it with other values.
+
+        Raises:
+            InputError: a value is not plausible.
+        """
+        table = self.model_dump() | dict(values)
+        return read_section("calibration", Calibration, table, "")
 
     def encode(self, command: Command) -> tuple[int, int]:
         """Return electrical turns a minute and thousandths of the servo's range.

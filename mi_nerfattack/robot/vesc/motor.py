@@ -48,6 +48,7 @@ class VescMotor(AbstractMotor):
     Attributes:
         calibration: as given.
         firmware: of the controller.
+        values: all that was last read.
 
     Raises:
         InputError: the port cannot be opened, or the firmware is older than 3.40.
@@ -67,6 +68,7 @@ class VescMotor(AbstractMotor):
         self._is_armed = False
         self._waits_since: float | None = None  # the first question with no answer
         self._way = 0
+        self.values = Values()
         self._link = Link(port, baudrate)
         try:
             version = self._link.ask(bytes([Id.FW_VERSION]), _VERSION_S, tries=2)
@@ -143,7 +145,7 @@ class VescMotor(AbstractMotor):
         self._link.send(VALUES_QUESTION)
         if answer is None:
             return None
-        values = parse_values(answer.payload)
+        self.values = values = parse_values(answer.payload)
         if (values.tachometer_absolute or 0) < self._way:
             self._lose("it has started anew")
         self._way = values.tachometer_absolute or 0

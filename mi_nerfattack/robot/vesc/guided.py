@@ -1,0 +1,164 @@
+"""Calibration of a car by short drives, each measured on the floor afterwards.
+
+A drive with the servo held is an arc. Where its end lies, ahead and to the left of its
+start, gives its length and its curvature; the motor's steps over the length are the
+scale of speed, and the steering angles of several arcs over the servo's positions are
+a line, whose slope and foot are the scale and the centre of steering.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.robot.devices import Command
+from mi_nerfattack.robot.vesc.calibration import Calibration
+from mi_nerfattack.robot.vesc.motor import VescMotor
+
+_PERIOD_S = 0.05
+_STANDING_MS, _STOP_S = 0.02, 5.0
+# Steps of the tachometer: six to an electrical turn, of which ERPM counts a minute's.
+_ERPM_PER_STEP = 60 / 6
+
+
+@dataclass(frozen=True)
+class Arc:
+    """A drive with the servo held.
+
+    Args:
+        servo: its position, 0 to 1.
+        steps: of the motor's tachometer, from standstill to standstill.
+        forward_m, left_m: where the middle of the rear axle came to, seen from where
+            it was, metres.
+    """
+
+    servo: float
+    steps: int
+    forward_m: float
+    left_m: float
+
+    @property
+    def length_m(self) -> float:
+        """Way of the middle of the rear axle, metres."""
+        half_turn = math.atan2(self.left_m, self.forward_m)
+        chord = math.hypot(self.forward_m, self.left_m)
+        return float(chord / np.sinc(half_turn / np.pi))
+
+    @property
+    def curvature(self) -> float:
+        """Of that way, 1/m, positive to the left."""
+        return 2 * self.left_m / (self.forward_m**2 + self.left_m**2)
+
+
+def drive_arc(
+    motor: VescMotor, command: Command, distance_m: float
+) -> tuple[float, int]:
+    """Drive until the motor has turned for a distance, and brake to a standstill.
+
+    Args:
+        motor: armed; its own calibration says what the command and distance are to it.
+        command: held all the way.
+        distance_m: metres.
+
+    Returns:
+        The servo's position, and the steps of the tachometer.
+
+    Raises:
+        InputError: it does not get that far, or does not stop.
+        DeviceLostError: the controller is lost.
+    """
+    calibration = motor.calibration
+    wanted = distance_m * calibration.erpm_per_ms / _ERPM_PER_STEP
+    start, sent = _steps(motor), motor.send(command)
+    end = time.monotonic() + 3.0 + 2 * distance_m / command.speed_ms
+    try:
+        while abs(_steps(motor) - start) < wanted:
+            if time.monotonic() > end:
+                raise InputError(
+                    f"VESC: no {distance_m:g} m at {command.speed_ms:g} m/s by the "
+                    "motor's turns; drive faster, check wheels and motor"
+                )
+            sent = motor.send(command)
+            time.sleep(_PERIOD_S)
+    finally:
+        motor.brake()
+    _stop(motor)
+    servo = calibration.servo_centre + calibration.servo_per_rad * sent.steering_rad
+    return servo, abs(_steps(motor) - start)
+
+
+def fit_arcs(
+    arcs: Sequence[Arc], wheelbase_m: float, calibration: Calibration
+) -> tuple[Calibration, float, float]:
+    """Return the calibration that arcs tell, and how far they are from it.
+
+    Args:
+        arcs: two or more, with different positions of the servo.
+        wheelbase_m: of the car, metres.
+        calibration: what they do not tell is its.
+
+    Returns:
+        The calibration; the largest distance of a steering angle from its line,
+        radians; the largest relative difference of the arcs' scales of speed.
+
+    Raises:
+        InputError: what they tell is not plausible.
+    """
+    for arc in arcs:
+        if not arc.length_m > 0.1 or not arc.steps:
+            raise InputError(
+                f"VESC: {arc.forward_m:g} m forward and {arc.left_m:g} m left in "
+                f"{arc.steps} steps of the motor; drive farther"
+            )
+    scales = [_ERPM_PER_STEP * arc.steps / arc.length_m for arc in arcs]
+    servo = np.array([arc.servo for arc in arcs])
+    steering = np.arctan([wheelbase_m * arc.curvature for arc in arcs])
+    if np.ptp(steering) < 0.05:
+        raise InputError(
+            f"VESC: steering angles of {steering.min():.3f} to {steering.max():.3f} "
+            "rad tell no scale; does the servo move? (VESC Tool: Enable Servo Output)"
+        )
+    slope, foot = np.polyfit(steering, servo, 1)
+    away = np.abs((servo - foot) / slope - steering).max()
+    mean = sum(arc.steps for arc in arcs) / sum(arc.length_m for arc in arcs)
+    found = {
+        "erpm_per_ms": round(_ERPM_PER_STEP * mean, 1),
+        "servo_per_rad": round(float(slope), 4),
+        "servo_centre": round(float(foot), 4),
+    }
+    return (
+        calibration.changed(found),
+        float(away),
+        (max(scales) - min(scales)) / min(scales),
+    )
+
+
+def _steps(motor: VescMotor) -> int:
+    """Return the tachometer, newly read."""
+    asked = time.monotonic()
+    while True:
+        read = motor.read()
+        if read is not None and read.time_s > asked:
+            return motor.values.tachometer or 0
+        time.sleep(0.01)
+
+
+def _stop(motor: VescMotor) -> None:
+    end = time.monotonic() + _STOP_S
+    while True:
+        motor.brake()
+        _steps(motor)
+        values = motor.values
+        if abs(values.erpm or 0) < _STANDING_MS * motor.calibration.erpm_per_ms:
+            return
+        if time.monotonic() > end:
+            raise InputError(
+                f"VESC: still at {values.erpm} ERPM {_STOP_S:g} s after the brake; "
+                "raise brake_current_a"
+            )
+        time.sleep(_PERIOD_S)

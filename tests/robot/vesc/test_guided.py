@@ -1,0 +1,144 @@
+"""A car's calibration by drives that somebody measures."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+
+import pytest
+from helpers.vesc_stand_in import ERPM_PER_MS, StandIn
+
+from mi_nerfattack import cli
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.robot.vesc.calibration import (
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from mi_nerfattack.robot.vesc.guided import Arc, fit_arcs
+
+WHEELBASE_M, CENTRE, PER_RAD = 0.3, 0.47, 1.1
+
+
+def end_of_arc(way_m: float, servo: float) -> tuple[float, float]:
+    """Return where a car of this file comes to, ahead and to the left."""
+    curvature = math.tan((servo - CENTRE) / PER_RAD) / WHEELBASE_M
+    if abs(curvature) < 1e-9:
+        return way_m, 0.0
+    turned = way_m * curvature
+    return math.sin(turned) / curvature, (1 - math.cos(turned)) / curvature
+
+
+def made_arcs(*servos: float) -> list[Arc]:
+    ways = [1.5 + 0.1 * i for i in range(len(servos))]
+    return [
+        Arc(servo, round(way * 480), *end_of_arc(way, servo))
+        for way, servo in zip(ways, servos, strict=True)
+    ]
+
+
+def test_arcs_tell_the_scales():
+    arcs = made_arcs(CENTRE, 0.7, 0.25)
+    before = Calibration(timeout_ms=200)
+    found, away_rad, spread = fit_arcs(arcs, WHEELBASE_M, before)
+    assert found == before.changed(
+        {"erpm_per_ms": 4800.0, "servo_per_rad": PER_RAD, "servo_centre": CENTRE}
+    )
+    assert away_rad < 1e-9 and spread < 1e-9
+    crooked = Arc(arcs[2].servo, arcs[2].steps, *end_of_arc(1.7, 0.31))
+    _, away_rad, _ = fit_arcs([*arcs[:2], crooked], WHEELBASE_M, before)
+    assert away_rad > 0.01
+
+
+@pytest.mark.parametrize(
+    ("arcs", "message"),
+    [
+        (made_arcs(0.5, 0.5), "Enable Servo Output"),
+        ([Arc(0.5, 30, 0.05, 0.0), *made_arcs(0.3, 0.7)], "0.05 m forward .* farther"),
+        ([Arc(0.5, 0, 1.5, 0.0), *made_arcs(0.3, 0.7)], "in 0 steps"),
+        ([Arc(0.1, 700, 1.0, 0.4), Arc(0.9, 700, 1, 0.4001)], "tell no scale"),
+        ([Arc(0.9, 700, 1.0, 0.4), Arc(0.901, 700, 1.0, -0.4)], "the servo hardly"),
+    ],
+)
+def test_measurements_that_are_not_plausible(arcs, message):
+    with pytest.raises(InputError, match=message):
+        fit_arcs(arcs, WHEELBASE_M, Calibration())
+
+
+class Person:
+    """Answers the questions as somebody with a tape would."""
+
+    def __init__(self, car: StandIn) -> None:
+        self.car, self.start_m, self.asked = car, 0.0, []
+
+    def __call__(self, prompt: str) -> str:
+        self.asked.append(prompt)
+        now = self.car.log()[-1]
+        if prompt.startswith("How"):
+            driven = [line for line in self.car.log() if line["event"] == "command 8"]
+            place = end_of_arc(now["way_m"] - self.start_m, driven[-1]["servo"])
+            return f"{place['left' in prompt]:.4f}"
+        self.start_m = now["way_m"]
+        return ""
+
+
+@pytest.mark.slow
+def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
+    """From scales that are wrong by a tenth and more to those of the car."""
+    begin, output = tmp_path / "begin.toml", tmp_path / "car.toml"
+    write_calibration(begin, Calibration(erpm_per_ms=4000.0, servo_per_rad=1.4))
+    with StandIn(tmp_path / "log") as car:
+        person = Person(car)
+        monkeypatch.setattr("builtins.input", person)
+        arguments = ["calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
+        arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
+        assert cli.main(arguments) == 0
+    found = read_calibration(output)
+    assert found.erpm_per_ms == pytest.approx(ERPM_PER_MS, rel=0.003)
+    assert found.servo_per_rad == pytest.approx(PER_RAD, rel=0.005)
+    assert found.servo_centre == pytest.approx(CENTRE, abs=0.002)
+    assert len(person.asked) == 1 + 3 * 3
+    shown = capsys.readouterr().out
+    assert "Armed: without commands it brakes after 250 ms with 20 A." in shown
+    assert f"Written to {output}." in shown and "(was 4000.0)" in shown
+
+
+@pytest.mark.slow
+def test_ctrl_c_brakes(tmp_path):
+    output, pipe = tmp_path / "car.toml", subprocess.PIPE
+    with StandIn(tmp_path / "log") as car:
+        command = [sys.executable, "-m", "mi_nerfattack.cli", "calibrate", car.port]
+        with subprocess.Popen(
+            [*command, "-o", str(output)], stdin=pipe, text=True
+        ) as process:
+            process.stdin.write("\n\n")
+            process.stdin.flush()
+            car.wait_for_event("memory")
+            while True:  # past the proof, which brakes, and on its way
+                if car.wait_for(mode="rpm")[-1]["way_m"] > 0.6:
+                    break
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 130
+        assert car.wait_for(speed_ms=0.0)[0]["event"] == "command 7"
+    assert not output.exists()
+
+
+def test_nothing_moves_before_somebody_answers(tmp_path, monkeypatch, capsys):
+    output = tmp_path / "car.toml"
+
+    def answer(prompt: str) -> str:
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", answer)
+    with StandIn(tmp_path / "log") as car:
+        assert cli.main(["calibrate", car.port, "-o", str(output)]) == 2
+        assert "run it in a terminal" in capsys.readouterr().err
+        assert "command 8" not in {line["event"] for line in car.log()}
+        output.write_text("")
+        assert cli.main(["calibrate", car.port, "-o", str(output)]) == 2
+        assert "exists; choose another" in capsys.readouterr().err
+        wrong = ["calibrate", car.port, "-o", str(tmp_path / "b"), "--speed-ms", "0"]
+        assert cli.main(wrong) == 2
+        assert "--speed-ms: 0.0; more than 0" in capsys.readouterr().err
