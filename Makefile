@@ -10,7 +10,7 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all test-fuzz test-random lint check-python clean
+.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
@@ -19,6 +19,7 @@ help:
 	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
 	@echo "make test-random  formats and geometry on other examples each time"
 	@echo "make lint         check format, lint and types"
+	@echo "make docs         build the documentation's site in build/docs"
 	@echo "make clean        remove the virtual environment and what was built"
 
 demo: $(VENV)/.installed
@@ -45,6 +46,10 @@ lint: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
+
+# Nothing is fetched; a warning, a dead link inside among them, is an error.
+docs: $(VENV)/.installed-dev
+	$(VENV)/bin/sphinx-build -W -n --keep-going -q -d build/docs-cache docs build/docs
 
 # A stamp says that the step is done, and is younger than what it was done from.
 $(VENV)/.installed: pyproject.toml | check-python

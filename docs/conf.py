@@ -1,0 +1,42 @@
+"""Settings of the documentation's site: `make docs`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+sys.path.append(str(HERE / "extensions"))
+
+project = "mi-nerfattack"
+copyright = "The mi-nerfattack authors"
+
+extensions = ["myst_parser", "mathml"]
+exclude_patterns = ["extensions", "examples"]
+# Nothing is fetched, neither while the site is built nor while it is read.
+html_math_renderer = "mathml"
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]  # ```math, which GitHub shows too
+
+html_theme = "furo"
+html_title = "mi-nerfattack"
+html_copy_source = False
+html_static_path = ["style"]
+html_css_files = ["tables.css"]
+# Fences without a language are commands with their output, or equations.
+highlight_language = "none"
+
+
+def _name_pages_of_the_site(app: Sphinx, page: str, text: list[str]) -> None:
+    """Point links at files beside what they describe to the site's page of them."""
+    del app, page
+    text[0] = text[0].replace("(../scenes/policy/pilotnet.md)", "(pilotnet.md)")
+
+
+def setup(app: Sphinx) -> None:
+    """Connect what the settings cannot say."""
+    app.connect("source-read", _name_pages_of_the_site)
