@@ -159,7 +159,10 @@ def read_box(
     number, field = names.index(boxes[0]), fields[boxes[0]]
     pose = poses[number]
     moved = offset_pose(pose, found.offsets[number])
-    return _box(found, boxes[0], field, Pose(*moved, pose.scale), texture_px), views
+    placed = Pose(*moved, pose.scale)
+    lower, upper, images = box_pictures(field, texture_px)
+    label, digest = found.label, found.digest
+    return AttackedBox(boxes[0], label, digest, lower, upper, placed, images), views
 
 
 def seen_most(box: AttackedBox, views: Views) -> str:
@@ -213,13 +216,18 @@ def _placed(found: FoundAttack) -> tuple[list[Pose], Views]:
     return poses, Views(camera, mount, matrices, period)
 
 
-def _box(
-    found: FoundAttack, name: str, field: GridField, pose: Pose, texture_px: int
-) -> AttackedBox:
+def box_pictures(
+    field: GridField, texture_px: int = TEXTURE_PX
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return `lower`, `upper` and `images` of `AttackedBox`.
+
+    Args:
+        field: of an object that is a box.
+        texture_px: of the longest edge, in the pictures.
+    """
     lower, upper = object_box(field)
     faces = render_faces(field, texture_px / float((upper - lower).max()))
-    images = {face: _solid(faces, key) for face, key in FACES.items()}
-    return AttackedBox(name, found.label, found.digest, lower, upper, pose, images)
+    return lower, upper, {face: _solid(faces, key) for face, key in FACES.items()}
 
 
 def _solid(faces: CubeFaces, key: str) -> np.ndarray:

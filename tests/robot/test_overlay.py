@@ -1,18 +1,24 @@
-"""Overlays against rays traced through every pixel by NumPy and OpenCV."""
+"""Overlays against rays traced through every pixel by NumPy and OpenCV.
+
+A render's pixel gathers 64 rays. Where between 40 and 60 % of them find white, as where
+several boundaries cross one pixel, the render itself does not tell on which side of a
+boundary the pixel is; all other pixels are checked, in every pose.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from helpers.boxes import flat_images, made_box
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.capture.mesh.mesh import CUBE_FACES
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera, look_at
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.robot.attacked import FACES
+from mi_nerfattack.robot.attacked import FACES, AttackedBox, box_pictures
 from mi_nerfattack.robot.overlay import Overlay, green_share
 
 cv2 = pytest.importorskip("cv2")
@@ -21,6 +27,8 @@ PINHOLE = Camera(183, 94, 90.0, 86.0, 90.0, 48.0)
 LENS = Camera(183, 94, 90.0, 86.0, 90.0, 48.0, -0.28, 0.07, 0.002, -0.003)
 POSE = Pose(Rotation.from_euler("zyx", [40, 10, -5], True).as_matrix(), np.ones(3), 0.5)
 CHECKS = 4
+FINE = 8  # rays a pixel, each way
+BLACK, WHITE = 10, 250
 
 
 def checked_box():
@@ -28,14 +36,16 @@ def checked_box():
     rows, columns = np.indices((256, 256)) // (256 // CHECKS)
     white = (rows + columns) % 2 == 0
     for face in FACES:
-        images[face] = np.where(white[..., None], [250] * 3, [10] * 3).astype(np.uint8)
+        images[face] = np.where(white[..., None], [WHITE] * 3, [BLACK] * 3).astype(
+            np.uint8
+        )
     return made_box(images, pose=POSE)
 
 
-def traced(box, camera: Camera, matrix: np.ndarray):
-    """Return per pixel: hit, whether white, and how far along the ray, metres."""
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    at = np.stack([columns, rows], -1).reshape(-1, 1, 2) + 0.5
+def pixel_rays(camera: Camera, fine: int = 1) -> np.ndarray:
+    """Return fine x fine unit rays of each pixel, (height, width, fine², 3)."""
+    columns, rows = (np.arange(n * fine) + 0.5 for n in (camera.width, camera.height))
+    at = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 1, 2) / fine
     lens = np.array(
         [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], float
     )
@@ -43,22 +53,27 @@ def traced(box, camera: Camera, matrix: np.ndarray):
     flat = cv2.undistortPoints(at, lens, np.array(camera.distortion), criteria=criteria)
     ray = np.concatenate([flat[:, 0], np.ones((len(at), 1))], 1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    pose = box.pose
+    ray = ray.reshape(camera.height, fine, camera.width, fine, 3).swapaxes(1, 2)
+    return ray.reshape(camera.height, camera.width, fine * fine, 3)
+
+
+def traced(box, ray: np.ndarray, matrix: np.ndarray):
+    """Return per ray (..., 3): hit, whether white, and how far along, metres."""
+    shape, pose = ray.shape[:-1], box.pose
     origin = pose.rotation.T @ (matrix[:3, 3] - pose.translation) / pose.scale
-    way = ray @ matrix[:3, :3].T @ pose.rotation / pose.scale
-    ends = np.stack([(bound - origin) / way for bound in (box.lower, box.upper)])
-    near, far = ends.min(0), ends.max(0).min(1)
-    axis, t = near.argmax(1), near.max(1)
+    way = pose.rotation.T @ matrix[:3, :3] @ ray.reshape(-1, 3).T / pose.scale
+    origin, lower, upper = (v[:, None] for v in (origin, box.lower, box.upper))
+    ends = (lower - origin) / way, (upper - origin) / way
+    near, far = np.minimum(*ends), np.maximum(*ends).min(0)
+    axis, t = near.argmax(0), near.max(0)
     hit = (t < far) & (t > 0)
-    point = (origin + t[:, None] * way - box.lower) / (box.upper - box.lower)
+    local = 2 * (origin + t * way - lower) / (upper - lower) - 1
     white = np.zeros(len(t), bool)
     for normal, right, up in map(np.array, CUBE_FACES.values()):
         side = np.flatnonzero(normal)[0]
-        mine = (axis == side) & (way[:, side] * normal[side] < 0)
-        local = 2 * point[mine] - 1
-        u, v = (1 + local @ right) / 2, (1 - local @ up) / 2
+        mine = (axis == side) & (way[side] * normal[side] < 0)
+        u, v = (1 + right @ local[:, mine]) / 2, (1 - up @ local[:, mine]) / 2
         white[mine] = (np.floor(CHECKS * u) + np.floor(CHECKS * v)) % 2 == 0
-    shape = camera.height, camera.width
     return hit.reshape(shape), (white & hit).reshape(shape), t.reshape(shape)
 
 
@@ -72,9 +87,9 @@ def poses(count: int) -> np.ndarray:
     return np.stack([look_at(eye, aim) for eye, aim in pairs])
 
 
-def farthest(found: np.ndarray, wanted: np.ndarray) -> float:
+def farthest(found: np.ndarray, wanted: np.ndarray, told=True) -> float:
     """Return how far from the edges of a mask another differs from it, pixels."""
-    wrong = found != wanted
+    wrong = (found != wanted) & told
     if not wrong.any() or wanted.all() or not wanted.any():
         return float(wrong.any())
     inner, outer = distance_transform_edt(wanted), distance_transform_edt(~wanted)
@@ -82,22 +97,81 @@ def farthest(found: np.ndarray, wanted: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
-def test_within_a_pixel_of_traced_rays(camera):
+def test_within_a_pixel_of_a_render(camera):
     box = checked_box()
     overlay = Overlay(box, camera, keyed=False)
-    shape = camera.height, camera.width, 3
+    shape = camera.height, camera.width
+    coarse, rays = pixel_rays(camera)[:, :, 0], pixel_rays(camera, FINE)
+    light = srgb_to_linear_numpy(np.arange(256) / 255)
+    middle = (light[BLACK] + light[WHITE]) / 2
     worst = []
     for matrix in poses(200):
-        over = [overlay.apply(np.full(shape, v, np.uint8), matrix) for v in (0, 255)]
-        share = 1 - (over[1].astype(int) - over[0])[..., 0] / 255
-        hit, white, _ = traced(box, camera, matrix)
-        inside = share > 0.99
-        bright = (over[0][..., 0] > 140) & inside
-        checks = farthest(bright | ~inside, white | ~inside)
-        worst.append((farthest(share > 0.5, hit), checks))
-    edges, checks = np.array(worst).T
+        on_black, on_white = (
+            light[overlay.apply(np.full((*shape, 3), v, np.uint8), matrix)[..., 0]]
+            for v in (0, 255)
+        )
+        share = 1 - (on_white - on_black)
+        near = binary_dilation(traced(box, coarse, matrix)[0], iterations=2)
+        hit, white = np.zeros(shape), np.zeros(shape)
+        for mask, found in zip(
+            (hit, white), traced(box, rays[near], matrix), strict=False
+        ):
+            mask[near] = found.mean(1)
+        inside = (share > 0.99) & (hit == 1)
+        told = inside & (np.abs(white - 0.5) > 0.1)
+        checks = farthest((on_black > middle) | ~inside, (white > 0.5) | ~inside, told)
+        worst.append((farthest(share > 0.5, hit > 0.5), checks, told.sum()))
+    edges, checks, pixels = np.array(worst).T
     assert edges.max() <= 1
-    assert np.quantile(checks, 0.9) <= 1
+    assert checks.max() <= 1
+    assert pixels.sum() > 1e5
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("variant")
+def test_within_a_pixel_of_the_field():
+    """The bundled cube's pictures against its field, marched along 9 rays a pixel.
+
+    The field's surface ends up to a voxel beside the box's, which is 1 px from 0.7 m.
+    """
+    from mi_nerfattack.fields.io import load_grid
+    from mi_nerfattack.render.camera.intrinsics import generate_rays, pose_arrays
+    from mi_nerfattack.render.march import march
+    from mi_nerfattack.render.posed import PosedField
+    from mi_nerfattack.render.rays import Rays
+    from mi_nerfattack.scenes import bundled
+
+    field = load_grid(bundled("cube/field.safetensors"))
+    lower, upper, images = box_pictures(field)
+    box = AttackedBox("cube", "", "", lower, upper, POSE, images)
+    overlay, posed = Overlay(box, LENS, keyed=False), PosedField(field, POSE)
+    shape, fine = (LENS.height, LENS.width), 3
+    camera = LENS.resized(fine * LENS.width, fine * LENS.height)
+    light = srgb_to_linear_numpy(np.arange(256) / 255)
+
+    def gathered(values: np.ndarray) -> np.ndarray:
+        return values.reshape(shape[0], fine, shape[1], fine, -1).mean((1, 3))
+
+    voxel = POSE.scale * float((field.upper - field.lower).max()) / 64
+    edges, colours, voxels_px = [], [], []
+    for matrix in poses(200):
+        rays = Rays(*generate_rays(camera, *pose_arrays(matrix[None]), 1))
+        seen = march(posed, rays)
+        opacity = gathered(seen.opacity.numpy())[..., 0]
+        radiance = gathered(seen.radiance.numpy().T)
+        on_black, on_white = (
+            light[overlay.apply(np.full((*shape, 3), v, np.uint8), matrix)]
+            for v in (0, 255)
+        )
+        share = 1 - (on_white - on_black)[..., 0]
+        edges.append(farthest(share > 0.5, opacity > 0.5))
+        inside = (share > 0.99) & (opacity > 0.99)
+        colours.append(np.abs(on_black - radiance)[inside].mean())
+        distance = traced(box, pixel_rays(LENS), matrix)[2][opacity > 0.5].min()
+        voxels_px.append(voxel * LENS.fx / distance)
+    assert np.quantile(edges, 0.95) <= 1
+    assert (np.array(edges) - voxels_px).max() <= 1
+    assert np.mean(colours) < 0.01
 
 
 def test_what_is_nearer_hides_it():
@@ -105,7 +179,7 @@ def test_what_is_nearer_hides_it():
     matrix = poses(1)[0]
     overlay = Overlay(box, PINHOLE, keyed=False)
     frame = np.full((94, 183, 3), 77, np.uint8)
-    hit, _, along = traced(box, PINHOLE, matrix)
+    hit, _, along = traced(box, pixel_rays(PINHOLE)[:, :, 0], matrix)
     depth = np.full(hit.shape, np.inf, np.float32)
     depth[:, :90] = 0.5 * along[hit].min()
     shown = overlay.apply(frame, matrix, depth)
@@ -121,7 +195,7 @@ def test_what_is_nearer_hides_it():
 def test_only_green_is_covered(exposure):
     box = made_box(flat_images(), pose=POSE)
     matrix = poses(1)[0]
-    hit, _, _ = traced(box, PINHOLE, matrix)
+    hit, _, _ = traced(box, pixel_rays(PINHOLE)[:, :, 0], matrix)
     frame = np.full((94, 183, 3), (90, 80, 85), np.uint8)
     frame[hit] = (45, 150, 60)
     frame[:, 80:95] = (150, 90, 40)  # somebody before it
