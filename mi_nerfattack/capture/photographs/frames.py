@@ -23,6 +23,7 @@ _SLACK = 0.4  # a frame may lie that much before or after its place, in baseline
 _RENEWED = 0.02  # shift to the reference frame from which on another is taken
 _RATIO = 1.15  # by which a baseline grows or shrinks until the frames are few or many
 _FEW, _FINEST = 20, 0.2  # frames below which it shrinks, and to which share of it
+_WINDOW = 32  # frames that are first looked at for the next one
 _MOVING = 75.0  # percentile of tiles: around a thing, the picture's middle stands still
 
 
@@ -90,17 +91,39 @@ def _spaced(motion: Motion, baseline: float) -> list[int]:
     found: list[int] = []
     start = 0
     while True:  # each of them is later, as its place is not the last one's
-        away = np.linalg.norm(motion.place[start:] - motion.place[start], axis=2)
-        moved = np.percentile(away, _MOVING, axis=1) / baseline
         near = 1 - _SLACK if found else 0.0
-        beyond = np.flatnonzero(moved > near + 2 * _SLACK)
-        if found and not len(beyond):
+        moved = _moved_from(motion, start, baseline, near + 2 * _SLACK)
+        is_beyond = moved[-1] > near + 2 * _SLACK
+        if found and not is_beyond:
             return found
         first = int(np.flatnonzero(moved >= near)[0])
-        end = int(beyond[0]) if len(beyond) else len(moved)
+        end = len(moved) - 1 if is_beyond else len(moved)
         window = np.arange(first, max(end, first + 1))
         start += int(window[motion.sharpness[start + window].argmax()])
         found.append(start)
+
+
+def _moved_from(
+    motion: Motion, start: int, baseline: float, limit: float
+) -> np.ndarray:
+    """Return how many baselines the frames from one on are away from it.
+
+    Up to the first beyond a limit, or to the film's end; looked for in windows that
+    grow, so that short baselines in a long film do not each cost the whole of it.
+    """
+    parts, at, length = [], start, _WINDOW
+    while at < len(motion.place):
+        away = np.linalg.norm(
+            motion.place[at : at + length] - motion.place[start], axis=2
+        )
+        moved = np.percentile(away, _MOVING, axis=1) / baseline
+        beyond = np.flatnonzero(moved > limit)
+        if len(beyond):
+            parts.append(moved[: beyond[0] + 1])
+            break
+        parts.append(moved)
+        at, length = at + length, 2 * length
+    return np.concatenate(parts)
 
 
 def measure_motion(

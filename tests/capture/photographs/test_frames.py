@@ -71,6 +71,34 @@ class TestChoice:
         found = choose_frames(motion, FrameOptions(frames=20, baseline=0.05))
         assert 10 <= len(found) <= 20 and found[-1] > 400
 
+    def test_a_long_film_is_looked_through_a_few_times(self, monkeypatch):
+        """The choice is that of a search to the film's end, at a small part of it."""
+        rng = np.random.default_rng(4)
+        place = rng.normal(0.004, 0.01, (3000, 16, 2)).cumsum(0)
+        motion = Motion(rng.uniform(size=len(place)), place)
+        looked, percentile = [], np.percentile
+
+        def counted(away: np.ndarray, *rest, **names):
+            looked.append(len(away))
+            return percentile(away, *rest, **names)
+
+        monkeypatch.setattr(np, "percentile", counted)
+        found = choose_frames(motion, FrameOptions(frames=1000, baseline=0.1))
+        assert len(found) > 100 and sum(looked) < 8 * len(place)
+        wanted, start, near = [], 0, 0.0
+        while True:
+            away = np.linalg.norm(place[start:] - place[start], axis=2)
+            moved = percentile(away, 75, axis=1) / 0.1
+            if not (moved > near + 0.8).any():
+                break
+            end = int(np.argmax(moved > near + 0.8))
+            first = int(np.argmax(moved >= near))
+            window = motion.sharpness[start + first : start + max(end, first + 1)]
+            start += first + int(window.argmax())
+            wanted.append(start)
+            near = 0.6
+        assert found == wanted
+
     @pytest.mark.parametrize("options", [{"frames": 0}, {"baseline": 0.0}])
     def test_options(self, options):
         with pytest.raises(InputError, match=next(iter(options))):
