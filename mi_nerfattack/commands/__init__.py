@@ -26,6 +26,7 @@ from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
 from mi_nerfattack.commands.retrain import Retrain
+from mi_nerfattack.commands.serve_policy import ServePolicy
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.commands.transfer import Transfer
@@ -57,6 +58,7 @@ COMMANDS: dict[str, type[Command]] = {
     "transfer": Transfer,
     "retrain": Retrain,
     "overlay": OverlayCommand,
+    "serve-policy": ServePolicy,
     "compare-drives": CompareDrives,
     "calibrate": Calibrate,
     "report": Report,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
+from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.vehicle.route.route import Route
@@ -48,7 +48,7 @@ def drive(
     memory = policy.initial_memory(1)
     states, controls = [environment.state[:3]], []
     for index in range(steps):
-        row, memory = policy.step(policy_image(frame), route.goal, memory)
+        row, memory = policy.step(policy_image(frame.image), route.goal, memory)
         controls.append(float(np.array(row)[0]))
         frame = environment.step(controls[-1])
         states.append(environment.state[:3])
@@ -69,6 +69,10 @@ def drive(
     )
 
 
-def policy_image(frame: CameraFrame) -> mi.TensorXf:
-    """Return the image that a policy gets: (1, height, width, 3), sRGB in [0, 1]."""
-    return mi.TensorXf(np.divide(frame.image[None], 255, dtype=np.float32))
+def policy_image(image: np.ndarray) -> mi.TensorXf:
+    """Return what a policy gets: (1, height, width, 3), sRGB in [0, 1].
+
+    Args:
+        image: (height, width, 3), uint8 sRGB.
+    """
+    return mi.TensorXf(np.divide(image[None], 255, dtype=np.float32))

@@ -4,4 +4,7 @@ from .monitor import Screen as Screen
 from .monitor import screen_image as screen_image
 from .overlay import Overlay as Overlay
 from .paper import write_net as write_net
+from .remote.pilot import RemotePilot as RemotePilot
+from .remote.sealed import Endpoint as Endpoint
+from .remote.sealed import read_key as read_key
 from .vesc.motor import VescMotor as VescMotor

@@ -174,7 +174,7 @@ class Film:
             shown = frame if step in wanted else None
             yield Moment(step, self.environment.state, memory, shown)
             if watched:
-                _, memory = policy.step(policy_image(frame), route.goal, memory)
+                _, memory = policy.step(policy_image(frame.image), route.goal, memory)
 
     def cost_by_image(self, steps: Sequence[int]) -> dict[int, np.ndarray]:
         """Differentiate the objective of the drive by its images.
@@ -216,7 +216,9 @@ class Film:
         if cost is not None:
             layers |= {f"cost.d{c}": cost[..., i] for i, c in enumerate("RGB")}
         if moment.step < len(self.drive.controls):
-            (planes,) = self.world.policy.planes(policy_image(frame), moment.memory)
+            (planes,) = self.world.policy.planes(
+                policy_image(frame.image), moment.memory
+            )
             layers |= {f"input.{k}": plane for k, plane in enumerate(planes)}
         # path-traced light sources may exceed the range of half precision
         half = self.drive.environment == SURROGATE

@@ -1,0 +1,91 @@
+"""``mi-nerfattack serve-policy``: a policy for a car on another computer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
+
+if TYPE_CHECKING:
+    from mi_nerfattack.policy.base import AbstractPolicy
+    from mi_nerfattack.robot.remote.server import Control
+
+
+@dataclass(frozen=True)
+class ServePolicy:
+    """Decide for a car that sends its frames, until Ctrl-C.
+
+    One car at a time. Without --key it listens on this computer alone.
+    """
+
+    policy: tyro.conf.Positional[str | None] = None
+    """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
+    file with the section [policy] of a scenario; the bundled policy by default."""
+    listen: str = "127.0.0.1:7447"
+    """HOST:PORT of this computer, as the car reaches it."""
+    key: Path | None = None
+    """File with the key that the car has, too; needed for other computers."""
+    route_goal: int = 0
+    """Goal of the route that is driven, as its file says it."""
+    size: tuple[int, int] | None = None
+    """Width and height of the car's frames: tries the policy on a black one first, so
+    that the first decision is as quick as the others."""
+    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    """How the policy is called."""
+
+    def run(self) -> int:
+        """Load, listen, and serve."""
+        from contextlib import closing
+
+        import numpy as np
+
+        from mi_nerfattack import variant
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
+        from mi_nerfattack.robot.remote.server import PolicyServer
+
+        endpoint = Endpoint.parse(self.listen)
+        key = read_key(self.key, endpoint)
+        if self.size is not None and min(self.size) < 1:
+            raise InputError(f"--size: {self.size}; width and height, 1 or more")
+        variant.ensure()
+        policy = self.options.section(self.policy).build()
+
+        def make_control() -> Control:
+            return _control(policy, self.route_goal)
+
+        if self.size is not None:
+            width, height = self.size
+            make_control()(np.zeros((height, width, 3), np.uint8))
+
+        def say(text: str) -> None:
+            print(text, flush=True)
+
+        with closing(PolicyServer(endpoint, key, make_control, say)) as server:
+            sealed = "sealed by the key" if key else "on this computer alone"
+            say(f"Serving at {endpoint}, {sealed}; Ctrl-C ends")
+            try:
+                server.run()
+            except KeyboardInterrupt:
+                say(f"Ended: {server.summary()}")
+        return 0
+
+
+def _control(policy: AbstractPolicy, goal: int) -> Control:
+    """Return what a policy makes of images, one after the other."""
+    import numpy as np
+
+    from mi_nerfattack.deploy.driving import policy_image
+
+    memory = policy.initial_memory(1)
+
+    def control(image: np.ndarray) -> float:
+        nonlocal memory
+        row, memory = policy.step(policy_image(image), goal, memory)
+        return float(np.array(row)[0])
+
+    return control

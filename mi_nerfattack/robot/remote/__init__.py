@@ -1,0 +1,1 @@
+"""A policy on another computer: frames there, decisions back, by zenoh."""

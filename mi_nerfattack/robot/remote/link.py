@@ -1,0 +1,87 @@
+"""Zenoh between exactly two computers: one listens, the other connects."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.robot.devices import DeviceLostError
+from mi_nerfattack.robot.remote.sealed import Endpoint
+from mi_nerfattack.system.extras import load_extra
+
+TO_POLICY, TO_CAR = "mi_nerfattack/to_policy", "mi_nerfattack/to_car"
+#: Largest message that is looked at.
+MAX_BYTES = 1 << 26
+
+
+class Link:
+    """A connection on which bytes go both ways; what cannot be sent in time is dropped.
+
+    Nothing is searched for in the network, and nothing else connected to.
+
+    Args:
+        endpoint: of the server.
+        listens: whether this side is the server.
+        on_bytes: called with what arrives, by a thread of zenoh's.
+        timeout_s: longest wait for the connection.
+
+    Raises:
+        InputError: it cannot listen there.
+        DeviceLostError: nobody listens there.
+        SetupError: zenoh is not installed.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        listens: bool,
+        on_bytes: Callable[[bytes], None],
+        timeout_s: float = 5.0,
+    ) -> None:
+        zenoh = load_extra("zenoh", "remote", "a policy on another computer")
+        place = [f"tcp/{endpoint}"]
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "peer",
+            "listen/endpoints": place if listens else [],
+            "connect/endpoints": [] if listens else place,
+            "connect/timeout_ms": round(1e3 * timeout_s),
+            "connect/exit_on_failure": True,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "transport/shared_memory/enabled": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            self._session: Any = zenoh.open(config)
+        except zenoh.ZError as error:
+            reason = str(error).partition(" at /")[0]
+            if listens:
+                raise InputError(
+                    f"--listen {endpoint}: {reason}; end what listens there, or choose "
+                    "another address of this computer or port"
+                ) from error
+            raise DeviceLostError(
+                f"policy at {endpoint}: {reason}; start 'mi-nerfattack serve-policy' "
+                "there, and look to address, port and firewall"
+            ) from error
+
+        def received(sample: Any) -> None:
+            if len(sample.payload) <= MAX_BYTES:
+                on_bytes(sample.payload.to_bytes())
+
+        there, here = (TO_CAR, TO_POLICY) if listens else (TO_POLICY, TO_CAR)
+        self._subscriber = self._session.declare_subscriber(here, received)
+        self._publisher = self._session.declare_publisher(
+            there, congestion_control=zenoh.CongestionControl.DROP, express=True
+        )
+
+    def send(self, raw: bytes) -> None:
+        """Send, or drop; nothing is raised where the other side is gone."""
+        self._publisher.put(raw)
+
+    def close(self) -> None:
+        """End the connection; more than once does no harm."""
+        self._session.close()
