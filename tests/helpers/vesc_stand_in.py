@@ -31,6 +31,7 @@ CHECK_S = 0.01  # the firmware looks at its timeout so often
 LONGEST_GAP_S = 0.2  # of this process's sleep that counts as time
 MASS_KG, NEWTON_PER_A, FRICTION_MS2 = 4.5, 0.66, 0.15
 ERPM_PER_MS, MOST_MS2 = 4614.0, 3.0  # of the speed controller
+LEAST_ERPM = 900  # that it holds; for less it lets go of the motor
 ALIVE_IDS = {5, 6, 7, 8, 9, 10, 30, 84}
 SIGNATURES = {(7, 1): 982638166, (7, 0): 2099347128, (6, 5): 2099347128}
 FLAWS = {
@@ -92,14 +93,14 @@ class Car:
 
     def tick(self) -> None:
         """Move for a tick under what the motor does."""
-        if self.mode == "rpm":
+        if self.mode == "rpm" and abs(self.value) >= LEAST_ERPM:
             wanted = (self.value / ERPM_PER_MS - self.speed) / 0.05
             self.speed += max(-MOST_MS2, min(MOST_MS2, wanted)) * TICK_S
         else:
             rolling = FRICTION_MS2
             if self.mode == "brake":
                 rolling += abs(self.value) * NEWTON_PER_A / MASS_KG
-            else:
+            elif self.mode == "current":
                 self.speed += self.value * NEWTON_PER_A / MASS_KG * TICK_S
             slower = max(0.0, abs(self.speed) - rolling * TICK_S)
             self.speed = math.copysign(slower, self.speed)
@@ -321,12 +322,12 @@ class StandIn:
             time.sleep(0.02)
         raise TimeoutError(f"{self.path}: never {wanted}")
 
-    def wait_for_event(self, event: str) -> None:
-        """Return once a line of the log has this event."""
+    def wait_for_line(self, **wanted: Any) -> None:
+        """Return once the log has a line as wanted."""
         deadline = time.monotonic() + 30
-        while not any(line["event"] == event for line in self.log()):
+        while not any(wanted.items() <= line.items() for line in self.log()):
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{self.path}: never {event}")
+                raise TimeoutError(f"{self.path}: never {wanted}")
             time.sleep(0.02)
 
     def close(self) -> None:

@@ -25,6 +25,8 @@ class Calibration(Section):
         servo_per_rad: change of the servo's position (0 to 1) for a radian to the left.
         servo_centre: its position straight ahead.
         servo_least, servo_most: ends that the servo is never sent beyond.
+        erpm_least: slowest turns that the controller holds (VESC Tool: PID Controllers,
+            Minimum ERPM); asked for slower ones it would let the wheels roll.
         erpm_most: fastest that the motor is told to turn, either way.
         steering_most_rad: largest steering angle, either way.
         brake_current_a: amperes through the motor to brake with.
@@ -36,6 +38,7 @@ class Calibration(Section):
     servo_centre: Share = 0.5304
     servo_least: Share = 0.15
     servo_most: Share = 0.85
+    erpm_least: Annotated[int, Field(ge=0, le=20_000)] = 900
     erpm_most: Annotated[int, Field(ge=1, le=200_000)] = 9228
     steering_most_rad: Acute = 0.34
     brake_current_a: Annotated[float, Field(ge=1, le=200)] = 20.0
@@ -48,6 +51,8 @@ class Calibration(Section):
         if not self.servo_least < self.servo_centre < self.servo_most:
             span = f"{self.servo_least} to {self.servo_most}"
             refuse("servo_centre", f"{self.servo_centre} is not within {span}")
+        if not self.erpm_least < self.erpm_most:
+            refuse("erpm_least", f"{self.erpm_least} is not below erpm_most")
         return self
 
     def changed(self, values: Mapping[str, float]) -> Calibration:
@@ -62,16 +67,17 @@ class Calibration(Section):
     def encode(self, command: Command) -> tuple[int, int]:
         """Return electrical turns a minute and thousandths of the servo's range.
 
-        Both are within the limits, whatever the command.
+        Both are within the limits, whatever the command; 0 turns are to be braked for.
         """
         fastest = self.erpm_most
         erpm = _clipped(command.speed_ms * self.erpm_per_ms, -fastest, fastest)
+        erpm = 0 if abs(erpm) < self.erpm_least else round(erpm)
         limit = self.steering_most_rad
         steering = _clipped(command.steering_rad, -limit, limit)
         servo = self.servo_centre + self.servo_per_rad * steering
         least = math.ceil(self.servo_least * _THOUSAND)
         most = math.floor(self.servo_most * _THOUSAND)
-        return round(erpm), round(_clipped(servo * _THOUSAND, least, most))
+        return erpm, round(_clipped(servo * _THOUSAND, least, most))
 
     def decode(self, erpm: int, servo: int) -> Command:
         """Return the command that turns and thousandths are."""

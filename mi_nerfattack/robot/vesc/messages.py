@@ -110,7 +110,9 @@ _FAULTS = (
     "encoder, encoder, damaged flash, offset of current sensor 1, "
     "offset of current sensor 2, offset of current sensor 3, unbalanced currents, "
     "brake, resolver, resolver, resolver, damaged flash of the app's configuration, "
-    "damaged flash of the motor's configuration"
+    "damaged flash of the motor's configuration, no magnet at the encoder, "
+    "too strong a magnet at the encoder, phase filter, encoder, low voltage output, "
+    "slip of the encoder, too fast, too slow, far too fast"
 ).split(", ")
 
 
@@ -120,7 +122,7 @@ def fault_name(number: int) -> str:
 
 
 def set_rpm(erpm: int) -> bytes:
-    """Hold a speed, electrical turns a minute."""
+    """Hold a speed, electrical turns a minute; below its least it lets go instead."""
     return struct.pack(">Bi", Id.SET_RPM, erpm)
 
 

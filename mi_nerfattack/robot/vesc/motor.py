@@ -98,6 +98,8 @@ class VescMotor(AbstractMotor):
     def send(self, command: Command) -> Command:
         """Send a command, which is the only sign of life that the controller gets.
 
+        It brakes for standstill and for what is slower than the controller can hold.
+
         Returns:
             What was really sent, within the calibration's limits and in the steps of
             the controller.
@@ -113,7 +115,9 @@ class VescMotor(AbstractMotor):
         ):
             raise InputError(f"VESC: {command}; speed and steering must be finite")
         erpm, servo = self.calibration.encode(command)
-        self._link.send(set_servo_position(servo), set_rpm(erpm))
+        current_a = self.calibration.brake_current_a
+        turn = set_rpm(erpm) if erpm else set_current_brake(current_a)
+        self._link.send(set_servo_position(servo), turn)
         return self.calibration.decode(erpm, servo)
 
     def brake(self) -> None:

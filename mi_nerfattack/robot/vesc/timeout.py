@@ -52,10 +52,16 @@ def set_timeout(
     where they are right.
 
     Raises:
-        InputError: its configuration is of an unknown layout, it was not allowed to be
-            written, or reads back otherwise than it was written.
+        InputError: it does not say whether its timeout has fired, its configuration is
+            of an unknown layout, was not allowed to be written, or reads back otherwise
+            than it was written.
         DeviceLostError: no answer.
     """
+    if _values(link)[1].has_timed_out is None:
+        raise InputError(
+            f"VESC: firmware {firmware} does not say whether its timeout has fired, so "
+            "nothing can be proven; update it to 5.03 or later with VESC Tool"
+        )
     before = _configuration(link, firmware)
     wanted = _TIMEOUT.pack(calibration.timeout_ms, calibration.brake_current_a)
     end = _HEAD.size + _TIMEOUT.size
@@ -114,11 +120,6 @@ def _turn_wheels(link: Link, calibration: Calibration) -> tuple[float, int]:
         sent = time.monotonic()
         link.send(set_rpm(erpm))
         _, values = _values(link)
-        if values.has_timed_out is None:
-            raise InputError(
-                "VESC: its firmware does not say whether its timeout has fired, so "
-                "nothing can be proven; update it to 5.03 or later with VESC Tool"
-            )
         if values.fault:
             name = fault_name(values.fault)
             raise InputError(f"VESC: fault {values.fault} ({name}); mend it first")

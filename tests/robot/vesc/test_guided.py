@@ -115,7 +115,7 @@ def test_ctrl_c_brakes(tmp_path):
         ) as process:
             process.stdin.write("\n\n")
             process.stdin.flush()
-            car.wait_for_event("memory")
+            car.wait_for_line(event="memory")
             while True:  # past the proof, which brakes, and on its way
                 if car.wait_for(mode="rpm")[-1]["way_m"] > 0.6:
                     break

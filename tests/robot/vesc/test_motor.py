@@ -78,10 +78,12 @@ def test_what_is_sent(start):
     with closing(VescMotor(car.port)) as motor:
         motor.arm()
         assert "memory" not in [line["event"] for line in car.log()]  # it was right
-        sent = motor.send(Command(0.1, 0.1))
-        assert sent.speed_ms == pytest.approx(461 / 4614)
+        sent = motor.send(Command(0.3, 0.1))
+        assert sent.speed_ms == pytest.approx(1384 / 4614)
         assert sent.steering_rad == pytest.approx((0.409 - 0.5304) / -1.2135)
-        car.wait_for(servo=0.409)
+        car.wait_for_line(servo=0.409, mode="rpm")
+        assert motor.send(Command(0.05, 0.1)).speed_ms == 0.0
+        car.wait_for_line(servo=0.409, mode="brake", event="command 7")
         with pytest.raises(InputError, match="finite"):
             motor.send(Command(0.1, float("nan")))
         motor.brake()
@@ -158,7 +160,7 @@ REFUSED = {
     "deaf": (["--flaw", "deaf"], "no answer to SET_APPCONF_NO_STORE"),
     "endless": (["--flaw", "endless"], "300 ms after the last command it does not"),
     "coasting": (["--flaw", "coasting"], "the wheels turn on at"),
-    "dumb": (["--flaw", "dumb"], "does not say whether its timeout has fired"),
+    "dumb": (["--flaw", "dumb"], "6.05 on 410 does not say whether its"),
     "declined": (["--firmware", "5.03"], "5.03 on 410 keeps its timeout of 1000 ms"),
     "older": (["--firmware", "3.57"], r"3\.57 .* known of 3\.58 to 7\.x alone"),
     "newer": (["--firmware", "8.00"], r"8\.00 .* cannot be armed"),
@@ -180,7 +182,7 @@ def test_what_is_not_armed(start, name):
             motor.arm()
         with pytest.raises(InputError, match="not armed"):
             motor.send(Command(1.0, 0.0))
-        car.wait_for_event("command 7")  # it brakes, as well as it can
+        car.wait_for_line(event="command 7")  # it brakes, as well as it can
 
 
 def test_flash_is_written_once_and_after_a_question(start):
