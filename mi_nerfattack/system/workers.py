@@ -11,16 +11,15 @@ import multiprocessing
 import signal
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 from mi_nerfattack.system.cores import cores
-from mi_nerfattack.system.processes import safe_path
+from mi_nerfattack.system.processes import blocked_interrupts, safe_path
 
 #: Most processes.
 MOST = 256
@@ -196,7 +195,7 @@ class _Member:
         self.connection, theirs = context.Pipe()
         self.piece, self.done = 0, 0
         self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-        with safe_path(), _blocked_interrupts():
+        with safe_path(), blocked_interrupts():
             self._process.start()
         theirs.close()  # so that its end is noticed
 
@@ -255,24 +254,6 @@ def chosen_workers(count: int | None, alone: bool) -> AbstractWorkers:
 def available_cores() -> int:
     """Return the number of cores that this process may use, at most `MOST`."""
     return min(cores(), MOST)
-
-
-@contextmanager
-def _blocked_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all, from processes that start here.
-
-    They inherit the mask; else it would end them, with a traceback each, in the seconds
-    until `_serve` runs.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # not on Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # its start would unblock them
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(work: AbstractWork, connection: Connection) -> None:

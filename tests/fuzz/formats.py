@@ -334,6 +334,16 @@ def _routes(folder: Path) -> list[tuple[Path, Read]]:
     return [(folder / "routes.json", read)]
 
 
+def _zed(folder: Path) -> list[tuple[Path, Read]]:
+    from helpers.zed_files import calibration_text
+
+    from mi_nerfattack.robot.camera.zed import LeftEye, read_left_eye
+
+    path = folder / "SN1.conf"
+    path.write_text(calibration_text())
+    return [(path, lambda path: LeftEye(read_left_eye(path)))]
+
+
 _TEXT, _JSON = one_of(of_text, of_text, of_bytes), one_of(of_json, of_json, of_text)
 _JSON_OR_BYTES = one_of(of_json, of_json, of_text, of_bytes)
 _TENSORS = one_of(of_tensors, of_tensors, of_bytes)
@@ -369,4 +379,5 @@ FORMATS: dict[str, Format] = {
     "mcap": Format(programs.logs, one_of(of_text, of_bytes)),
     "video": Format(programs.videos, of_bytes),
     "xml": Format(programs.scenes, _TEXT),
+    "zed": Format(_zed, _TEXT),
 }

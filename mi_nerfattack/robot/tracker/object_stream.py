@@ -33,6 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import TrackedPose
+from mi_nerfattack.robot.tracker.newest import MOST_BODIES, NewestPoses
 
 #: Meaning of the three numbers of a rotation, body to world: angles about the body's
 #: own x, then y, then z axis (R = Rx Ry Rz), or axis times angle.
@@ -40,14 +41,12 @@ Convention = Literal["euler", "rotation-vector"]
 CONVENTIONS: tuple[Convention, ...] = ("euler", "rotation-vector")
 
 SIZES = (256, 512, 1024)  # bytes of a datagram
-REPEATS = 3  # frames in which a pose may repeat bit for bit
 #: Silence after which a lower frame number is a new start of Tracker, no late datagram.
 RESTART_S = 0.5
 _BLOCK, _ITEM = struct.Struct("<IB"), struct.Struct("<BH")
 _OBJECT = struct.Struct("<24s6d")
 _OBJECT_KINDS = 0, 2  # by Vicon's manual; by what one receiver found
 _LARGEST_MM, _LARGEST_RAD = 1e6, 6.3
-_MOST_BODIES = 256
 
 
 @dataclass(frozen=True)
@@ -116,22 +115,11 @@ def to_rotation(rotation_rad: ArrayLike, convention: Convention) -> Rotation:
     return Rotation.from_rotvec(rotation_rad)
 
 
-@dataclass
-class _Body:
-    """The last of a body: its pose, the numbers behind it, and how often they came."""
-
-    pose: TrackedPose
-    values: tuple[float, ...]
-    repeats: int = 0
-
-
 class ObjectStream:
     """The newest pose of each body in a stream of datagrams.
 
     Blocks of one frame have one time, that of the first. A frame older than one that
-    came within `RESTART_S` is dropped. A pose that repeats bit for bit in more than
-    `REPEATS` frames is that of a body that Tracker has lost, since measurements jitter:
-    its time is that of the last frame that counted.
+    came within `RESTART_S` is dropped.
 
     Args:
         convention: of the rotations.
@@ -144,7 +132,7 @@ class ObjectStream:
             )
         self._convention: Convention = convention
         self._frame, self._time_s = -1, -np.inf
-        self._bodies: dict[str, _Body] = {}
+        self._poses, self._rotations = NewestPoses(), dict[str, np.ndarray]()
         self._refused: dict[str, str] = {}
         self._error = ""
 
@@ -168,40 +156,23 @@ class ObjectStream:
         if block.frame != self._frame:
             self._frame, self._time_s = block.frame, time_s
         for name, values in block.objects.items():
-            self._update(name, values)
-        if len(self._refused) < _MOST_BODIES:
+            matrix = np.eye(4)
+            matrix[:3, :3] = to_rotation(values[3:], self._convention).as_matrix()
+            matrix[:3, 3] = 1e-3 * np.array(values[:3])
+            if self._poses.update(name, matrix, self._time_s, self._frame):
+                self._rotations[name] = np.array(values[3:])
+            self._refused.pop(name, None)
+        if len(self._refused) < MOST_BODIES:
             self._refused.update(block.refused)
         return True
 
-    def _update(self, name: str, values: tuple[float, ...]) -> None:
-        known = self._bodies.get(name)
-        if known is None and len(self._bodies) >= _MOST_BODIES:
-            return
-        repeats = 0
-        if known is not None:
-            if known.pose.index == self._frame:
-                return
-            repeats = known.repeats + 1 if known.values == values else 0
-            if repeats > REPEATS:
-                known.repeats = repeats
-                return
-        self._refused.pop(name, None)
-        matrix = np.eye(4)
-        matrix[:3, :3] = to_rotation(values[3:], self._convention).as_matrix()
-        matrix[:3, 3] = 1e-3 * np.array(values[:3])
-        matrix.setflags(write=False)
-        pose = TrackedPose(matrix, self._time_s, self._frame)
-        self._bodies[name] = _Body(pose, values, repeats)
-
     def newest(self, body: str) -> TrackedPose | None:
         """Return the newest pose of a body; None before the first."""
-        known = self._bodies.get(body)
-        return None if known is None else known.pose
+        return self._poses.newest(body)
 
     def rotation(self, body: str) -> np.ndarray | None:
-        """Return the three numbers (3,), radians, that the newest pose turns by."""
-        known = self._bodies.get(body)
-        return None if known is None else np.array(known.values[3:])
+        """Return the three numbers (3,), radians, that came last for a body."""
+        return self._rotations.get(body)
 
     def explain(self, body: str) -> str:
         """Say why no new pose of a body comes; empty where nothing came at all."""
@@ -209,13 +180,4 @@ class ObjectStream:
             return f"what comes is no object stream: {self._error}" * bool(self._error)
         if body in self._refused:
             return f"{body!r}: {self._refused[body]}"
-        known = self._bodies.get(body)
-        if known is None:
-            names = ", ".join(sorted({*self._bodies, *self._refused})) or "no object"
-            return f"the stream has {names}, not {body!r}: tick it in Tracker"
-        if known.repeats > REPEATS:
-            return (
-                f"{body!r} repeats bit for bit, as what Tracker has lost from view: "
-                "are enough markers seen?"
-            )
-        return f"{body!r} was last in frame {known.pose.index} of {self._frame}"
+        return self._poses.explain(body, self._frame, "tick it in Tracker")

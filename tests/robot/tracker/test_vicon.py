@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 
 import pytest
 from helpers.vicon_sender import Sender, datagrams
+from helpers.waiting import wait_for
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import DeviceLostError
 from mi_nerfattack.robot.tracker.vicon import ViconTracker
-
-
-def wait_for(found: Callable[[], object]) -> None:
-    """Wait until something holds."""
-    end = time.monotonic() + 20
-    while not found():
-        assert time.monotonic() < end
-        time.sleep(0.002)
 
 
 @pytest.fixture
