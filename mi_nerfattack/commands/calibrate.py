@@ -24,7 +24,7 @@ class Calibrate:
     measure with a tape. It asks before anything moves; Ctrl-C brakes.
     """
 
-    port: tyro.conf.Positional[str]
+    port: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PORT")]
     """Serial port of the VESC, such as /dev/ttyACM0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the calibration (.toml); one that exists is not written over."""
@@ -108,7 +108,9 @@ class Calibrate:
         servo, steps = drive_arc(motor, command, self.distance_m)
         forward_m = _ask_number("How far along that line did the middle come, metres")
         left_m = _ask_number("How far to its left, metres (right: negative)")
-        return Arc(servo, steps, forward_m, left_m)
+        arc = Arc(servo, steps, forward_m, left_m)
+        print(f"Servo {servo:.3f}: {steps} steps of the motor, {arc.length_m:.3f} m.")
+        return arc
 
     def _tell(self, before: Calibration, found: Calibration) -> None:
         for name in ("erpm_per_ms", "servo_per_rad", "servo_centre"):

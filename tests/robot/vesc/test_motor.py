@@ -185,6 +185,7 @@ def test_what_is_not_armed(start, name):
         car.wait_for_line(event="command 7")  # it brakes, as well as it can
 
 
+@pytest.mark.slow
 def test_flash_is_written_once_and_after_a_question(start):
     car = start("--firmware", "5.03")
     asked = []
