@@ -7,6 +7,7 @@ import sys
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
 from bench.commands.memory import BenchMemory
+from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
 from bench.commands.scaling import BenchScaling
 from bench.commands.speed import (
@@ -35,6 +36,7 @@ COMMANDS = {
     "dagger": BenchDagger,
     "study": BenchStudy,
     "table2": BenchTable2,
+    "methods": BenchMethods,
     "overlay": BenchOverlay,
 }
 

@@ -48,6 +48,28 @@ def stamp(document: dict[str, Any], command: Sequence[str]) -> dict[str, Any]:
     }
 
 
+def summary_of(sweep: Path) -> dict[str, Any]:
+    """Return what a sweep, finished or not, or a copy of its table came to."""
+    from mi_nerfattack.experiment.sweep.cell import CELLS
+    from mi_nerfattack.experiment.sweep.summary import SUMMARY, write_summary
+
+    if (sweep / CELLS).is_dir():
+        return write_summary(sweep)
+    return files.read_json(sweep / SUMMARY)
+
+
+def copy_sweep(sweep: Path, output: Path) -> None:
+    """Copy a sweep's table and summary, unless they are there already."""
+    from mi_nerfattack.experiment.sweep.summary import SUMMARY
+    from mi_nerfattack.experiment.sweep.table import MAX_TABLE_BYTES, RESULTS
+
+    files.make_folder(output)
+    if output.resolve() != sweep.resolve():
+        for name in (RESULTS, SUMMARY):
+            raw = files.read_bytes(sweep / name, MAX_TABLE_BYTES)
+            files.write_bytes(output / name, raw)
+
+
 def write(target: Path, name: str, document: dict[str, Any]) -> Path:
     """Write a stamped document.
 

@@ -31,11 +31,7 @@ class BenchTable2:
         from bench.table2.page import page
         from bench.table2.rows import read_retrained
         from mi_nerfattack.experiment.sweep.summary import SUMMARY
-        from mi_nerfattack.experiment.sweep.table import (
-            MAX_TABLE_BYTES,
-            RESULTS,
-            read_table,
-        )
+        from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
         from mi_nerfattack.io import files
 
         summary = files.read_json(self.folder / SUMMARY)
@@ -45,11 +41,7 @@ class BenchTable2:
             retrained = read_retrained(self.retrained, {row["cell"] for row in rows})
             words.append("--retrained DATA")
         text = page(summary, rows, retrained, results.stamp({}, words))
-        files.make_folder(self.output)
-        if self.output.resolve() != self.folder.resolve():
-            for name in (RESULTS, SUMMARY):
-                raw = files.read_bytes(self.folder / name, MAX_TABLE_BYTES)
-                files.write_bytes(self.output / name, raw)
+        results.copy_sweep(self.folder, self.output)
         files.write_text(self.output / "README.md", text)
         print(f"{self.output / 'README.md'}: written")
         return 0

@@ -49,6 +49,7 @@ _RETRAIN = (
     "mi-nerfattack retrain FOLDER/cells/* -o retrained.safetensors --data DATA "
     "--more FRAMES  # those of the bundled policy's training"
 )
+_REPLAY = "mi-nerfattack replay docs/table2 --rows 10  # any row comes back"
 _AGAINST = [
     *("environment", "route", "ratio", "difference (m)", "spread over seeds (m)"),
     *("random out", "gradient out", "p (McNemar)"),
@@ -74,34 +75,39 @@ def page(
         InputError: the sweep has no such attacks, or several budgets.
     """
     table, cases = make_table(summary, retrained), list(COLUMNS.values())
-    parts = [_INTRODUCTION, _flags(summary)]
+    parts = [_INTRODUCTION, flags(summary)]
     for environment, title in TITLES.items():
         own = own_rows(table, environment)
-        parts.append(_section(title, "", ["route", *cases], own))
+        parts.append(section(title, "", ["route", *cases], own))
     theirs = paper_rows(table)
     against = against_rows(summary["comparisons"])
     aims = aim_rows(summary, rows, table, retrained)
     parts += [
-        _section("In the paper's unit", _UNIT, ["route", "", *cases], theirs),
-        _section("Against random textures", "", _AGAINST, against),
-        _section("What was aimed at", "", ["aim", "found", ""], aims),
+        section("In the paper's unit", _UNIT, ["route", "", *cases], theirs),
+        section("Against random textures", "", _AGAINST, against),
+        section("What was aimed at", "", ["aim", "found", ""], aims),
     ]
     if retrained:
         parts.append(_retraining(retrained))
-    parts.append(_section("All figures", "", _DETAILS, detail_rows(table)))
-    parts.append(_provenance(summary, rows, made, bool(retrained)))
+    parts.append(section("All figures", "", _DETAILS, detail_rows(table)))
+    commands = ["mi-nerfattack sweep scenes/table2.toml -o FOLDER"]
+    commands += [_RETRAIN] if retrained else []
+    commands += [made["command"], _REPLAY]
+    parts.append(provenance(commands, summary["attacks"], rows, made))
     return "\n\n".join(parts) + "\n"
 
 
-def _section(
+def section(
     title: str, text: str, header: Sequence[str], rows: Iterable[Sequence[str]]
 ) -> str:
+    """Return a section of a page: title, text and table."""
     lines = [header, ["---"] * len(header), *rows]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
     return "\n\n".join(filter(None, (f"## {title}", text, table)))
 
 
-def _flags(summary: Figures) -> str:
+def flags(summary: Figures) -> str:
+    """Return the section that tells a sweep's flags and failed cells."""
     told = [f"- **{flag}".replace(": ", ":** ", 1) for flag in summary["flags"]]
     told += [f"- **failed:** {r['cell']}: {r['error']}" for r in summary["failed"]]
     cells = f"{summary['complete']} of {summary['cells']} attacks are complete."
@@ -133,12 +139,23 @@ def _retraining(retrained: Table) -> str:
         "without\nobjects are the same for all attacks of a route: the mean alone."
     )
     header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
-    return _section("Before and after retraining", text, header, rows)
+    return section("Before and after retraining", text, header, rows)
 
 
-def _provenance(
-    summary: Figures, rows: Iterable[Figures], made: Figures, has_retrained: bool
+def provenance(
+    commands: Sequence[str],
+    attacks: Sequence[Figures],
+    rows: Iterable[Figures],
+    made: Figures,
 ) -> str:
+    """Return the section that tells how a page was made.
+
+    Args:
+        commands: in their order.
+        attacks: of the ``summary.json``.
+        rows: of the table.
+        made: date, machine and command, as of `bench.results.stamp`.
+    """
     versions, contents = {}, {}
     for row in rows:
         if row["versions"] is not None:
@@ -146,20 +163,17 @@ def _provenance(
         for key, digest in json.loads(row["digests"]).items():
             if key != "scenario":
                 contents[digest] = contents.get(digest, key)
-    done = sum(attack["converged"] for attack in summary["attacks"])
+    done = sum(attack["converged"] for attack in attacks)
     told = [", ".join(f"{k} {v}" for k, v in json.loads(v).items()) for v in versions]
     machine = ", ".join(f"{key}: {value}" for key, value in made["machine"].items())
     lines = [
         "## How it was made\n",
         "```",
-        "mi-nerfattack sweep scenes/table2.toml -o FOLDER",
-        *([_RETRAIN] if has_retrained else []),
-        made["command"],
-        "mi-nerfattack replay docs/table2 --rows 10  # any row comes back",
+        *commands,
         "```\n",
         f"- page written on {made['date']}; {machine}",
         *(f"- attacked with: {text}" for text in told),
-        f"- {done} of {len(summary['attacks'])} attacks converged",
+        f"- {done} of {len(attacks)} attacks converged",
         *(f"- {key}: SHA-256 {digest}" for digest, key in contents.items()),
     ]
     return "\n".join(lines)

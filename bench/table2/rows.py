@@ -151,11 +151,12 @@ def cell(figures: Figures | None) -> str:
     mean, count = f"{figures['cross_track_mean_m']:.3f}", figures["attacks"]
     if figures["cross_track_sd_m"] is not None:
         mean += f" ± {figures['cross_track_sd_m']:.3f}"
-    interval = _interval(figures["cross_track_mean_ci95_m"])
-    return f"{mean}{interval} ({count}); {_out(figures)}"
+    ends = interval(figures["cross_track_mean_ci95_m"])
+    return f"{mean}{ends} ({count}); {_out(figures)}"
 
 
-def _interval(ends: Sequence[float] | None) -> str:
+def interval(ends: Sequence[float] | None) -> str:
+    """Return an interval after a space, or nothing."""
     return "" if ends is None else f" [{ends[0]:.3f}, {ends[1]:.3f}]"
 
 
@@ -205,8 +206,8 @@ def against_rows(comparisons: Iterable[Figures]) -> Iterator[Sequence[str]]:
         yield (
             row["environment"],
             row["route"] or "all",
-            ratio + _interval(effect["ratio_ci95"]),
-            f"{effect['difference']:.3f}{_interval(effect['difference_ci95'])}",
+            ratio + interval(effect["ratio_ci95"]),
+            f"{effect['difference']:.3f}{interval(effect['difference_ci95'])}",
             spread,
             f"{left['both'] + left['other']}/{effect['attacks']}",
             f"{left['both'] + left['one']}/{effect['attacks']}",
@@ -235,7 +236,7 @@ def aim_rows(
             yield (
                 f"{where}: mean error at least {least:g} times that of random, "
                 f"{environment}",
-                told + _interval(row["effect"]["ratio_ci95"]),
+                told + interval(row["effect"]["ratio_ci95"]),
                 _met(ratio is not None and ratio >= least),
             )
     attack = table[None, DEPLOYMENT, ATTACK]
@@ -296,7 +297,7 @@ def detail_rows(table: Table) -> Iterator[Sequence[str]]:
                     str(figures["drives"]),
                     f"{figures['cross_track_mean_m']:.3f}",
                     "" if spread is None else f"{spread:.3f}",
-                    _interval(figures["cross_track_mean_ci95_m"]).strip(),
+                    interval(figures["cross_track_mean_ci95_m"]).strip(),
                     f"{figures['cross_track_total']:.2f}",
                     _share(*left, figures["departure_rate_ci95"]),
                     _out(figures),

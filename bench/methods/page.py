@@ -1,0 +1,99 @@
+"""Methods of attack at equal numbers of rendered frames: a page in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from bench.methods.tuning import METHODS, rows, settings_of
+from bench.table2.page import flags, provenance, section
+from bench.table2.rows import TITLES, cell, interval
+from mi_nerfattack.experiment.sweep.summary import GRADIENT
+from mi_nerfattack.rollout.drive import ATTACK, RANDOM
+
+_INTRODUCTION = """\
+# Methods of attack at equal numbers of rendered frames
+
+Three cars and three hydrants at natural size, attacked at once on three routes of the
+bundled intersection. Each method has the setting that did best of three, at places that
+are not compared ([`scenes/tuning.toml`](../../scenes/tuning.toml)); rule, places, seeds
+and budgets of both sweeps were settled before their first results. A pass back counts
+as many drives as it takes the time of, so searches without gradients drive more often.
+
+Figures are mean distances from the lane's centre, metres: mean ± standard deviation
+over attacks [95 % interval, BCa] (attacks); then how many of them have a wheel out of
+the lane for 1 s, in the mean over their drives [95 % interval, Wilson, per cent].
+Frames are those of an attack. The last column divides a method's error by the
+gradient's at the same places: below 1, the gradient is better."""
+_TUNING = """\
+Mean error in the surrogate past one attack a route, metres, and its geometric mean over
+the routes: the largest of a method is chosen, once all its settings are done."""
+_HEADER = ["route", "method", "frames", "past random looks", "past the attack", "ratio"]
+
+
+def page(
+    summary: Mapping[str, Any] | None,
+    table: Sequence[Mapping[str, Any]],
+    tuning: Mapping[str, Any],
+    grid: Mapping[str, Any],
+    made: Mapping[str, Any],
+) -> str:
+    """Return the page.
+
+    Args:
+        summary: ``summary.json`` of the comparison; None before there is one.
+        table: rows of its table, else those of the tuning.
+        tuning: ``summary.json`` of the tuning.
+        grid: of the tuning, ``scenes/tuning.toml``.
+        made: date, machine and command, as of `bench.results.stamp`.
+    """
+    parts = [_INTRODUCTION, flags(tuning if summary is None else summary)]
+    if summary is not None:
+        for environment, title in TITLES.items():
+            own = list(_compared(summary, environment))
+            if own:
+                parts.append(section(title, "", _HEADER, own))
+    names, routes = (
+        [choice["name"] for choice in grid[axis]] for axis in ("methods", "routes")
+    )
+    settings = settings_of(tuning, names, routes)
+    header = ["method", "setting", *routes, "geometric mean", ""]
+    parts.append(section("Settings", _TUNING, header, rows(settings, routes)))
+    commands = ["mi-nerfattack sweep scenes/tuning.toml -o TUNING"]
+    if summary is not None:
+        commands.append("mi-nerfattack sweep scenes/methods.toml -o FOLDER")
+    commands.append(made["command"])
+    attacks = (tuning if summary is None else summary)["attacks"]
+    parts.append(provenance(commands, attacks, table, made))
+    return "\n\n".join(parts) + "\n"
+
+
+def _compared(summary: Mapping[str, Any], environment: str) -> Iterator[list[str]]:
+    """Yield a row for each method on each route, then on all."""
+    groups = {
+        (group["route"], group["method"], group["case"]): group
+        for group in summary["groups"]
+        if group["environment"] == environment
+    }
+    ratios = {
+        (row["route"], row["method"]): row["effect"]
+        for row in summary["comparisons"]
+        if (row["environment"], row["other_method"], row["other_case"])
+        == (environment, GRADIENT, ATTACK)
+    }
+    for route in dict.fromkeys(key[0] for key in groups):
+        for method in METHODS:
+            attack = groups.get((route, method, ATTACK))
+            if attack is None:
+                continue
+            effect, ratio = ratios.get((route, method)), ""
+            if effect is not None and effect["ratio"] is not None:
+                ratio = f"{effect['ratio']:.2f}{interval(effect['ratio_ci95'])}"
+            yield [
+                route or "all",
+                method,
+                f"{attack['frames']:.0f}",
+                cell(groups.get((route, method, RANDOM))),
+                cell(attack),
+                ratio,
+            ]
