@@ -22,6 +22,7 @@ from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.overlay import OverlayCommand
+from mi_nerfattack.commands.refine import Refine
 from mi_nerfattack.commands.render import Render
 from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
@@ -56,6 +57,7 @@ COMMANDS: dict[str, type[Command]] = {
     "sweep": Sweep,
     "replay": Replay,
     "transfer": Transfer,
+    "refine": Refine,
     "retrain": Retrain,
     "overlay": OverlayCommand,
     "serve-policy": ServePolicy,

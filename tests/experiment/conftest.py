@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mitsuba as mi
+import numpy as np
 import pytest
 from helpers import attack_jobs
 from helpers import toy_loop as toy
 
+from mi_nerfattack.fields import load_grid, save_field
 from mi_nerfattack.io import files
+
+_POLICY = """\
+[policy]
+file = "smooth.py:SmoothPolicy"
+trust_code = true
+goal = "integer"
+goals = 3
+"""
+_FOUND = {
+    '[policy]\nfile = "policy.safetensors"\n': _POLICY,
+    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
+    "max_iterations = 30": "max_iterations = 2",
+    "textures = 4": "textures = 2",
+    "[7.0, 4.2, 1.6]": "[-15.0, 2.6, 1.6]",
+}
+_POSES = '[attack]\nparameters = "both"\npose_limit_m = 0.2\n'
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +82,23 @@ def whole(folder, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         leave_out_results(patch)
         return output, attack_jobs.job(folder, output).run()
+
+
+@pytest.fixture(scope="session")
+def found_run(tmp_path_factory) -> Path:
+    """The folder of a finished attack of poses and texture, without pictures."""
+    from mi_nerfattack.experiment.job import Job
+    from mi_nerfattack.scenario.scenario import load_scenario
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), _FOUND)
+    item = load_grid(folder / "object.safetensors")
+    item.set_parameter("density", np.full(item.n_vertices, 3.0, np.float32))
+    save_field(folder / "object.safetensors", item)
+    (folder / "smooth.py").write_text("from helpers.toy_loop import SmoothPolicy\n")
+    path = folder / "scenario.toml"
+    path.write_text(path.read_text().replace("[attack]", _POSES))
+    scenario, text = load_scenario(path)
+    job = Job(scenario, text, scenario.build_policy(), folder / "run", frames=None)
+    job.run(anyway=True)
+    return folder / "run"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,8 +24,6 @@ class BayesianSearch(AbstractSearch):
 
     Args:
         basis: of the textures, at most 64 coefficients.
-        known: coefficients (count,) whose objective is known from elsewhere, as that of
-            a surrogate, with it: they shape the process as if they had been told.
         seed: of all draws.
 
     Raises:
@@ -36,12 +33,7 @@ class BayesianSearch(AbstractSearch):
     Source: Hvarfner et al., ICML 2024 (dimension-scaled priors); Optuna's `GPSampler`.
     """
 
-    def __init__(
-        self,
-        basis: LowFrequency,
-        known: Sequence[tuple[np.ndarray, float]] = (),
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, basis: LowFrequency, seed: int = 0) -> None:
         if basis.count > MOST:
             raise InputError(f"coefficients: {basis.count}; at most {MOST}")
         optuna = load_extra("optuna", "bayesian", "Bayesian optimisation")
@@ -52,13 +44,6 @@ class BayesianSearch(AbstractSearch):
         one = optuna.distributions.FloatDistribution(-1.0, 1.0)
         self._space = {f"{i:02d}": one for i in range(basis.count)}
         self._asked: Trial | None = None
-        for coefficients, objective in known:
-            at = dict(zip(self._space, map(float, coefficients), strict=True))
-            self._study.add_trial(
-                optuna.trial.create_trial(
-                    params=at, distributions=dict(self._space), value=objective
-                )
-            )
 
     def ask(self) -> Proposal:
         """See :meth:`AbstractSearch.ask`; asked again, it asks the same."""

@@ -15,11 +15,12 @@ class LowFrequency:
     """Changes of colour on a coarse lattice around each object, interpolated.
 
     Trilinear between as many vertices as the number of coefficients allows; all zeros
-    are the original textures. Colours that are not allowed are projected.
+    are the original textures, or others. Colours that are not allowed are projected.
 
     Args:
         colourings: of the objects.
         most: coefficients of all objects together, at most.
+        middle: (n, 3) colours of each object that zeros give; the original by default.
 
     Attributes:
         count: of coefficients, 3 a vertex: changes of sRGB values.
@@ -28,7 +29,12 @@ class LowFrequency:
         InputError: not even one colour an object is left.
     """
 
-    def __init__(self, colourings: Sequence[Colours], most: int) -> None:
+    def __init__(
+        self,
+        colourings: Sequence[Colours],
+        most: int,
+        middle: Sequence[np.ndarray] | None = None,
+    ) -> None:
         vertices = most // (3 * len(colourings))
         if not vertices:
             raise InputError(
@@ -37,6 +43,7 @@ class LowFrequency:
             )
         edge = int(np.cbrt(vertices) + 1e-9)
         self.colourings = colourings
+        self._middle = [c.start for c in colourings] if middle is None else middle
         self._shape = (len(colourings), edge, edge, edge, 3)
         self.count = int(np.prod(self._shape))
         self._weights = [_weights(c.level.resolution, edge) for c in colourings]
@@ -46,8 +53,10 @@ class LowFrequency:
         lattices = np.reshape(coefficients, self._shape)
         changes = map(_spread, lattices, self._weights)
         colours = [
-            colouring.project(colouring.start + change)
-            for colouring, change in zip(self.colourings, changes, strict=True)
+            colouring.project(start + change)
+            for colouring, start, change in zip(
+                self.colourings, self._middle, changes, strict=True
+            )
         ]
         return propose(self.colourings, colours)
 

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,11 @@ class FoundAttack:
                     "starts vary (lateral_sd_m, heading_sd_deg or covariance)"
                 )
 
+    def with_objects(self, folder: Path, label: str) -> FoundAttack:
+        """Return this attack with the objects of another folder, where they stood."""
+        digest = _digest(folder, self.scenario, self.offsets)
+        return replace(self, folder=folder, label=label, digest=digest)
+
     def looks(self, world: World) -> dict[str, Appearance]:
         """Load how the objects of a world look, and where they stand, by case."""
         own = world.appearance()
@@ -155,8 +160,6 @@ def _read(folder: Path, label: str) -> FoundAttack:
         pose = (document.get("object_poses") or {}).get(item.id)
         if pose is not None:
             offsets[number] = [*pose["shift_m"], *pose["rotation_vector"]]
-    sums = [files.sha256(object_path(folder, item.id)) for item in scenario.objects]
-    about = json.dumps([sums, offsets.tolist()])
     return FoundAttack(
         folder,
         label,
@@ -165,9 +168,15 @@ def _read(folder: Path, label: str) -> FoundAttack:
         offsets,
         (document.get("baseline") or {}).get("best"),
         identity,
-        hashlib.sha256(about.encode()).hexdigest(),
+        _digest(folder, scenario, offsets),
         _surrogate(scenario.scene, identity),
     )
+
+
+def _digest(folder: Path, scenario: Scenario, offsets: np.ndarray) -> str:
+    sums = [files.sha256(object_path(folder, item.id)) for item in scenario.objects]
+    about = json.dumps([sums, offsets.tolist()])
+    return hashlib.sha256(about.encode()).hexdigest()
 
 
 def _check_unchanged(checkpoint: Path, identity: Mapping[str, str]) -> None:

@@ -108,19 +108,6 @@ def test_a_gaussian_process_finds_the_colours_of_two_boxes():
     assert found < 0.5 * drawn
 
 
-def test_what_is_known_shapes_the_process():
-    fields = grey()
-    basis = LowFrequency([Colours(field) for field in fields], 3)
-    optimum = np.array([0.0, -0.5, 0.3])
-    rng = np.random.default_rng(0)
-    points = [*rng.uniform(-1, 1, (20, 3)), optimum]
-    known = [(x, float(((x - optimum) ** 2).sum())) for x in points]
-    asked = BayesianSearch(basis, known).ask()
-    fields[0].set_parameter("texture", asked.textures[0])
-    found = vertex_colours(fields[0], fields[0].levels()[-1])[0] - 0.5
-    np.testing.assert_allclose(found, optimum.clip(-0.48, 0.48), atol=0.15)
-
-
 @pytest.mark.parametrize("kind", ["random", "blocks", "separable", "bayesian"])
 def test_an_attack_that_is_told_the_same_goes_on_alike(kind):
     whole = attacked(kind, proposals=16)

@@ -7,17 +7,13 @@ import pickle
 import shutil
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import attack_jobs
-from helpers import toy_loop as toy
 
 from mi_nerfattack import cli
 from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.experiment.transfer import run as transfer_run
 from mi_nerfattack.experiment.transfer.columns import (
     Column,
@@ -35,45 +31,11 @@ from mi_nerfattack.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-POLICY = """\
-[policy]
-file = "smooth.py:SmoothPolicy"
-trust_code = true
-goal = "integer"
-goals = 3
-"""
-CHANGES = {
-    '[policy]\nfile = "policy.safetensors"\n': POLICY,
-    "[drive]": f"[camera]\nwidth = {toy.WIDTH}\nheight = {toy.HEIGHT}\n[drive]",
-    "max_iterations = 30": "max_iterations = 2",
-    "textures = 4": "textures = 2",
-    "[7.0, 4.2, 1.6]": "[-15.0, 2.6, 1.6]",
-}
 SETTINGS = (
     ("surrogate", "mitsuba", "mitsuba_built_in", "mujoco"),
     ("day", "exposure:+1", "placement:0.3,latency:1", "pitch:2"),
 )
 ROWS = 3 + 3 * 4  # the surrogate has no exposure
-
-
-@pytest.fixture(scope="module")
-def found_run(tmp_path_factory) -> Path:
-    """The folder of a finished attack of poses and texture, without pictures."""
-    mi.set_variant("llvm_ad_rgb")
-    folder = attack_jobs.write_scenario(tmp_path_factory.mktemp("scenario"), CHANGES)
-    item = load_grid(folder / "object.safetensors")
-    item.set_parameter("density", np.full(item.n_vertices, 3.0, np.float32))
-    save_field(folder / "object.safetensors", item)
-    (folder / "smooth.py").write_text("from helpers.toy_loop import SmoothPolicy\n")
-    path = folder / "scenario.toml"
-    path.write_text(path.read_text().replace("[attack]", _POSES))
-    scenario, text = load_scenario(path)
-    job = Job(scenario, text, scenario.build_policy(), folder / "run", frames=None)
-    job.run(anyway=True)
-    return folder / "run"
-
-
-_POSES = '[attack]\nparameters = "both"\npose_limit_m = 0.2\n'
 
 
 def command(run: Path, *more: str) -> list[str]:

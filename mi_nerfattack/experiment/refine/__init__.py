@@ -1,0 +1,1 @@
+"""Found attacks finished where they are to work, by few drives there."""
