@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
+from mi_nerfattack.policy.image_shape import misfit, usual_shape
 from mi_nerfattack.policy.pilotnet import PilotNet
 
 #: Part of the largest value by which two evaluations of one image may differ.
@@ -33,8 +34,8 @@ def call_module(
         The control and the hidden states.
 
     Raises:
-        InputError: the module raises an exception, which is told with the shapes, or
-            returns something else than tensors.
+        InputError: the module takes images of another shape, which is told, raises an
+            exception, or returns something else than tensors.
     """
     try:
         if isinstance(module, PilotNet):
@@ -47,6 +48,9 @@ def call_module(
         if is_interrupt(err):
             raise
         shapes = [tuple(part.shape) for part in arguments]
+        wanted = usual_shape(module, arguments[0], arguments[1:])
+        if wanted not in (None, shapes[0]):
+            raise InputError(f"{name}: {misfit(wanted, shapes[0])}") from err
         raise InputError(
             f"{name}: fails on an input of shape {shapes[0]}, with goal and hidden "
             f"states {shapes[1:]}: {type(err).__name__}: {err}; declare "

@@ -236,11 +236,26 @@ class ModuleSection(AbstractNetworkSection):
     recurrent: Shapes = ()  # -1 for the vehicles
 
     def build(self) -> AbstractPolicy:
-        """Run the file and load the weights."""
+        """Run the file and load the weights; refuse those that are drawn at random."""
         module = self._made(torch.nn.Module, "torch.nn.Module")
         if self.weights_file is not None:
             load_state(module, self.weights_file.file)
+        else:
+            self._refuse_drawn(module)
         return self._policy(module, recurrent=self.recurrent)
+
+    def _refuse_drawn(self, module: torch.nn.Module) -> None:
+        """Make the module once more, from other random numbers, and compare."""
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(int(torch.randint(1 << 62, ())))
+            again = self._made(torch.nn.Module, "torch.nn.Module").state_dict()
+        for name, value in module.state_dict().items():
+            if not torch.equal(value, again.get(name, value)):
+                raise InputError(
+                    f"{self.source}: its weights are random: {name!r} differs each "
+                    "time that it is made; give policy.weights_file (--weights-file), "
+                    "or load them in the Python file"
+                )
 
 
 class ProgramSection(AbstractNetworkSection):

@@ -295,7 +295,8 @@ def test_an_environment_that_is_not_installed_is_one_message(
         ("nothing.toml", "nothing.toml: does not exist"),
         ("empty.toml", "empty.toml: has no section [policy]"),
         ("key.toml", "key.toml: policy.colour"),
-        ("small.py:Small", "small.py:Small"),
+        ("small.py:Small", "small.py:Small: fails on an input of shape"),
+        ("drawn.py:Drawn", "drawn.py:Drawn: its weights are random"),
         ("nan.py:Bad", "it must be finite"),
         ("noise.bin", "its suffix tells no kind"),
         ("noise.safetensors", "noise.safetensors"),
@@ -305,8 +306,13 @@ def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message
     Path("empty.toml").write_text("[scene]\n")
     Path("key.toml").write_text('[policy]\nfile = "still.py:drive"\ncolour = "red"\n')
     Path("small.py").write_text(  # for images of 66 x 100 pixels
-        "from torch import nn\n\n\ndef Small():\n"
+        "import torch\nfrom torch import nn\n\n\ndef Small():\n"
+        "    torch.manual_seed(0)\n"
         "    return nn.Sequential(nn.Flatten(), nn.Linear(3 * 66 * 100, 1))\n"
+    )
+    Path("drawn.py").write_text(
+        "from torch import nn\n\n\ndef Drawn():\n"
+        "    return nn.Sequential(nn.Flatten(), nn.Linear(3 * 66 * 200, 1))\n"
     )
     Path("nan.py").write_text(
         "from torch import nn\n\n\nclass Bad(nn.Module):\n"
@@ -316,7 +322,7 @@ def test_policies_that_do_not_fit_are_one_message(place, capsys, policy, message
     Path("noise.bin").write_bytes(b"noise")
     Path("noise.safetensors").write_bytes(b"noise")
     place = with_policy(policy, place)
-    place += ["--trust-code"] * policy.endswith((":Small", ":Bad"))
+    place += ["--trust-code"] * policy.endswith((":Small", ":Drawn", ":Bad"))
     assert cli.main(place) == 2
     errors = capsys.readouterr().err
     assert message in errors and "Traceback" not in errors

@@ -19,6 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.scenario.policy import PolicySection, PreprocessSection
@@ -188,6 +189,30 @@ MODULE = (
 )
 
 
+def test_random_weights_are_refused(tmp_path, rng):
+    """Of one layer of several, too; not those that the file sets."""
+    (tmp_path / "net.py").write_text(
+        MODULE + "import torch\n"
+        "def half():\n"
+        "    net = make()\n"
+        "    nn.init.zeros_(net[1].weight)\n"
+        "    return net\n"
+        "def loaded():\n"
+        "    net = half()\n"
+        "    net.load_state_dict({'1.weight': torch.zeros(1, 39600),"
+        " '1.bias': torch.ones(1)})\n"
+        "    return net\n"
+        "net = make()\n"
+    )
+    for name, tensor in (("make", "1.weight"), ("half", "1.bias"), ("net", "1.weight")):
+        message = f"net.py:{name}: .*random: '{tensor}' .*policy.weights_file"
+        with pytest.raises(InputError, match=message):
+            policy_of(tmp_path, file=f"net.py:{name}")
+    image = camera(2, rng)
+    policy = policy_of(tmp_path, file="net.py:loaded")
+    np.testing.assert_array_equal(policy.control(image, 0), [1, 1])
+
+
 def test_weights_of_a_module(tmp_path, rng):
     (tmp_path / "net.py").write_text(MODULE)
     network = nn.Sequential(nn.Flatten(), nn.Linear(39600, 1))
@@ -232,13 +257,52 @@ def test_weights_that_do_not_fit(state, message, tmp_path):
         policy_of(tmp_path, **keys)
 
 
-def test_input_sizes_that_do_not_fit(tmp_path, rng):
-    (tmp_path / "net.py").write_text(MODULE)
-    policy = policy_of(tmp_path, file="net.py:make")
+SHAPES = """
+import torch
+from torch import nn
+class Net(nn.Module):
+    shape = {}
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.head = nn.Linear(torch.tensor(self.shape).prod(), 1)
+    def forward(self, image):
+        assert tuple(image.shape[1:]) == self.shape
+        return self.head(image.flatten(1))
+"""
+
+
+@pytest.mark.parametrize(
+    ("shape", "keys"),
+    [
+        ((3, 66, 200), "resize_px = [200, 66]"),
+        ((66, 200, 3), 'resize_px = [200, 66], layout = "NHWC"'),
+        ((1, 64, 64), 'resize_px = [64, 64], colour = "grey"'),
+    ],
+)
+def test_images_of_another_shape_are_refused_with_a_remedy_that_helps(
+    shape, keys, tmp_path, rng
+):
+    (tmp_path / "net.py").write_text(SHAPES.format(shape))
     image = mi.TensorXf(rng.random((2, 10, 20, 3), dtype=np.float32))
-    message = r"net.py:make: fails on an input of shape \(2, 3, 10, 20\).*preprocess"
-    with pytest.raises(InputError, match=f"(?s){message}"):
-        policy.step(image, 0, ())
+    message = (
+        f"net.py:Net: takes images of shape {(2, *shape)}, and gets (2, 3, 10, 20) of "
+        f"the camera and policy.preprocess; write {keys} in [policy.preprocess]"
+    )
+    with pytest.raises(InputError, match=re.escape(message)):
+        policy_of(tmp_path, file="net.py:Net").control(image, 0)
+    preprocess = parse_toml("keys", re.sub(r", (?=[a-z])", "\n", keys))
+    policy = policy_of(tmp_path, file="net.py:Net", preprocess=preprocess)
+    assert np.isfinite(policy.control(image, 0)).all()
+
+
+def test_images_that_no_usual_shape_explains_are_told_with_the_module_s_words(
+    tmp_path, rng
+):
+    (tmp_path / "net.py").write_text(SHAPES.format((3, 7, 9)))
+    message = r"net.py:Net: fails on an input of shape \(2, 3, 66, 200\).*preprocess"
+    with pytest.raises(InputError, match=message):
+        policy_of(tmp_path, file="net.py:Net").control(camera(2, rng), 0)
 
 
 # --- the default and the digest -------------------------------------------------------

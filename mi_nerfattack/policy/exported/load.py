@@ -17,6 +17,7 @@ import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
+from mi_nerfattack.policy.image_shape import misfit
 
 MAX_PROGRAM_BYTES = 1 << 31
 
@@ -25,13 +26,16 @@ class ExportedNetwork(torch.nn.Module):
     """A program of ``torch.export``; its mode was fixed when it was exported.
 
     Attributes:
-        batch: the number of images that it takes, None where any.
+        sizes: of the images that it takes, None where any.
+        batch: the first of them.
     """
 
-    def __init__(self, program: torch.export.ExportedProgram) -> None:
+    def __init__(self, program: torch.export.ExportedProgram, name: str) -> None:
+        """Take a program over; `name` is for messages."""
         super().__init__()
-        self.program = program.module()
-        self.batch = _batch(program)
+        self.program, self.name = program.module(), name
+        self.sizes = _image_sizes(program)
+        self.batch = self.sizes[0] if self.sizes else None
 
     def train(self, mode: bool = True) -> ExportedNetwork:
         """Do nothing: an exported program cannot change its mode."""
@@ -40,6 +44,10 @@ class ExportedNetwork(torch.nn.Module):
 
     def forward(self, *arguments: torch.Tensor) -> Any:
         """Call the program."""
+        given = tuple(arguments[0].shape)
+        pairs = zip(self.sizes, given, strict=False)
+        if any(size not in (None, actual) for size, actual in pairs):
+            raise InputError(f"{self.name}: {misfit(self.sizes, given)}")
         return self.program(*arguments)
 
 
@@ -52,7 +60,7 @@ def load_exported(path: Path) -> ExportedNetwork:
     raw = _read_archive(path, "torch.export.save")
     try:
         program = torch.export.load(io.BytesIO(raw))
-        network = ExportedNetwork(program)
+        network = ExportedNetwork(program, str(path))
     except Exception as err:  # torch raises whatever a damaged program leads to
         if is_interrupt(err):
             raise
@@ -100,11 +108,11 @@ def _read_archive(path: Path, writer: str) -> bytes:
     return raw
 
 
-def _batch(program: torch.export.ExportedProgram) -> int | None:
-    """Return the first size of the first input where it is fixed."""
+def _image_sizes(program: torch.export.ExportedProgram) -> tuple[int | None, ...]:
+    """Return the sizes of the first input, None where one is free."""
     first = list(program.graph_signature.user_inputs)[0]
     for node in program.graph.nodes:
         if node.op == "placeholder" and node.name == first:
-            size = node.meta["val"].shape[0]
-            return size if isinstance(size, int) else None
-    return None
+            sizes = node.meta["val"].shape
+            return tuple(size if isinstance(size, int) else None for size in sizes)
+    return ()

@@ -17,6 +17,7 @@ import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
+from mi_nerfattack.policy.image_shape import misfit
 from mi_nerfattack.policy.onnx.budget import Budget
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
@@ -136,10 +137,13 @@ class OnnxNetwork(torch.nn.Module):
             pairs = zip(item.sizes, value.shape, strict=False)
             wrong = any(size not in (None, actual) for size, actual in pairs)
             if wrong or len(item.sizes) != value.ndim:
+                if item is self.inputs[0]:
+                    told = misfit(item.sizes, value.shape)
+                    raise InputError(f"{self.name}: {told}")
                 sizes = ["any" if size is None else size for size in item.sizes]
                 raise InputError(
                     f"{self.name}: input {item.name!r} has the shape {sizes}; it gets "
-                    f"{list(value.shape)}: set policy.preprocess"
+                    f"{list(value.shape)}: set policy.goal and policy.recurrent"
                 )
         return {
             item.name: value.to(torch.int64 if item.whole else dtype)
