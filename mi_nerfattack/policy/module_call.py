@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
-from mi_nerfattack.policy.image_shape import misfit, usual_shape
+from mi_nerfattack.policy.checks import misfit, usual_shape
 from mi_nerfattack.policy.pilotnet import PilotNet
 
 #: Part of the largest value by which two evaluations of one image may differ.

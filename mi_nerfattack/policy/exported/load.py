@@ -17,7 +17,7 @@ import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
-from mi_nerfattack.policy.image_shape import misfit
+from mi_nerfattack.policy.checks import misfit
 
 MAX_PROGRAM_BYTES = 1 << 31
 

@@ -17,7 +17,7 @@ import torch
 
 from mi_nerfattack.errors import InputError, is_interrupt
 from mi_nerfattack.io import files
-from mi_nerfattack.policy.image_shape import misfit
+from mi_nerfattack.policy.checks import misfit
 from mi_nerfattack.policy.onnx.budget import Budget
 from mi_nerfattack.policy.onnx.call import Call
 from mi_nerfattack.policy.onnx.operators import OPERATORS
