@@ -58,6 +58,8 @@ class OverlayCommand:
             self.recording, views.camera, views.mount, views.period
         )
         with closing(recording), StageBars() as bars:
+            for remark in recording.remarks:
+                bars.say(f"{self.recording}: {remark}")
             overlay = Overlay(box, recording.camera, keyed=not self.paste)
             times = recording.track.times
             told = bars.counter("overlaying", "frame ")

@@ -59,7 +59,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes."""
     piece = max(_check_file(path, limit), 1 << 16)  # files of the system tell 0 bytes
     parts, size = [], 0
-    with _reported(path), open(path, "rb") as file:
+    with reported(path), open(path, "rb") as file:
         while size <= limit and (part := file.read(piece)):
             parts.append(part)
             size += len(part)
@@ -72,7 +72,7 @@ def sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file's content as hexadecimal digits."""
     digest = hashlib.sha256()
     _check_file(path, MAX_TENSOR_BYTES)
-    with _reported(path), open(path, "rb") as file:
+    with reported(path), open(path, "rb") as file:
         while piece := file.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()
@@ -87,7 +87,7 @@ def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -
         rows: (k,) numbers from 0.
         out: (k, ...), in C order; filled.
     """
-    with _reported(path), open(path, "rb", buffering=0) as file:
+    with reported(path), open(path, "rb", buffering=0) as file:
         for row, into in zip(rows.tolist(), out, strict=True):
             file.seek(start + row * into.nbytes)
             if file.readinto(into.reshape(-1).view(np.uint8).data) != into.nbytes:
@@ -165,7 +165,7 @@ def read_safetensors(
     import safetensors
 
     size = _check_file(path, MAX_TENSOR_BYTES)
-    with _reported(path), open(path, "rb") as file:
+    with reported(path), open(path, "rb") as file:
         start = file.read(9)
     _check_tensor_header(path, start, size)
     try:
@@ -184,7 +184,7 @@ def read_safetensors(
 def find_tensor(path: str | Path, name: str) -> tuple[int, str, tuple[int, ...]]:
     """Return where a tensor of a safetensors file begins, its type and its shape."""
     read_safetensors(path, ())  # checks the header
-    with _reported(path), open(path, "rb") as file:
+    with reported(path), open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")
         entry = json.loads(file.read(length)).get(name)
     if entry is None:
@@ -227,8 +227,7 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
             f"{path}: array {image.dtype} {image.shape}; {name} takes uint8 "
             f"(height, width) or (height, width, {' or '.join(map(str, channels))})"
         )
-    buffer = io.BytesIO()
-    options = {"quality": 95} if name == "JPEG" else {}
+    buffer, options = io.BytesIO(), {"quality": 95} if name == "JPEG" else {}
     Image.fromarray(np.ascontiguousarray(image)).save(buffer, name, **options)
     write_bytes(path, buffer.getvalue())
 
@@ -259,7 +258,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
-    with _reported(path):
+    with reported(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, "is a folder")
@@ -276,7 +275,7 @@ def _write(path: str | Path, parts: Sequence[bytes | memoryview]) -> None:
 
 def make_folder(path: str | Path) -> Path:
     """Create a folder and its parents where they are missing."""
-    with _reported(path):
+    with reported(path):
         Path(path).mkdir(parents=True, exist_ok=True)
     return Path(path)
 
@@ -286,7 +285,7 @@ def check_writable(path: str | Path) -> None:
 
     To be called before long work; it makes a file beside the target and removes it.
     """
-    with _reported(path):
+    with reported(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, "is a folder")
@@ -304,7 +303,8 @@ def check_folder(path: str | Path) -> None:
 
 
 @contextmanager
-def _reported(path: str | Path) -> Iterator[None]:
+def reported(path: str | Path) -> Iterator[None]:
+    """Turn errors of the system into InputError with the path."""
     try:
         yield
     except OSError as err:
@@ -345,7 +345,7 @@ def _decoding(
 
 
 def _check_file(path: str | Path, limit: int) -> int:
-    with _reported(path):
+    with reported(path):
         status = os.stat(path)
     if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path}: {_REASONS[errno.EISDIR]}")

@@ -111,11 +111,13 @@ def log_messages(folder: Path) -> dict[str, tuple[str, list[dict]]]:
     }
 
 
-def write_log(path: Path, topics, compression: str = "ZSTD", encoding="json") -> Path:
+def write_log(
+    path: Path, topics, compression: str = "ZSTD", encoding="json", chunk_size=1 << 20
+) -> Path:
     writer_module = pytest.importorskip("mcap.writer")
     with path.open("wb") as stream:
         kind = getattr(writer_module.CompressionType, compression)
-        writer = writer_module.Writer(stream, compression=kind)
+        writer = writer_module.Writer(stream, chunk_size, kind)
         writer.start()
         for topic, (schema, messages) in topics.items():
             number = writer.register_schema(schema, "jsonschema", b"{}")

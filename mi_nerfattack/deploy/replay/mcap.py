@@ -13,7 +13,9 @@ or `/vehicle/pose`    `foxglove.PoseInFrame`        the same of the vehicle: x f
                                                     (`plumb_bob`); may be missing
 ====================  ============================  ===================================
 
-A frame takes the pose nearest in time. There is no depth.
+A frame takes the pose nearest in time. There is no depth. A log that is cut off, as by
+a process that was killed, is read up to there; frames before the first pose and after
+the last are left out.
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_ma
 
 MAX_LOG_BYTES = 1 << 32
 MAX_CHUNK_BYTES = 1 << 30
+_MAGIC = b"\x89MCAP0\r\n"
+_HEAD, _FOOTER = struct.Struct("<BQ"), 2  # of a record; the kind of the last one
 
 
 @dataclass(frozen=True)
@@ -92,10 +96,11 @@ class McapRecording(AbstractRecording):
         topics: McapTopics | None = None,
     ) -> None:
         topics = topics or McapTopics()
-        found = _read_messages(path, topics.schemas())
+        found, self.remarks = _read_messages(path, topics.schemas())
         images = found[topics.image]
         if not images:
-            raise InputError(f"{path}: no message on {topics.image}, so no frame")
+            cut = "".join(f" ({remark})" for remark in self.remarks)
+            raise InputError(f"{path}: no message on {topics.image}, so no frame{cut}")
         self._path = path
         self._images = [_compressed(f"{path}: {topics.image}", item) for item in images]
         times = _stamps(f"{path}: {topics.image}", images)
@@ -109,7 +114,15 @@ class McapRecording(AbstractRecording):
             )
         where = f"{path}: {name}"
         poses = np.stack([_pose(where, item) for item in found[name]]) @ body_to_camera
-        index = nearest_pose(str(path), name, times, _stamps(where, found[name]))
+        pose_times = _stamps(where, found[name])
+        kept = _with_poses(times, pose_times)
+        if (kept.start, kept.stop) != (0, len(times)):
+            self.remarks += (
+                f"frames {kept.start} to {kept.stop - 1} of {len(times)} are read; "
+                f"before and after them there are no poses on {name}",
+            )
+        times, self._images = times[kept], self._images[kept]
+        index = nearest_pose(str(path), name, times, pose_times)
         self.track = Track(str(path), times, poses[index])
         own = _calibration(f"{path}: {topics.calibration}", found[topics.calibration])
         self.camera = required_camera(path, own, camera)
@@ -127,8 +140,8 @@ class McapRecording(AbstractRecording):
 
 def _read_messages(
     path: Path, schemas: Mapping[str, str]
-) -> dict[str, list[dict[str, Any]]]:
-    """Return the messages of each topic in the order of the log."""
+) -> tuple[dict[str, list[dict[str, Any]]], tuple[str, ...]]:
+    """Return the messages of each topic in the order of the log, and remarks."""
     try:
         from mcap.exceptions import McapError
     except ImportError as error:
@@ -136,7 +149,7 @@ def _read_messages(
             f"{path}: MCAP logs need the package mcap ({error}); "
             "pip install 'mi-nerfattack[mcap]'"
         ) from error
-    raw = files.read_bytes(path, MAX_LOG_BYTES)
+    raw, remarks = _ended(files.read_bytes(path, MAX_LOG_BYTES))
     found: dict[str, list[dict[str, Any]]] = {topic: [] for topic in schemas}
     try:
         for topic, schema, encoding, data in _messages(path, raw, found):
@@ -155,10 +168,36 @@ def _read_messages(
         raise
     except (McapError, struct.error, ValueError, KeyError, OverflowError) as error:
         raise InputError(
-            f"{path}: damaged or truncated log ({type(error).__name__}: {error}); copy "
-            "it again, or repair it with 'mcap recover'"
+            f"{path}: damaged log ({type(error).__name__}: {error}); copy it again, or "
+            "repair it with 'mcap recover'"
         ) from error
-    return found
+    return found, remarks
+
+
+def _ended(raw: bytes) -> tuple[bytes, tuple[str, ...]]:
+    """Return a log with an end: one that is cut off ends after its last whole record.
+
+    A record is a byte of its kind, 8 of its length, and as many as that.
+    """
+    if raw.endswith(_MAGIC) and len(raw) > len(_MAGIC):
+        return raw, ()
+    whole, end = len(_MAGIC), len(_MAGIC)
+    while end + _HEAD.size <= len(raw):
+        kind, size = _HEAD.unpack_from(raw, end)
+        end += _HEAD.size + size
+        if end > len(raw) or kind == _FOOTER:
+            break
+        whole = end
+    remark = f"cut off; {whole} of {len(raw)} bytes are read"
+    return raw[:whole] + _HEAD.pack(_FOOTER, 20) + bytes(20) + _MAGIC, (remark,)
+
+
+def _with_poses(times: np.ndarray, pose_times: np.ndarray) -> slice:
+    """Return the frames between the first pose and the last, half a frame beyond."""
+    half = 0.5 * float(np.diff(times).min()) if len(times) > 1 else 0.05
+    first = np.searchsorted(times, pose_times[0] - half)
+    last = np.searchsorted(times, pose_times[-1] + half, side="right")
+    return slice(int(first), int(last)) if first < last else slice(0, len(times))
 
 
 def _messages(

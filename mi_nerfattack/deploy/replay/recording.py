@@ -82,10 +82,12 @@ class AbstractRecording(ABC):
     Attributes:
         camera: intrinsics of all frames.
         track: times and poses.
+        remarks: what of the file is left out, for a person.
     """
 
     camera: Camera
     track: Track
+    remarks: tuple[str, ...] = ()
 
     @abstractmethod
     def image(self, index: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import sys
 from pathlib import Path
@@ -202,12 +203,51 @@ def test_poses_that_do_not_fit_a_video(tmp_path, rows, message):
 
 
 @pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
-@pytest.mark.parametrize("keep", [0.0, 0.01, 0.4, 0.9, 0.999])
-def test_truncated_logs(tmp_path, compression, keep):
+@pytest.mark.parametrize(
+    ("keep", "message"),
+    [
+        (0.0, "damaged log .*InvalidMagic"),
+        (0.001, "damaged log .*InvalidMagic"),
+        (0.4, "no message on .* no frame .cut off; .* bytes are read"),
+    ],
+)
+def test_logs_cut_off_before_a_frame(tmp_path, compression, keep, message):
     path = write_log(tmp_path / "drive.mcap", log_messages(tmp_path), compression)
     raw = path.read_bytes()
     path.write_bytes(raw[: int(keep * len(raw))])
-    refused("drive.mcap: damaged or truncated log", path)
+    refused(f"drive.mcap: {message}", path)
+
+
+def test_a_log_that_is_cut_off_is_read_up_to_there(tmp_path):
+    topics = log_messages(tmp_path)
+    path = write_log(tmp_path / "drive.mcap", topics, chunk_size=1)  # one a message
+    raw, counts = path.read_bytes(), []
+    for size in range(len(raw) // 3, len(raw), 97):
+        path.write_bytes(raw[:size])
+        try:
+            recording = open_recording(path, CAMERA, MOUNT)
+        except InputError as error:
+            assert "no message" in str(error) and not counts
+            continue
+        counts.append(len(recording.track.times))
+        whole, of = map(int, re.findall("[0-9]+", recording.remarks[0])[:2])
+        assert of == size and size - 400 < whole <= size
+        assert len(recording.remarks) == (1 if counts[-1] == COUNT else 2)
+    assert counts == sorted(counts) and set(counts) >= {1, COUNT}
+
+
+def test_frames_without_poses_at_both_ends_are_left_out(tmp_path):
+    topics = log_messages(tmp_path)
+    poses = topics["/camera/pose"][1]
+    del poses[-1], poses[0]
+    path = write_log(tmp_path / "drive.mcap", topics)
+    recording = open_recording(path, None, MOUNT)
+    assert len(recording.track.times) == COUNT - 2
+    assert "frames 1 to 4 of 6 are read" in recording.remarks[0]
+    expected = open_recording(
+        write_log(tmp_path / "whole.mcap", log_messages(tmp_path)), None, MOUNT
+    )
+    np.testing.assert_array_equal(recording.image(0), expected.image(1))
 
 
 @pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])

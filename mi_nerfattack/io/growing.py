@@ -1,0 +1,57 @@
+"""A new file that grows while it is written, whole up to its last piece."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+
+
+class GrowingFile:
+    """What is written is in the system's hands at once: a killed process loses nothing.
+
+    Unlike all other files it is not written beside its target first.
+
+    Args:
+        path: of no file; its folder is made.
+
+    Raises:
+        InputError: it exists, or cannot be made or written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        files.make_folder(self.path.parent)
+        if os.path.lexists(path):
+            raise InputError(f"{path}: exists; choose another name")
+        with files.reported(path):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+            self._descriptor = os.open(path, flags, 0o666)
+        self._size, self._closed = 0, False
+
+    def write(self, data: bytes) -> int:
+        """Append bytes, all of them."""
+        rest = memoryview(data)
+        with files.reported(self.path):
+            while rest:
+                written = os.write(self._descriptor, rest)
+                self._size += written
+                rest = rest[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the bytes written so far."""
+        return self._size
+
+    def close(self) -> None:
+        """Bring it to the disk and close it; more than once does no harm."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            with files.reported(self.path):
+                os.fsync(self._descriptor)
+        finally:
+            os.close(self._descriptor)

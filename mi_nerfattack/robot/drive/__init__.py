@@ -1,0 +1,1 @@
+"""The loop that drives a real car, what stops it, and what it writes down."""

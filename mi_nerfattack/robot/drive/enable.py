@@ -1,0 +1,82 @@
+"""The button that a person holds as long as the car may move."""
+
+from __future__ import annotations
+
+import os
+import struct
+from contextlib import suppress
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Seconds, Whole
+from mi_nerfattack.robot.devices import AbstractEnable, Clock
+
+_EVENT = struct.Struct("=IhBB")  # milliseconds, value, type, number
+_BUTTON, _INITIAL = 0x01, 0x80
+
+
+class JoystickEnable(AbstractEnable):
+    """A button of a joystick or gamepad by Linux's ``/dev/input/js0``.
+
+    The driver tells changes alone: a wireless pad that is out of reach tells nothing,
+    and its button stays as it was. Take one with a cable; or one that sends all the
+    time, as those with motion sensors or a stick that is moved, and set `silence_s`.
+    A keyboard in a terminal cannot take its place: terminals do not tell when a key is
+    let go.
+
+    Args:
+        path: of the device.
+        button: its number, from 0; ``jstest`` shows it.
+        clock: of the loop.
+        silence_s: after which without any event the button counts as let go; None
+            where the link cannot break unseen.
+
+    Raises:
+        InputError: the device cannot be opened.
+    """
+
+    def __init__(
+        self, path: str, button: Whole, clock: Clock, silence_s: Seconds | None = None
+    ) -> None:
+        self._button, self._clock, self._silence_s = button, clock, silence_s
+        self._is_pressed, self._heard_s, self._rest = False, clock(), b""
+        self._descriptor: int | None = None
+        if not hasattr(os, "O_NONBLOCK"):
+            raise InputError(f"{path}: joysticks are read on Linux alone")
+        with files.reported(path):
+            self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+
+    def is_held(self) -> bool:
+        """Whether the button is down, by all that has come up to now."""
+        self._read()
+        if self._silence_s is not None:
+            is_silent = self._clock() - self._heard_s > self._silence_s
+        else:
+            is_silent = False
+        return self._is_pressed and self._descriptor is not None and not is_silent
+
+    def close(self) -> None:
+        """Let go of the device; from then on nothing is held."""
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            os.close(descriptor)
+
+    def _read(self) -> None:
+        while self._descriptor is not None:
+            try:
+                data = os.read(self._descriptor, 64 * _EVENT.size)
+            except BlockingIOError:
+                return
+            except OSError:  # unplugged
+                data = b""
+            if not data:
+                with suppress(OSError):
+                    self.close()
+                return
+            self._heard_s = self._clock()
+            data = self._rest + data
+            whole = len(data) - len(data) % _EVENT.size
+            self._rest = data[whole:]
+            for _, value, kind, number in _EVENT.iter_unpack(data[:whole]):
+                if kind & ~_INITIAL == _BUTTON and number == self._button:
+                    self._is_pressed = value == 1
