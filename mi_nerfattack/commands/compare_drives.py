@@ -88,9 +88,12 @@ class CompareDrives:
         from mi_nerfattack.report.plots.drives import overhead
         from mi_nerfattack.robot.compare.course import footprints
         from mi_nerfattack.robot.compare.plot import plot_aligned
+        from mi_nerfattack.robot.compare.views import draw_views
 
         if not compared.aligned:
             return
+        given = compared.aligned, compared.run, found.folder / "frames", course
+        draw_views(self.output / "views.png", *given)
         path = self.output / "comparison.png"
         plot_aligned(path, compared.aligned, course, self.environment)
         overhead(

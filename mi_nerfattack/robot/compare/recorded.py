@@ -19,7 +19,7 @@ from mi_nerfattack.rollout.drive import Drive
 REAL = "real"
 #: Share of the stretch from which on a drive counts as whole.
 WHOLE = 0.95
-_FAR = 3.0  # lane widths, in the median: another frame of the world
+_FAR = 3.0  # lane widths: another frame of the world
 _STANDING = 0.1  # of the route's speed
 _EPOCH = 1e9  # smaller times are of no calendar
 
@@ -35,7 +35,9 @@ class RecordedDrive:
         began: when the recording began, seconds since 1970.
         has_clock: whether the recording says so itself; else its file does.
         sha256: of its times and poses.
-        coverage: share of the stretch that it drives, at most 1.
+        first: index of the recording's frame that it begins with.
+        coverage: share of the stretch that it gets along, at most 1.
+        driven: length of its path over that of the stretch.
     """
 
     path: Path
@@ -43,12 +45,14 @@ class RecordedDrive:
     began: float
     has_clock: bool
     sha256: str
+    first: int
     coverage: float
+    driven: float
 
     @property
     def is_whole(self) -> bool:
-        """Whether it went all the way."""
-        return self.coverage >= WHOLE
+        """Whether it went all the way, or as far beside it."""
+        return max(self.coverage, self.driven) >= WHOLE
 
     @property
     def began_utc(self) -> str:
@@ -59,8 +63,9 @@ class RecordedDrive:
 def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDrive:
     """Read a recording of a real drive.
 
-    What lies before and after the stretch is left out, and so is what stands at either
-    end; of several laps, one counts.
+    It begins where the stretch does, and ends at its end or, out of the lane, when it
+    has driven as far as that is long. What stands at either end is left out; of several
+    laps, one counts.
 
     Args:
         path: video with poses, folder or .mcap log, as for replays.
@@ -76,9 +81,9 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     with closing(recording):
         track = recording.track
     states = vehicle_states(track, course.mount)
-    _check_frame(path, states, course)
     arcs = course.arcs(states)
     first, last = _cut(states, track.times, arcs, course)
+    _check_frame(path, states[first], course)
     if last - first < 2:
         raise InputError(
             f"{path}: its {len(arcs)} poses cover {arcs.min():.2f} to "
@@ -92,6 +97,7 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     states, times = states[cut], track.times[cut]
     _check_gaps(path, states, first, course)
     covered = min(arcs[cut].max(), course.end_m) - begin
+    way = float(np.hypot(*np.diff(states[:, :2], axis=0).T).sum())
     drive = Drive(
         REAL,
         course.route.name,
@@ -106,21 +112,22 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     content = track.times.tobytes() + track.camera_to_world.tobytes()
     digest = hashlib.sha256(content).hexdigest()
     began = _began(track)
-    return RecordedDrive(path, drive, *began, digest, covered / course.length_m)
+    shares = covered / course.length_m, way / course.length_m
+    return RecordedDrive(path, drive, *began, digest, first, *shares)
 
 
-def _check_frame(path: Path, states: np.ndarray, course: Course) -> None:
-    """Refuse poses that are far from the route, or look another way."""
+def _check_frame(path: Path, state: np.ndarray, course: Course) -> None:
+    """Refuse a drive that begins far from the route, or looks another way."""
     route = course.route
-    measures = route.project_numpy(states)
-    far = float(np.median(np.abs(measures.cross_track)))
-    turned = float(np.degrees(np.median(np.abs(measures.heading_error))))
+    measures = route.project_numpy(state)
+    far = abs(float(measures.cross_track[0]))
+    turned = abs(float(np.degrees(measures.heading_error[0])))
     if far > _FAR * route.lane_width_m or turned > 90:
         raise InputError(
-            f"{path}: in the median {far:.2f} m from route {route.name!r}, whose lane "
-            f"is {route.lane_width_m:g} m wide, and turned from it by {turned:.0f} "
-            "degrees: in another frame of the world, or not in metres; give poses in "
-            "the frame of the run's scene"
+            f"{path}: begins {far:.2f} m from route {route.name!r}, whose lane is "
+            f"{route.lane_width_m:g} m wide, turned from it by {turned:.0f} degrees: "
+            "in another frame of the world, or not in metres; give poses in the frame "
+            "of the run's scene"
         )
 
 
@@ -140,14 +147,17 @@ def _cut(
     states: np.ndarray, times: np.ndarray, arcs: np.ndarray, course: Course
 ) -> tuple[int, int]:
     """Return the first and last pose on the stretch that belong to the drive."""
-    speed = np.hypot(*np.diff(states[:, :2], axis=0).T) / np.diff(times)
-    moving = np.flatnonzero(speed > _STANDING * course.route.speed_ms)
+    way = np.hypot(*np.diff(states[:, :2], axis=0).T)
+    moving = np.flatnonzero(way / np.diff(times) > _STANDING * course.route.speed_ms)
     moving = moving[arcs[moving] >= course.start_m]
     if not len(moving):
         return 0, 0
     first, last = int(moving[0]), int(moving[-1]) + 1
-    beyond = np.flatnonzero(arcs[first:] >= course.end_m)
-    return first, min(last, first + int(beyond[0])) if len(beyond) else last
+    # out of its lane it ends when it has driven as far; in it, it may weave
+    driven = np.append(0.0, np.cumsum(way[first:]))
+    out = abs(course.route.cross_track_numpy(states[first:])) > course.lane.centre_m
+    over = (arcs[first:] >= course.end_m) | (out & (driven >= course.length_m))
+    return first, min(last, first + int(over.argmax())) if over.any() else last
 
 
 def _began(track: Track) -> tuple[float, bool]:

@@ -22,6 +22,7 @@ from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.robot.compare.aligned import align
 from mi_nerfattack.robot.compare.course import Course
 from mi_nerfattack.robot.compare.recorded import read_recorded
+from mi_nerfattack.robot.compare.views import draw_views
 from mi_nerfattack.rollout.drive import Drive, Lane
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -137,6 +138,60 @@ def test_change_of_steering(tmp_path):
     assert found["steering_change_correlation"] > 0.98
     assert found["within_range"] is None
     assert align(course, own, [run[0]], [], []).figures()["control_correlation"] is None
+
+
+def test_a_drive_that_never_comes_back(tmp_path):
+    """It is whole once it has driven as far as the run's drives; the rest is cut."""
+    course = course_of(LINE)
+    turn = np.radians(70)
+    way = np.arange(0, 60, 0.3)
+    away = np.maximum(way - 5, 0)
+    x, y = np.minimum(way, 5) - 20 + np.cos(turn) * away, np.sin(turn) * away
+    states = np.stack([x, y, np.where(away > 0, turn, 0)], 1)
+    path = write_drive(tmp_path / "away.mcap", states, 0.06, 1.8e9)
+    recorded = read_recorded(path, "attack", 0, course)
+    driven = np.hypot(*np.diff(recorded.drive.states[:, :2], axis=0).T).sum()
+    assert driven == pytest.approx(LENGTH, abs=0.31) and recorded.is_whole
+    reached = 5 + 7 * np.cos(turn)
+    assert recorded.coverage == pytest.approx(reached / LENGTH, abs=0.03)
+    early = write_drive(tmp_path / "early.mcap", states[:30], 0.06, 1.8e9)
+    assert not read_recorded(early, "attack", 0, course).is_whole
+
+
+def write_coloured(folder, states, arcs):
+    """Write a recording whose frames are the redder the further."""
+    files.make_folder(folder)
+    rows = ["time_s,file,x_m,y_m,heading_rad"]
+    for k, (state, arc) in enumerate(zip(states, arcs, strict=True)):
+        image = np.full((8, 16, 3), [round(15 * max(arc, 0)), 255, 0], np.uint8)
+        files.write_image(folder / f"{k}.png", image)
+        rows.append(",".join(map(str, [0.1 * k, f"{k}.png", *state])))
+    files.write_text(folder / "poses.csv", "\n".join([*rows, ""]))
+    return folder
+
+
+def test_views_at_equal_places(tmp_path):
+    """Both rows show the same places, a control period apart at most."""
+    course, drive = course_of(LINE), made(LINE, "attack", 1.5)
+    driven = drive.states[:-1]
+    frames = tmp_path / "frames"
+    write_coloured(frames / "surrogate_attack", driven, course.arcs(driven))
+    arcs = np.arange(-3.0, 14, 0.4)
+    real = write_coloured(tmp_path / "real", swerved(LINE, arcs, 1.4), arcs)
+    aligned = align(course, read_recorded(real, "attack", 0, course), [drive], [], [])
+    picture = tmp_path / "views.png"
+    draw_views(picture, [aligned], [drive], tmp_path / "elsewhere", course)
+    assert not picture.exists()
+    draw_views(picture, [aligned], [drive], frames, course)
+    image = files.read_image(picture).astype(int)
+    shown = (image[..., 1] == 255) & (image[..., 2] == 0)
+    lines = np.flatnonzero(shown.any(1))
+    bands = np.split(lines, np.flatnonzero(np.diff(lines) > 1) + 1)
+    found = [np.unique(image[band[0], shown[band[0]], 0]) / 15 for band in bands]
+    assert len(found) == 2 and len(found[0]) == len(found[1]) == 6
+    places = np.linspace(aligned.places[0], aligned.places[-3], 6)
+    for row, step in zip(found, (SPEED * PERIOD, 0.4), strict=True):
+        assert (row - places).min() > -0.05 and (row - places).max() < step + 0.05
 
 
 def test_steering_angles_as_driven():
