@@ -49,6 +49,7 @@ lint: $(VENV)/.installed-dev
 
 # Nothing is fetched; a warning, a dead link inside among them, is an error.
 docs: $(VENV)/.installed-dev
+	$(VENV)/bin/python docs/pictures.py
 	$(VENV)/bin/sphinx-build -W -n --keep-going -q -E -a docs build/docs
 
 # A stamp says that the step is done, and is younger than what it was done from.

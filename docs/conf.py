@@ -7,13 +7,14 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-HERE = Path(__file__).parent
-sys.path.append(str(HERE / "extensions"))
+sys.path.append(str(Path(__file__).parent / "extensions"))
+import plugin_reference  # noqa: E402
 
 project = "mi-nerfattack"
 copyright = "The mi-nerfattack authors"
 
-extensions = ["myst_parser", "mathml"]
+extensions = ["myst_parser", "sphinx_tabs.tabs", "mathml", "plugin_reference"]
+rst_prolog = plugin_reference.PROLOG
 exclude_patterns = ["extensions", "examples"]
 # Nothing is fetched, neither while the site is built nor while it is read.
 html_math_renderer = "mathml"

@@ -22,38 +22,68 @@ from mi_nerfattack.render.rays import Rays
 
 
 class FieldEmitter(mi.Emitter):
-    r"""Fields behind the surface of a closed shape (``field_emitter``).
+    r"""
+    .. _emitter-field_emitter:
 
-    Radiance that leaves the surface along a ray is the composite of the nested fields
-    along that ray (see ``field_integrator``), over the background of the first field
-    that has one. Seen from outside, the march starts on the surface; seen from
-    inside, it starts at the ray's origin and ends on the surface. So stock
-    integrators (``path``, ``direct``) show the fields, and light other surfaces with
-    them: directions are sampled on the shape, as the stock ``area`` emitter does.
+    Fields behind the surface of a shape (:monosp:`field_emitter`)
+    --------------------------------------------------------------
 
-    ===========  ========  =======  =======  ========================================
-    name         type      unit     default  meaning
-    ===========  ========  =======  =======  ========================================
-    (nested)     volume                      ``grid_field``, ``ngp_field``; 1 or more
-    composite    string             inter-   ``interleaved`` or ``depth``
-                                    leaved
-    stop         float              1e-6     transmittance at which a ray ends
-    ===========  ========  =======  =======  ========================================
+    .. pluginparameters::
 
-    .. code-block:: xml
+     * - (Nested plugin)
+       - |volume|
+       - ``grid_field``, ``ngp_field``; one or more
+       - |exposed|, |differentiable|
 
-        <shape type="cube">
-            <bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
-            <emitter type="field_emitter">
-                <volume type="grid_field" id="object">
-                    <string name="filename" value="hydrant.safetensors"/>
-                </volume>
-            </emitter>
-        </shape>
+     * - composite
+       - |string|
+       - :monosp:`interleaved` or :monosp:`depth`, as of ``field_integrator``.
+         (Default: :monosp:`interleaved`)
 
-    .. code-block:: python
+     * - stop
+       - |float|
+       - Transmittance at which a ray ends. (Default: 1e-6)
 
-        {"type": "field_emitter", "object": {"type": "grid_field", "filename": "f"}}
+     * - sampling_weight
+       - |float|
+       - Share of emitter samples, relative to the scene's other emitters.
+         (Default: 1)
+
+     * - to_world
+       - |transform|
+       - Read by Mitsuba of every emitter, and without effect: volumes and shape have
+         their own
+
+    Radiance that leaves the surface of a closed shape along a ray is the composite of
+    the nested fields along that ray (see ``field_integrator``), over the background
+    of the first field that has one. Seen from outside, the march starts on the
+    surface; seen from inside, it starts at the ray's origin and ends on the surface.
+    So stock integrators (``path``, ``direct``) show the fields, and light other
+    surfaces with them: directions are sampled on the shape, as the stock ``area``
+    emitter does.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <shape type="cube">
+                <bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
+                <emitter type="field_emitter">
+                    <volume type="grid_field" id="object">
+                        <string name="filename" value="hydrant.safetensors"/>
+                    </volume>
+                </emitter>
+            </shape>
+
+        .. code-tab:: python
+
+            {
+                "type": "cube",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0}},
+                "emitter": {
+                    "type": "field_emitter",
+                    "object": {"type": "grid_field", "filename": "hydrant.safetensors"},
+                },
+            }
 
     Next-event estimation and multiple importance sampling are those of the stock
     ``area`` emitter: points are sampled on the shape by area, so a small bright field

@@ -28,7 +28,45 @@ from mi_nerfattack.render.surroundings import nearest_surface
 
 
 class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
-    r"""Composite of radiance fields (``field_integrator``).
+    r"""
+    .. _integrator-field_integrator:
+
+    Composite of fields (:monosp:`field_integrator`)
+    ------------------------------------------------
+
+    .. pluginparameters::
+
+     * - (Nested plugin)
+       - |volume|
+       - ``grid_field``, ``ngp_field``, ``splat_background``; one or more
+       - |exposed|, |differentiable|
+
+     * - (Nested plugin)
+       - |integrator|
+       - Renders the surfaces and lights behind, for instance ``path``.
+         (Default: none)
+
+     * - composite
+       - |string|
+       - :monosp:`interleaved` or :monosp:`depth`. (Default: :monosp:`interleaved`)
+
+     * - stop
+       - |float|
+       - Transmittance at which a ray ends. (Default: 1e-6)
+
+     * - jitter
+       - |bool|
+       - Random instead of middle sample positions. (Default: |false|)
+
+     * - relit_samples
+       - |int|
+       - Light samples a ray, for each field and for what lies behind; only if a field
+         is ``relit``. (Default: 16)
+
+     * - hide_emitters, max_depth, rr_depth, block_size, samples_per_pass, timeout
+       - |int|
+       - Read by Mitsuba's own base classes, and without effect here: those of the
+         nested integrator count
 
     Every camera ray is marched through the nested fields up to the nearest surface
     of the scene, and lies over what a nested integrator sees behind, or over the
@@ -36,6 +74,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum sigma_k L_k /
     sigma``) or ``depth`` (each field alone, folded front to back by expected depth,
     ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do not overlap.
+    A ``splat_background`` is a layer of ``depth`` alone, and takes no derivatives.
 
     AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
     ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of the field's
@@ -43,36 +82,25 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     a pixel is the mean of its samples weighted by their opacity, infinite where none
     is above 0; ``mi.render`` returns it, the film alone holds depth times opacity.
 
-    =============  ==========  =======  =============================================
-    name           type        default  meaning
-    =============  ==========  =======  =============================================
-    (nested)       volume               ``grid_field``, ``ngp_field``,
-                                        ``splat_background``; 1 or more
-    (nested)       integrator  none     renders surfaces and lights behind
-    composite      string      inter-   ``interleaved`` or ``depth``
-                               leaved
-    stop           float       1e-6     transmittance at which a ray ends
-    jitter         bool        false    random instead of middle sample positions
-    relit_samples  integer     16       light samples a ray, for each field and for
-                                        what lies behind; only if a field is ``relit``
-    =============  ==========  =======  =============================================
+    .. tabs::
+        .. code-tab:: xml
 
-    A ``splat_background`` is a layer of ``depth`` alone, and takes no derivatives.
+            <integrator type="field_integrator">
+                <volume type="ngp_field" id="scene">
+                    <string name="filename" value="field.safetensors"/>
+                </volume>
+                <volume type="grid_field" id="object">
+                    <string name="filename" value="hydrant.safetensors"/>
+                </volume>
+            </integrator>
 
-    .. code-block:: xml
+        .. code-tab:: python
 
-        <integrator type="field_integrator">
-            <volume type="ngp_field" id="scene">
-                <string name="filename" value="field.safetensors"/>
-            </volume>
-            <volume type="grid_field" id="object">
-                <string name="filename" value="hydrant.safetensors"/>
-            </volume>
-        </integrator>
-
-    .. code-block:: python
-
-        {"type": "field_integrator", "object": {"type": "grid_field", "filename": "f"}}
+            {
+                "type": "field_integrator",
+                "scene": {"type": "ngp_field", "filename": "field.safetensors"},
+                "object": {"type": "grid_field", "filename": "hydrant.safetensors"},
+            }
 
     Volumes with ``relit`` true are inserted objects, lit by the scene's emitters: their
     radiance counts as the reflectance of a diffuse surface, ``L = radiance E / pi``, at

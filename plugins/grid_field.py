@@ -8,7 +8,51 @@ from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 
 class GridFieldVolume(AbstractFieldVolume):
-    r"""Decoder-free grid field (``grid_field``).
+    r"""
+    .. _volume-grid_field:
+
+    Decoder-free grid field (:monosp:`grid_field`)
+    ----------------------------------------------
+
+    .. pluginparameters::
+     :extra-rows: 6
+
+     * - filename
+       - |string|
+       - Field file, of ``mi-nerfattack asset``
+
+     * - to_world
+       - |transform|
+       - Rotation, translation and uniform scale, field to world, metres.
+         (Default: identity)
+
+     * - quantity
+       - |string|
+       - What it is in a medium: :monosp:`density` or :monosp:`radiance`.
+         (Default: :monosp:`density`)
+
+     * - density_limit
+       - |float|
+       - Cuts the density, 1/metre, in media alone. (Default: infinite)
+
+     * - step_m
+       - |float|
+       - Step of the march, metres in the field's frame. (Default: that of the file)
+
+     * - relit
+       - |bool|
+       - Lit by the scene's emitters, in ``field_integrator`` alone.
+         (Default: |false|)
+
+     * - texture
+       - |tensor|
+       - Raw colours of the vertices of all levels, (n, 3)
+       - |exposed|, |differentiable|
+
+     * - density
+       - :paramtype:`float[]`
+       - Raw densities of the vertices of all levels, (n,)
+       - |exposed|, |differentiable|
 
     Density ``s exp(sum_l d_l(x))`` and radiance
     ``srgb_to_linear(sigmoid(sum_l c_l(x)))`` of trilinearly interpolated vertices of
@@ -16,30 +60,21 @@ class GridFieldVolume(AbstractFieldVolume):
     ``sigma_t`` (quantity ``density``) or ``albedo`` (quantity ``radiance``); inside
     ``field_emitter`` and ``field_integrator`` both are used.
 
-    =============  =========  =======  ========  ====================================
-    name           type       unit     default   meaning
-    =============  =========  =======  ========  ====================================
-    filename       string                        file of ``mi-nerfattack asset``
-    to_world       transform  metre    identity  rotation, translation, uniform scale
-    quantity       string              density   ``density`` or ``radiance``
-    density_limit  float      1/metre  infinite  cuts the density, in media alone
-    step_m         float      metre    the file  step of the march, in the field's frame
-    relit          boolean             false     lit by the scene's emitters, in
-                                                 ``field_integrator`` alone
-    texture        tensor                        (n, 3) raw colours; differentiable
-    density        array                         (n,) raw densities; differentiable
-    =============  =========  =======  ========  ====================================
+    .. tabs::
+        .. code-tab:: xml
 
-    .. code-block:: xml
+            <volume type="grid_field" id="object">
+                <string name="filename" value="hydrant.safetensors"/>
+                <transform name="to_world"><scale value="2"/></transform>
+            </volume>
 
-        <volume type="grid_field" id="object">
-            <string name="filename" value="hydrant.safetensors"/>
-            <transform name="to_world"><scale value="2"/></transform>
-        </volume>
+        .. code-tab:: python
 
-    .. code-block:: python
-
-        {"type": "grid_field", "filename": "hydrant.safetensors"}
+            {
+                "type": "grid_field",
+                "filename": "hydrant.safetensors",
+                "to_world": mi.ScalarTransform4f().scale(2),
+            }
 
     Media step by the largest density: where an object is as opaque as fitted ones are
     (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass

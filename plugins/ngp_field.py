@@ -8,36 +8,73 @@ from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 
 class NGPFieldVolume(AbstractFieldVolume):
-    r"""Instant-NGP field (``ngp_field``).
+    r"""
+    .. _volume-ngp_field:
+
+    Instant-NGP field (:monosp:`ngp_field`)
+    ---------------------------------------
+
+    .. pluginparameters::
+     :extra-rows: 6
+
+     * - filename
+       - |string|
+       - Field file, of ``mi-nerfattack fit``
+
+     * - to_world
+       - |transform|
+       - Rotation, translation and uniform scale, field to world, metres.
+         (Default: identity)
+
+     * - quantity
+       - |string|
+       - What it is in a medium: :monosp:`density` or :monosp:`radiance` (seen along
+         the field's +z).
+         (Default: :monosp:`density`)
+
+     * - density_limit
+       - |float|
+       - Cuts the density, 1/metre, in media alone. (Default: infinite)
+
+     * - step_m
+       - |float|
+       - Step of the march, metres in the field's frame. (Default: that of the file)
+
+     * - relit
+       - |bool|
+       - Lit by the scene's emitters, in ``field_integrator`` alone.
+         (Default: |false|)
+
+     * - table
+       - :paramtype:`float[]`
+       - Features of the hash grid
+       - |exposed|, |differentiable|
+
+     * - density_weights, colour_weights
+       - :paramtype:`float[]`
+       - Weights of the two networks
+       - |exposed|, |differentiable|
+
+     * - sky
+       - :paramtype:`float[]`
+       - Image of what lies behind, by direction
+       - |exposed|, |differentiable|
 
     Hash grid, density network and view-dependent colour network (Mueller et al.
     2022) with an image of the sky behind. In a stock ``heterogeneous`` medium it
     serves as ``sigma_t``; inside ``field_emitter`` and ``field_integrator`` density
     and radiance are used.
 
-    =============  =========  =======  ========  ====================================
-    name           type       unit     default   meaning
-    =============  =========  =======  ========  ====================================
-    filename       string                        file of ``mi-nerfattack fit``
-    to_world       transform  metre    identity  rotation, translation, uniform scale
-    quantity       string              density   ``density`` or ``radiance`` (seen
-                                                 along the field's +z)
-    density_limit  float      1/metre  infinite  cuts the density, in media alone
-    step_m         float      metre    the file  step of the march, in the field's frame
-    relit          boolean             false     lit by the scene's emitters, in
-                                                 ``field_integrator`` alone
-    table, ...     array                         parameters; differentiable
-    =============  =========  =======  ========  ====================================
+    .. tabs::
+        .. code-tab:: xml
 
-    .. code-block:: xml
+            <volume type="ngp_field" id="scene">
+                <string name="filename" value="field.safetensors"/>
+            </volume>
 
-        <volume type="ngp_field" id="scene">
-            <string name="filename" value="field.safetensors"/>
-        </volume>
+        .. code-tab:: python
 
-    .. code-block:: python
-
-        {"type": "ngp_field", "filename": "field.safetensors"}
+            {"type": "ngp_field", "filename": "field.safetensors"}
 
     Not differentiable: the pose. Media step by the largest density, an estimate (see
     ``NGPField.density_bound``): ``density_limit`` makes it sharp and small.

@@ -18,7 +18,73 @@ _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 class OpencvCamera(mi.Sensor):
-    r"""Pinhole camera with OpenCV's lens distortion (``opencv_camera``).
+    r"""
+    .. _sensor-opencv_camera:
+
+    Pinhole camera with OpenCV's lens distortion (:monosp:`opencv_camera`)
+    ----------------------------------------------------------------------
+
+    .. pluginparameters::
+     :extra-rows: 11
+
+     * - fx
+       - |float|
+       - Focal length, pixels
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - fy
+       - |float|
+       - Focal length along the columns, pixels. (Default: ``fx``)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - cx, cy
+       - |float|
+       - Principal point in the full film, pixels. (Default: its centre)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - k1, k2
+       - |float|
+       - Radial distortion. (Default: 0)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - p1, p2
+       - |float|
+       - Tangential distortion. (Default: 0)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - to_world
+       - |transform|
+       - Rotation and translation, camera to world, metres. (Default: identity)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - near_clip, far_clip
+       - |float|
+       - Rays start and end at these distances along z, metres.
+         (Default: 1e-2, 1e4)
+       - |exposed|
+
+     * - shutter_open
+       - |float|
+       - Time at which the shutter opens, as of ``perspective``. (Default: 0)
+       - |exposed|
+
+     * - shutter_close
+       - |float|
+       - Time at which it closes, as of ``perspective``. (Default: 0)
+
+     * - srf
+       - |spectrum|
+       - Sensor response of spectral variants, as of ``perspective``. (Default: none)
+
+     * - (Nested plugin)
+       - |film|, |sampler|, |medium|
+       - As of ``perspective``
+       - |exposed|
+
+     * - shutter_open_time
+       - |float|
+       - How long the shutter is open
+       - |exposed|
 
     A point :math:`(X, Y, Z)` of the camera's frame (Mitsuba's: x to the left, y up, z
     forward) is seen at the pixel :math:`u = f_x x' + c_x,\ v = f_y y' + c_y`, where
@@ -34,41 +100,37 @@ class OpencvCamera(mi.Sensor):
     principal point found with OpenCV, which counts from the centre of the first pixel,
     add 0.5.
 
-    =================  =========  =====  ========  ===================================
-    name               type       unit   default   meaning
-    =================  =========  =====  ========  ===================================
-    fx                 float      pixel            focal length
-    fy                 float      pixel  fx        focal length along the columns
-    cx, cy             float      pixel  centre    principal point in the full film
-    k1, k2             float             0         radial distortion
-    p1, p2             float             0         tangential distortion
-    to_world           transform  metre  identity  rotation and translation
-    near_clip          float      metre  1e-2      rays start at this distance along z
-    far_clip           float      metre  1e4       rays end at this distance along z
-    shutter_open, shutter_close, srf, (nested) film and sampler: as of ``perspective``
-    ==================================================================================
+    Other values need no other kernel, unless the first distortion coefficient becomes
+    other than zero.
 
-    All but the shutter and ``srf`` show in ``mi.traverse``. Other values need no other
-    kernel, unless the first distortion coefficient becomes other than zero.
+    .. tabs::
+        .. code-tab:: xml
 
-    .. code-block:: xml
+            <sensor type="opencv_camera">
+                <float name="fx" value="250"/>
+                <float name="fy" value="252"/>
+                <float name="k1" value="-0.1"/>
+                <transform name="to_world">
+                    <lookat origin="3, 1, 1.5" target="0, 0, 0" up="0, 0, 1"/>
+                </transform>
+                <film type="hdrfilm">
+                    <integer name="width" value="320"/>
+                    <integer name="height" value="240"/>
+                </film>
+            </sensor>
 
-        <sensor type="opencv_camera">
-            <float name="fx" value="250"/>
-            <float name="fy" value="252"/>
-            <float name="k1" value="-0.1"/>
-            <transform name="to_world">
-                <lookat origin="3, 1, 1.5" target="0, 0, 0" up="0, 0, 1"/>
-            </transform>
-            <film type="hdrfilm">
-                <integer name="width" value="320"/>
-                <integer name="height" value="240"/>
-            </film>
-        </sensor>
+        .. code-tab:: python
 
-    .. code-block:: python
-
-        {"type": "opencv_camera", "fx": 600.0, "fy": 605.0, "k1": -0.1}
+            {
+                "type": "opencv_camera",
+                "fx": 250.0,
+                "fy": 252.0,
+                "k1": -0.1,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    [3, 1, 1.5], [0, 0, 0], [0, 0, 1]
+                ),
+                "film": {"type": "hdrfilm", "width": 320, "height": 240},
+            }
 
     Differentiable with respect to the intrinsics and ``to_world``, as far as the
     integrator is. Limits: no aperture; a distortion that cannot be inverted in the

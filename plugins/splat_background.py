@@ -14,7 +14,23 @@ from mi_nerfattack.render.splats import SplatBackground
 
 
 class SplatBackgroundVolume(mi.Volume):
-    r"""3D Gaussian splats as a constant background (``splat_background``).
+    r"""
+    .. _volume-splat_background:
+
+    Gaussian splats as a constant background (:monosp:`splat_background`)
+    ---------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - .ply of a 3D Gaussian splatting trainer: ``f_dc_*``, ``opacity``,
+         ``scale_*``, ``rot_*``, ``f_rest_*``
+
+     * - to_world
+       - |transform|
+       - Rotation, translation and uniform scale (metres per unit of the file), file
+         to world. (Default: identity)
 
     The scene that a 3D Gaussian splatting trainer wrote, seen by ``field_integrator``
     behind, between and in front of fields, by depth. Splats are intersected through
@@ -23,34 +39,31 @@ class SplatBackgroundVolume(mi.Volume):
     a_j)``, ``a_i = min(opacity_i exp(-m_i^2 / 2), 0.9999)``, m_i the least distance of
     the ray from the centre in standard deviations, at most 3. See ``render.splats``.
 
-    =============  =========  =======  ========  ====================================
-    name           type       unit     default   meaning
-    =============  =========  =======  ========  ====================================
-    filename       string                        .ply with ``f_dc_*``, ``opacity``,
-                                                 ``scale_*``, ``rot_*``, ``f_rest_*``
-    to_world       transform  metre    identity  rotation, translation, uniform scale
-                                                 (metres per unit of the file)
-    =============  =========  =======  ========  ====================================
+    .. tabs::
+        .. code-tab:: xml
 
-    .. code-block:: xml
+            <integrator type="field_integrator">
+                <string name="composite" value="depth"/>
+                <volume type="splat_background" id="street">
+                    <string name="filename" value="street.ply"/>
+                </volume>
+                <volume type="grid_field" id="object">
+                    <string name="filename" value="hydrant.safetensors"/>
+                </volume>
+            </integrator>
 
-        <integrator type="field_integrator">
-            <string name="composite" value="depth"/>
-            <volume type="splat_background" id="street">
-                <string name="filename" value="street.ply"/>
-            </volume>
-            <volume type="grid_field" id="object">
-                <string name="filename" value="hydrant.safetensors"/>
-            </volume>
-        </integrator>
+        .. code-tab:: python
 
-    .. code-block:: python
-
-        {"type": "splat_background", "filename": "street.ply"}
+            {
+                "type": "field_integrator",
+                "composite": "depth",
+                "street": {"type": "splat_background", "filename": "street.ply"},
+                "object": {"type": "grid_field", "filename": "hydrant.safetensors"},
+            }
 
     Limits: a layer of the ``depth`` composite alone; splats have no density, so that
     ``interleaved``, media and ``field_emitter`` refuse them, and so does ``relit``.
-    It has no parameters, and nothing is differentiated by it.
+    It has no parameters in ``mi.traverse``, and nothing is differentiated by it.
     """
 
     def __init__(self, props: mi.Properties) -> None:
