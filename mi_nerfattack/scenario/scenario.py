@@ -11,6 +11,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -47,6 +48,7 @@ from mi_nerfattack.vehicle.route.route import Route
 #: Returns the name of a file without its folder, and the SHA-256 of its content.
 Content = Callable[[NamedFile], dict[str, str]]
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
+_LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _MAX_CHARACTERS = 1 << 16
 _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside objects'
 
@@ -104,6 +106,14 @@ class CameraSection(Section):
     width: Count = 200
     height: Count = 66
     fov_x_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    fx: Positive | None = None  # pixels; in place of fov_x_deg
+    fy: Positive | None = None  # fx
+    cx: Finite | None = None  # pixels from the image's corner, not its first pixel's
+    cy: Finite | None = None  # centre; the middle
+    k1: Finite = 0.0  # distortion as OpenCV's
+    k2: Finite = 0.0
+    p1: Finite = 0.0
+    p2: Finite = 0.0
     height_m: Positive = 1.4
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
@@ -111,7 +121,22 @@ class CameraSection(Section):
     def build(self) -> tuple[Camera, CameraMount]:
         """Make intrinsics and mount."""
         camera = from_fov(self.width, self.height, self.fov_x_deg)
+        lens = {key: getattr(self, key) for key in _LENS} | {"fy": self.fy or self.fx}
+        camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
         return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
+
+    @model_validator(mode="after")
+    def _check_lens(self) -> Any:
+        """Refuse two focal lengths, half of one, and distortion without an inverse."""
+        if self.fx and self.fov_x_deg != self.defaults()["fov_x_deg"]:
+            refuse("fx", "stands beside fov_x_deg; give one of them")
+        if self.fy and not self.fx:
+            refuse("fy", "stands without fx; give both, or fov_x_deg")
+        try:
+            self.build()
+        except InputError as error:
+            refuse("k1", str(error))
+        return self
 
 
 class DriveSection(Section):
@@ -259,7 +284,7 @@ class Scenario(Section):
 
     def _check_named(self, xml: NamedFile) -> None:
         """Refuse what the Mitsuba scene of the surrogate says itself."""
-        lens = ("width", "height", "fov_x_deg")
+        lens = ("width", "height", "fov_x_deg", *_LENS)
         groups = [("camera", self.camera, lens), ("attack", self.attack, ("jitter",))]
         own = ("field", "position_m", "yaw_deg", "scale", "step_m")
         groups += [(f"objects.{i}", item, own) for i, item in enumerate(self.objects)]

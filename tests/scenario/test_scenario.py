@@ -10,6 +10,7 @@ from helpers.scenario_text import write_named_files
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import differences
+from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.scenario.named_file import resolve
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.world import initial_states
@@ -57,6 +58,33 @@ def test_defaults_and_text(write):
     assert scenario.attack.method.max_iterations == 3
     assert scenario.camera.width == 200 and scenario.camera.height == 66
     assert [item.scale for item in scenario.objects] == [1.0, 2.0]
+
+
+LENS = "fx = 175.5\nfy = 170\ncx = 165\nk1 = -0.17\nk2 = 0.03\np1 = 1e-3\n"
+
+
+def test_a_measured_lens_takes_the_place_of_an_angle(write):
+    size = "[camera]\nwidth = 336\nheight = 188\n"
+    scenario, _ = load_scenario(write(MINIMAL + size + LENS))
+    camera, _ = scenario.camera.build()
+    bent = {"k1": -0.17, "k2": 0.03, "p1": 1e-3}
+    assert camera == Camera(336, 188, 175.5, 170.0, 165.0, 94.0, **bent)
+    scenario, _ = load_scenario(write(MINIMAL + size + "fx = 200\n"))
+    assert scenario.camera.build()[0] == Camera(336, 188, 200.0, 200.0, 168.0, 94.0)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("fx = 200\nfov_x_deg = 70", "camera.fx: stands beside fov_x_deg"),
+        ("fy = 200", "camera.fy: stands without fx"),
+        ("fx = 0", "camera.fx: "),
+        ("k1 = -3", "camera.k1: .*folds the image over itself"),
+    ],
+)
+def test_impossible_lenses_are_refused(write, lines, message):
+    with pytest.raises(InputError, match=message):
+        load_scenario(write(MINIMAL + f"[camera]\n{lines}\n"))
 
 
 def test_digest_tells_scenarios_apart(write, tmp_path):

@@ -104,6 +104,7 @@ def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
         ({OBJECT: ""}, "", r"8: objects.0.field: is missing"),
         ({FIELD: NAMED[FIELD], OBJECT: ""}, "", r"10: objects.0.position_m: .*out"),
         (NAMED, "[camera]\nwidth = 96\n", "camera.width: surrogate.xml says it; leave"),
+        (NAMED, "[camera]\nk1 = -0.01\n", "camera.k1: surrogate.xml says it; leave"),
     ],
 )
 def test_what_the_xml_says_is_said_once(load, changes, add, message):
