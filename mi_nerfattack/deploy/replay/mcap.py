@@ -104,17 +104,7 @@ class McapRecording(AbstractRecording):
         self._path = path
         self._images = [_compressed(f"{path}: {topics.image}", item) for item in images]
         times = _stamps(f"{path}: {topics.image}", images)
-        name, body_to_camera = topics.camera_pose, np.eye(4)
-        if not found[name]:
-            name, body_to_camera = topics.vehicle_pose, mount_matrix(np.zeros(3), mount)
-        if not found[name]:
-            raise InputError(
-                f"{path}: no message on {topics.camera_pose} or {topics.vehicle_pose}; "
-                "record the poses, too"
-            )
-        where = f"{path}: {name}"
-        poses = np.stack([_pose(where, item) for item in found[name]]) @ body_to_camera
-        pose_times = _stamps(where, found[name])
+        name, pose_times, poses = _camera_poses(path, found, topics, mount)
         kept = _with_poses(times, pose_times)
         if (kept.start, kept.stop) != (0, len(times)):
             self.remarks += (
@@ -136,6 +126,51 @@ class McapRecording(AbstractRecording):
     def depth(self, index: int) -> np.ndarray:
         """Return infinite depth: a log has none."""
         return no_depth(self.camera)
+
+
+def read_vehicle_poses(
+    path: Path, mount: CameraMount, topics: McapTopics | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Read all poses of a log's vehicle, those between frames too.
+
+    Args:
+        path: of at most 4 GiB.
+        mount: of the camera, for logs of its poses.
+        topics: names.
+
+    Returns:
+        times (n,), seconds, and body to world (n, 4, 4): x forward, y left, z up,
+        metres.
+
+    Raises:
+        InputError: it cannot be read, or has no poses.
+    """
+    topics = topics or McapTopics()
+    schemas = topics.schemas()
+    wanted = {name: schemas[name] for name in (topics.camera_pose, topics.vehicle_pose)}
+    found, _ = _read_messages(path, wanted)
+    _, times, poses = _camera_poses(path, found, topics, mount)
+    return times, poses @ np.linalg.inv(mount_matrix(np.zeros(3), mount)[0])
+
+
+def _camera_poses(
+    path: Path,
+    found: Mapping[str, Sequence[Mapping[str, Any]]],
+    topics: McapTopics,
+    mount: CameraMount,
+) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return the topic, times (n,) and poses (n, 4, 4) of the camera, OpenCV axes."""
+    name, body_to_camera = topics.camera_pose, np.eye(4)
+    if not found[name]:
+        name, body_to_camera = topics.vehicle_pose, mount_matrix(np.zeros(3), mount)[0]
+    if not found[name]:
+        raise InputError(
+            f"{path}: no message on {topics.camera_pose} or {topics.vehicle_pose}; "
+            "record the poses, too"
+        )
+    where = f"{path}: {name}"
+    poses = np.stack([_pose(where, item) for item in found[name]]) @ body_to_camera
+    return name, _stamps(where, found[name]), poses
 
 
 def _read_messages(

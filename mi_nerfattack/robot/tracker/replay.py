@@ -1,0 +1,75 @@
+"""Recorded poses as a tracker."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mi_nerfattack.deploy.replay.mcap import read_vehicle_poses
+from mi_nerfattack.deploy.replay.poses import read_poses
+from mi_nerfattack.deploy.replay.recording import Track
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix
+from mi_nerfattack.robot.devices import (
+    AbstractTracker,
+    Clock,
+    DeviceLostError,
+    TrackedPose,
+)
+
+
+class ReplayTracker(AbstractTracker):
+    """Poses of one vehicle, at the times between them from the moment it is made.
+
+    Args:
+        track: times, and where the body was: its matrices are taken as the body's.
+        clock: of the poses' times.
+    """
+
+    def __init__(self, track: Track, clock: Clock = time.monotonic) -> None:
+        self._track, self._clock = track, clock
+        self._times = clock() + track.times - track.times[0]
+        self._is_closed = False
+
+    def newest(self, body: str) -> TrackedPose | None:
+        """Return the newest pose, whatever the body is called.
+
+        Raises:
+            DeviceLostError: the last pose has been, as long as there were between
+                poses at most.
+        """
+        del body
+        now, times = self._clock(), self._times
+        over = times[-1] + (np.diff(times).max() if len(times) > 1 else 0.0)
+        if self._is_closed or now > over:
+            why = "it is closed" if self._is_closed else "the recording is over"
+            raise DeviceLostError(f"{self._track.where}: {why}")
+        index = max(int(np.searchsorted(times, now, side="right")) - 1, 0)
+        matrix = self._track.camera_to_world[index]
+        return TrackedPose(matrix, float(times[index]), index)
+
+    def close(self) -> None:
+        """Let go of the recording."""
+        self._is_closed = True
+
+
+def read_body_track(path: Path, mount: CameraMount) -> Track:
+    """Read when a vehicle was where.
+
+    Args:
+        path: an MCAP log, or a pose file (.csv, .toml, .json) with times.
+        mount: of the camera, where the file has the camera's poses.
+
+    Raises:
+        InputError: it cannot be read, or has no times.
+    """
+    if path.suffix.lower() == ".mcap":
+        times, poses = read_vehicle_poses(path, mount)
+        return Track(str(path), times, poses)
+    table = read_poses(path, mount)
+    if table.times is None:
+        raise InputError(f"{path}: no times; add a column time_s, seconds")
+    to_body = np.linalg.inv(mount_matrix(np.zeros((1, 3)), mount)[0])
+    return Track(str(path), table.times, table.camera_to_world @ to_body)
