@@ -11,7 +11,6 @@ import tyro
 from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
 
 if TYPE_CHECKING:
-    from mi_nerfattack.policy.base import AbstractPolicy
     from mi_nerfattack.robot.remote.server import Control
 
 
@@ -45,6 +44,7 @@ class ServePolicy:
 
         from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
+        from mi_nerfattack.robot.drive.pilot import policy_control
         from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
         from mi_nerfattack.robot.remote.server import PolicyServer
 
@@ -56,7 +56,7 @@ class ServePolicy:
         policy = self.options.section(self.policy).build()
 
         def make_control() -> Control:
-            return _control(policy, self.route_goal)
+            return policy_control(policy, self.route_goal)
 
         if self.size is not None:
             width, height = self.size
@@ -73,19 +73,3 @@ class ServePolicy:
             except KeyboardInterrupt:
                 say(f"Ended: {server.summary()}")
         return 0
-
-
-def _control(policy: AbstractPolicy, goal: int) -> Control:
-    """Return what a policy makes of images, one after the other."""
-    import numpy as np
-
-    from mi_nerfattack.deploy.driving import policy_image
-
-    memory = policy.initial_memory(1)
-
-    def control(image: np.ndarray) -> float:
-        nonlocal memory
-        row, memory = policy.step(policy_image(image), goal, memory)
-        return float(np.array(row)[0])
-
-    return control

@@ -125,6 +125,7 @@ def _document(
             "case": recorded.drive.case,
             "began": recorded.began_utc,
             "coverage": recorded.coverage,
+            "remarks": list(recorded.remarks),
             "figures": {k: v for k, v in per_run.items() if k not in ("run", "seed")},
             "beside_run": item.figures(),
         }

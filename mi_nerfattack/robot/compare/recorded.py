@@ -38,6 +38,7 @@ class RecordedDrive:
         first: index of the recording's frame that it begins with.
         coverage: share of the stretch that it gets along, at most 1.
         driven: length of its path over that of the stretch.
+        remarks: what of the recording is left out.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class RecordedDrive:
     first: int
     coverage: float
     driven: float
+    remarks: tuple[str, ...]
 
     @property
     def is_whole(self) -> bool:
@@ -79,7 +81,7 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     """
     recording = open_recording(path, course.camera, course.mount, course.period)
     with closing(recording):
-        track = recording.track
+        track, remarks = recording.track, recording.remarks
     states = vehicle_states(track, course.mount)
     arcs = course.arcs(states)
     first, last = _cut(states, track.times, arcs, course)
@@ -113,7 +115,7 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     digest = hashlib.sha256(content).hexdigest()
     began = _began(track)
     shares = covered / course.length_m, way / course.length_m
-    return RecordedDrive(path, drive, *began, digest, first, *shares)
+    return RecordedDrive(path, drive, *began, digest, first, *shares, remarks)
 
 
 def _check_frame(path: Path, state: np.ndarray, course: Course) -> None:

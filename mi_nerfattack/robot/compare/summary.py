@@ -58,6 +58,7 @@ def _drive(row: Mapping[str, Any], document: Mapping[str, Any]) -> str:
         }[row["success"]]
     if "decision" in row:
         judged += f": {row['decision']}"
+    judged += "".join(f"; {remark}" for remark in row["remarks"])
     return (
         f"{row['file']} ({row['case']}): mean error "
         f"{figures['cross_track_mean_m']:.3f} m, at most "

@@ -1,4 +1,4 @@
-"""Real drives beside those of a run that were drawn, not driven."""
+"""The command that compares drives, on a run that was drawn, not driven."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ import numpy as np
 import pytest
 from helpers.attack_jobs import write_scenario
 from helpers.made_drives import COST
-from helpers.recorded_drives import CALIBRATION, image_message, pose_message, write_log
+from helpers.real_drives import LINE, STEPS, made, real, swerved, write_drive
 
 from mi_nerfattack import cli
 from mi_nerfattack.evaluation.metrics import metrics_document
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
-from mi_nerfattack.robot.compare.aligned import align
-from mi_nerfattack.robot.compare.course import Course
-from mi_nerfattack.robot.compare.recorded import read_recorded
-from mi_nerfattack.robot.compare.views import draw_views
-from mi_nerfattack.rollout.drive import Drive, Lane
-from mi_nerfattack.vehicle.route.route import Route
+from mi_nerfattack.rollout.drive import Lane
 
 CRITERIA = """\
 case = "attack"
@@ -36,176 +30,6 @@ p1 = 0.75
 alpha = 0.1
 beta = 0.1
 """
-SPEED, PERIOD, STEPS = 5.0, 0.1, 24
-LENGTH = SPEED * PERIOD * STEPS
-ANGLE = 2 * np.pi * np.arange(600) / 600
-LOOP = Route("loop", 0, 10 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], 1), closed=True)
-LINE = Route("line", 0, np.array([[-20.0, 0], [60, 0]]))
-
-
-def course_of(route: Route, start: float = 0.0, length: float = LENGTH, **changes):
-    camera, mount = from_fov(16, 8, 90.0), CameraMount()
-    about = {"control_unit": "rad/s", "wheelbase": 2.7} | changes
-    lane = Lane(0.85, 1.75)
-    return Course(route, start, start + length, lane, camera, mount, PERIOD, **about)
-
-
-def swerved(route: Route, arcs: np.ndarray, most: float, left=0.0) -> np.ndarray:
-    """Return states (n, 3) that leave the lane to the right by `most` about 8 m."""
-    lateral = left - most * np.exp(-(((arcs - 8) / 2) ** 2))
-    slope = np.gradient(lateral, arcs)
-    return route.pose_at(arcs, lateral, np.arctan(slope))
-
-
-def made(route: Route, case: str, most: float, run: int = 0, left=0.0) -> Drive:
-    """Return a drive of the run."""
-    states = swerved(route, SPEED * PERIOD * np.arange(STEPS + 1), most, left)
-    times = PERIOD * np.arange(1, STEPS + 1)
-    controls, errors = np.diff(states[:, 2]) / PERIOD, route.cross_track_numpy(states)
-    about = "surrogate", route.name, case, run, run
-    return Drive(*about, states, controls, errors[1:], times)
-
-
-def write_drive(path, states, period: float, began: float):
-    """Write a recording of a vehicle's states (n, 3)."""
-    poses = np.tile(np.eye(4), (len(states), 1, 1))
-    cos, sin = np.cos(states[:, 2]), np.sin(states[:, 2])
-    poses[:, 0, 0], poses[:, 0, 1] = cos, -sin
-    poses[:, 1, 0], poses[:, 1, 1] = sin, cos
-    poses[:, :2, 3] = states[:, :2]
-    times = began + period * np.arange(len(states))
-    image = image_message(path.parent, 0.0, 0)
-    stamps = [pose_message(t, m) for t, m in zip(times, poses, strict=True)]
-    images = [{**image, "timestamp": item["timestamp"]} for item in stamps]
-    topics = {
-        "/camera/image": ("foxglove.CompressedImage", images),
-        "/vehicle/pose": ("foxglove.PoseInFrame", stamps),
-        "/camera/calibration": ("foxglove.CameraCalibration", [CALIBRATION]),
-    }
-    return write_log(path, topics)
-
-
-def real(path, most: float, began: float, until: float = 14.0, speed: float = 4.0):
-    """Write a drive along LINE from 3 m before the stretch, at another speed."""
-    period = 0.02 * 4.0
-    return write_drive(
-        path,
-        swerved(LINE, np.arange(-3.0, until, speed * period), most),
-        period,
-        began,
-    )
-
-
-@pytest.mark.parametrize("route", [LINE, LOOP], ids=["line", "loop"])
-def test_the_same_path_at_another_speed(route, tmp_path):
-    """Aligned by place: no difference, and the time that the way takes longer."""
-    course = course_of(route)
-    # on the loop the stretch comes after most of a lap, and again a lap later
-    begin = -3.0 if route is LINE else -40.0
-    end = 14.0 if route is LINE else 90.0
-    arcs = np.arange(begin, end, 0.3)
-    states = swerved(route, arcs, 1.5)
-    path = write_drive(tmp_path / "real.mcap", states, 0.3 / 4, 1.8e9)
-    recorded = read_recorded(path, "attack", 0, course)
-    assert recorded.is_whole and recorded.began == pytest.approx(1.8e9)
-    assert recorded.drive.time_s[-1] == pytest.approx(LENGTH / 4, abs=0.15)
-    run = [made(route, "attack", 1.5, left=left) for left in (-0.1, 0.1)]
-    found = align(course, recorded, run, [], []).figures()
-    # outside of a bend, the nearest place of the polygon is its vertex
-    assert found["cross_track_rms_m"] < 0.03 and found["within_range"] > 0.95
-    assert found["cross_track_correlation"] > 0.999
-    assert found["control_correlation"] > 0.98
-    assert found["steering_change_correlation"] is None
-    covered = found["to_m"] - found["from_m"]
-    assert covered == pytest.approx(LENGTH, abs=0.6)
-    assert found["time_behind_s"] == pytest.approx(covered / 4 - covered / 5, abs=0.02)
-
-
-def test_change_of_steering(tmp_path):
-    """What the look changes agrees, though both plain drives steer differently."""
-    course = course_of(LINE)
-    weave = 0.02 * np.sin(2 * np.arange(-3, 14, 0.3))
-    drives = []
-    for number, most in enumerate((0.0, 1.5)):
-        states = swerved(LINE, np.arange(-3, 14, 0.3), most)
-        states[:, 2] += weave
-        path = write_drive(tmp_path / f"{number}.mcap", states, 0.06, 1.8e9)
-        drives.append(read_recorded(path, ("own", "attack")[number], 0, course))
-    own, attacked = drives
-    run = made(LINE, "own", 0.0), made(LINE, "attack", 1.5)
-    args = [own.drive], [run[0]]
-    found = align(course, attacked, [run[1]], *args).figures()
-    assert found["steering_change_correlation"] > 0.98
-    assert found["within_range"] is None
-    assert align(course, own, [run[0]], [], []).figures()["control_correlation"] is None
-
-
-def test_a_drive_that_never_comes_back(tmp_path):
-    """It is whole once it has driven as far as the run's drives; the rest is cut."""
-    course = course_of(LINE)
-    turn = np.radians(70)
-    way = np.arange(0, 60, 0.3)
-    away = np.maximum(way - 5, 0)
-    x, y = np.minimum(way, 5) - 20 + np.cos(turn) * away, np.sin(turn) * away
-    states = np.stack([x, y, np.where(away > 0, turn, 0)], 1)
-    path = write_drive(tmp_path / "away.mcap", states, 0.06, 1.8e9)
-    recorded = read_recorded(path, "attack", 0, course)
-    driven = np.hypot(*np.diff(recorded.drive.states[:, :2], axis=0).T).sum()
-    assert driven == pytest.approx(LENGTH, abs=0.31) and recorded.is_whole
-    reached = 5 + 7 * np.cos(turn)
-    assert recorded.coverage == pytest.approx(reached / LENGTH, abs=0.03)
-    early = write_drive(tmp_path / "early.mcap", states[:30], 0.06, 1.8e9)
-    assert not read_recorded(early, "attack", 0, course).is_whole
-
-
-def write_coloured(folder, states, arcs):
-    """Write a recording whose frames are the redder the further."""
-    files.make_folder(folder)
-    rows = ["time_s,file,x_m,y_m,heading_rad"]
-    for k, (state, arc) in enumerate(zip(states, arcs, strict=True)):
-        image = np.full((8, 16, 3), [round(15 * max(arc, 0)), 255, 0], np.uint8)
-        files.write_image(folder / f"{k}.png", image)
-        rows.append(",".join(map(str, [0.1 * k, f"{k}.png", *state])))
-    files.write_text(folder / "poses.csv", "\n".join([*rows, ""]))
-    return folder
-
-
-def test_views_at_equal_places(tmp_path):
-    """Both rows show the same places, a control period apart at most."""
-    course, drive = course_of(LINE), made(LINE, "attack", 1.5)
-    driven = drive.states[:-1]
-    frames = tmp_path / "frames"
-    write_coloured(frames / "surrogate_attack", driven, course.arcs(driven))
-    arcs = np.arange(-3.0, 14, 0.4)
-    real = write_coloured(tmp_path / "real", swerved(LINE, arcs, 1.4), arcs)
-    aligned = align(course, read_recorded(real, "attack", 0, course), [drive], [], [])
-    picture = tmp_path / "views.png"
-    draw_views(picture, [aligned], [drive], tmp_path / "elsewhere", course)
-    assert not picture.exists()
-    draw_views(picture, [aligned], [drive], frames, course)
-    image = files.read_image(picture).astype(int)
-    shown = (image[..., 1] == 255) & (image[..., 2] == 0)
-    lines = np.flatnonzero(shown.any(1))
-    bands = np.split(lines, np.flatnonzero(np.diff(lines) > 1) + 1)
-    found = [np.unique(image[band[0], shown[band[0]], 0]) / 15 for band in bands]
-    assert len(found) == 2 and len(found[0]) == len(found[1]) == 6
-    places = np.linspace(aligned.places[0], aligned.places[-3], 6)
-    for row, step in zip(found, (SPEED * PERIOD, 0.4), strict=True):
-        assert (row - places).min() > -0.05 and (row - places).max() < step + 0.05
-
-
-def test_steering_angles_as_driven():
-    """On a circle of 10 m the single-track model steers by atan(l / 10)."""
-    course = course_of(LOOP, control_unit="rad", wheelbase=0.5)
-    angle = np.linspace(0, 1, 200)
-    x, y = 10 * np.cos(angle), 10 * np.sin(angle)
-    states = np.stack([x, y, angle + np.pi / 2], 1)
-    controls = course.controls(states, np.arange(200.0))
-    np.testing.assert_allclose(controls, np.arctan(0.05), rtol=1e-4)
-    # backwards through the cut of the angle, a heading rate
-    course = course_of(LOOP)
-    states = np.array([[0, 0, np.pi - 0.1], [0.1, 0, -np.pi + 0.1]])
-    assert course.controls(states, np.array([0, 0.5])) == pytest.approx([0.4])
 
 
 @pytest.fixture(scope="module")
@@ -245,30 +69,35 @@ def call(capsys, *arguments) -> tuple[int, str, str]:
     return code, captured.out, captured.err
 
 
-def test_a_campaign(run, criteria, tmp_path, capsys):
-    """Criteria first, then drive by drive to the decision; nothing is lost on the way.
+@pytest.fixture
+def recordings(tmp_path):
+    """Return real drives: one past the plain object, and past the attack in order."""
+    plain = real(tmp_path / "plain.mcap", 0.05, 1.8e9)
+    drives = (1.5, 14), (0.2, 14), (0.2, 6), (1.7, 10), (1.5, 14), (0.3, 14)
+    return plain, [
+        real(tmp_path / f"{k}.mcap", most, 1.8e9 + 100 * (k + 1), until)
+        for k, (most, until) in enumerate(drives)
+    ]
+
+
+def test_a_campaign(run, criteria, recordings, tmp_path, capsys):
+    """Criteria first, then drive by drive to the decision.
 
     Each success triples the ratio, which is accepted at nine.
     """
-    out = tmp_path / "compared"
+    out, (plain, attacked) = tmp_path / "compared", recordings
     code, told, err = call(capsys, run, criteria, "-o", out)
     assert code == 0, err
     assert "expected drives 3.2 at 0.75, 3.2 at 0.25" in told
     assert "0 of 0 succeeded: go on" in told and not (out / "comparison.png").exists()
-    plain = real(tmp_path / "plain.mcap", 0.05, 1.8e9)
-    attacked = [
-        real(tmp_path / f"{k}.mcap", most, 1.8e9 + 100 * (k + 1), until)
-        for k, (most, until) in enumerate(((1.5, 14), (0.2, 14), (0.2, 6), (1.7, 10)))
-    ]
-    both = ("--own", plain, "--attack")
-    decisions = []
+    arguments = (run, criteria, "-o", out, "--own", plain, "--attack")
+    decisions, document = [], {}
     for count in range(1, 5):
-        arguments = (run, criteria, "-o", out, *both, *attacked[:count], "--json")
-        code, told, err = call(capsys, *arguments)
+        code, told, err = call(capsys, *arguments, *attacked[:count], "--json")
         assert code == 0, err
-        decisions.append(json.loads(told)["test"]["decision"])
+        document = json.loads(told)
+        decisions.append(document["test"]["decision"])
     assert decisions == ["go on"] * 4
-    document = json.loads(told)
     assert document == json.loads((out / "metrics.json").read_text())
     rows = document["drives"]
     assert [row.get("success") for row in rows] == [None, True, False, None, True]
@@ -279,41 +108,40 @@ def test_a_campaign(run, criteria, tmp_path, capsys):
     test = document["test"]
     assert (test["drives"], test["successes"]) == (3, 2)
     assert test["log_likelihood_ratio"] == pytest.approx(np.log(3))
-    last = real(tmp_path / "last.mcap", 1.5, 1.8e9 + 900)
-    more = real(tmp_path / "more.mcap", 0.3, 1.8e9 + 999)
-    code, told, err = call(
-        capsys, run, criteria, "-o", out, *both, *attacked, last, more
-    )
+    code, told, err = call(capsys, *arguments, *attacked)
     assert code == 0, err
     assert "3 of 4 succeeded: accept, the rate of success is 0.75" in told
     assert "1 drives after the decision do not count" in told
     assert "2.mcap (attack)" in told and "not judged, it ends after" in told
     assert (out / "summary.txt").read_text() in told
-    assert {p.name for p in out.iterdir()} == {
-        "metrics.json",
-        "summary.txt",
-        "comparison.png",
-        "overhead.png",
-    }
+    names = {"metrics.json", "summary.txt", "comparison.png", "overhead.png"}
+    assert {path.name for path in out.iterdir()} == names
+
+
+def test_what_was_judged_stays(run, criteria, recordings, tmp_path, capsys):
+    out, (plain, attacked) = tmp_path / "compared", recordings
+    first, second, third, *_ = attacked
+    before = ("--own", plain, "--attack", first, second)
+    assert call(capsys, run, criteria, "-o", out, *before)[0] == 0
     kept = {path: path.read_bytes() for path in out.iterdir()}
     for given, message in (
-        ((*both, *attacked[:2]), "drive 2 past attack is"),
-        ((*both, attacked[0], last), "now " + str(last)),
-        (("--attack", *attacked, last, more), "drive 0 past own is"),
-        ((*both, *attacked, last, more, last), f"is the drive of {last} again"),
-        ((*both, *attacked, more, last), "give the drives of --attack in the order"),
-        ((*both, *attacked, last, more, "--random", plain), "is the drive of"),
+        (before[:-1], "drive 1 past attack is"),
+        ((*before[:-1], third), f"now {third}"),
+        (("--attack", first, second), "drive 0 past own is"),
+        ((*before, second), f"is the drive of {second} again"),
+        ((*before[:-2], second, first), "give the drives of --attack in the order"),
+        ((*before, "--random", plain), "is the drive of"),
+        ((*before, "--environment", "mitsuba"), "was begun with the environment"),
     ):
         code, told, err = call(capsys, run, criteria, "-o", out, *given)
         assert (code, told) == (2, "") and message in err, err
     criteria.write_text(CRITERIA + "# as I meant it\n")
-    given = (*both, *attacked, last, more)
-    code, _, err = call(capsys, run, criteria, "-o", out, *given)
+    code, _, err = call(capsys, run, criteria, "-o", out, *before, third)
     assert code == 2 and "was begun with the criteria" in err
     assert kept == {path: path.read_bytes() for path in out.iterdir()}
     # touched, but unchanged: it was there before the first drive
     criteria.write_text(CRITERIA)
-    assert call(capsys, run, criteria, "-o", out, *given)[0] == 0
+    assert call(capsys, run, criteria, "-o", out, *before, third)[0] == 0
 
 
 def test_refused(run, criteria, tmp_path, capsys):
