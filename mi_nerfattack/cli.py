@@ -1,11 +1,12 @@
 """The command line: arguments, exit codes and messages, no logic.
 
 Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
-130 interrupted.
+130 interrupted, 141 nobody reads the output. docs/commands.md tells users.
 """
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import sys
@@ -17,7 +18,7 @@ import tyro
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
 from mi_nerfattack.commands import COMMANDS, Command
-from mi_nerfattack.errors import NerfAttackError, is_interrupt
+from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 
 PROG = "mi-nerfattack"
 EXIT_INPUT = 2
@@ -88,22 +89,34 @@ def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str)
     if arguments == ["--version"]:
         print(f"{prog} {mi_nerfattack.__version__}")
         return 0
+    _check_name(arguments, commands)
     try:
         command = tyro.extras.subcommand_cli_from_dict(
             dict(commands),
             prog=prog,
             description=_DESCRIPTION,
             args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
         )
     except SystemExit as stop:  # help printed, or wrong usage reported
-        return stop.code if isinstance(stop.code, int) else EXIT_INPUT
+        code = stop.code or 0
+        return code if isinstance(code, int) else EXIT_INPUT
     try:
         return command.run()
     except SystemExit as stop:
         if not isinstance(stop.__context__, BrokenPipeError):
             raise
         raise stop.__context__ from None  # rich ends the process by itself
+
+
+def _check_name(arguments: list[str], commands: Mapping[str, type[Command]]) -> None:
+    """Raise InputError of a word that is no command, with those that resemble it."""
+    if not arguments or arguments[0].startswith("-") or arguments[0] in commands:
+        return
+    near = difflib.get_close_matches(arguments[0], commands)
+    one_of = f"one of {', '.join(commands)}"
+    meant = f"did you mean {' or '.join(map(repr, near))}?" if near else one_of
+    raise InputError(f"{arguments[0]!r}: is no command; {meant}")
 
 
 def _drop_output() -> None:

@@ -132,6 +132,32 @@ def test_other_threads_may_call(run):
 
 
 @pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("atack", "'atack': is no command; did you mean 'attack'?"),
+        ("retarin", "'retarin': is no command; did you mean 'retrain'"),
+        ("nonsense", "'nonsense': is no command; one of doctor, demo, "),
+    ],
+)
+def test_a_word_that_is_no_command_is_told_with_what_resembles_it(run, word, message):
+    code, out, err = run(word, "scenario.toml")
+    assert (code, out) == (2, "") and err.startswith(f"mi-nerfattack: error: {message}")
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_help_names_kinds_of_values_and_groups_of_options(run, name):
+    code, out, _ = run(name, "--help")
+    assert code == 0 and "None}" not in out
+    titles = re.findall(r"(?m)^[ ╭─│]*([a-z]+) options", out)
+    assert not {"where", "options", "against"} & set(titles)
+
+
+def test_completion_is_printed(run):
+    code, out, _ = run("--tyro-print-completion", "bash")
+    assert code == 0 and "complete" in out and "attack" in out
+
+
+@pytest.mark.parametrize(
     "arguments", [[], ["nonsense"], ["doctor", "--nonsense"], ["--nonsense"]]
 )
 def test_wrong_usage_is_code_2(run, arguments):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mi_nerfattack.commands.shared.options import given
+from mi_nerfattack.commands.shared.options import check_empty, given
 from mi_nerfattack.errors import InputError
 
 _SHOWN = 10  # photographs to take again; capture.json lists all
@@ -115,7 +115,6 @@ class PhotographArguments:
             FrameOptions,
             extract_frames,
         )
-        from mi_nerfattack.io import files
 
         def show(stage: str, done: int, total: int) -> None:
             bars.show(stage, done, total, f"{done} of {total}")
@@ -135,7 +134,6 @@ class PhotographArguments:
             if option := given(self, ("frames", "baseline")):
                 raise InputError(f"{option}: not for {source}, which is no video")
             return estimate_poses(source, output, options, show)
-        files.check_folder(output)
         with tempfile.TemporaryDirectory() as folder:
             chosen = FrameOptions(self.frames, self.baseline)
             extract_frames(source, Path(folder), chosen, show)
@@ -207,7 +205,8 @@ class Capture:
     source: tyro.conf.Positional[Path]
     """Scene (.xml), folder of JPEG, PNG or WebP photographs, or video."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder for transforms.json and images, with depth or sparse points."""
+    """Folder, new or empty, for transforms.json and images, with depth or sparse
+    points."""
     seed: int = 0
     """Of all random numbers."""
     scene: Annotated[SceneArguments, tyro.conf.OmitArgPrefixes] = field(
@@ -228,6 +227,7 @@ class Capture:
             raise InputError(
                 f"{option}: not for {self.source}, which is {kind}; leave it out"
             )
+        check_empty(self.output)
         with StageBars() as bars:
             if is_scene:
                 path = self.scene.write(self.source, self.output, self.seed, bars)
@@ -239,7 +239,8 @@ class Capture:
             self.photographs.tell(told)
         else:
             print(f"Wrote {self.scene.views} views to {path.parent}")
-        print("Fit a field to them with")
+        print("Fit a field to them, in 15 minutes; hours give a sharper one, see fit:")
         folder = shlex.quote(str(path.parent))
-        print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors")
+        quick = "--network small --budget-minutes 15"
+        print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors {quick}")
         return 0

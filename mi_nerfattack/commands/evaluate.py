@@ -69,9 +69,13 @@ class Evaluate:
     powers of two on request: noon, noon:+1, evening:-0.5. Not for the surrogate."""
     spp: int = 4
     """Samples per pixel of path-traced images."""
-    where: tyro.conf.OmitArgPrefixes[PlaceOptions] = PlaceOptions()
+    where: Annotated[
+        PlaceOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="place")
+    ] = PlaceOptions()
     """Where."""
-    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    options: Annotated[
+        PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
+    ] = PolicyOptions()
     """How the policy is called."""
     workers: int | None = None
     """Processes that drive; one a core by default, for a URL 1: its server may keep a

@@ -75,9 +75,9 @@ class Fit:
     """Of all random numbers."""
     skip_missing: bool = False
     """Leave out frames whose image file is missing."""
-    against: Annotated[CompareArguments, tyro.conf.OmitArgPrefixes] = field(
-        default_factory=CompareArguments
-    )
+    against: Annotated[
+        CompareArguments, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="comparison")
+    ] = field(default_factory=CompareArguments)
     json: bool = False
     """End with one line of JSON in place of the table."""
 

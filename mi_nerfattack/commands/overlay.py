@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.options import check_empty
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -90,9 +92,7 @@ class OverlayCommand:
         if is_video:
             files.check_writable(path)
             return True
-        files.check_folder(path)
-        if path.is_dir() and any(path.iterdir()):
-            raise InputError(f"-o: {path}; is not an empty folder, choose another")
+        check_empty(path)
         return False
 
     def _frames(

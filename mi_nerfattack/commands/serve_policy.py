@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -33,7 +33,9 @@ class ServePolicy:
     size: tuple[int, int] | None = None
     """Width and height of the car's frames: tries the policy on a black one first, so
     that the first decision is as quick as the others."""
-    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    options: Annotated[
+        PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
+    ] = PolicyOptions()
     """How the policy is called."""
 
     def run(self) -> int:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from helpers.small_fields import blob, vertices
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.report.plots import heat
-from mi_nerfattack.report.plots.heat import side_views, surface_heat, write_heat
+from mi_nerfattack.report.plots import charts, heat
+from mi_nerfattack.report.plots.heat import (
+    SIDES,
+    SideView,
+    side_views,
+    surface_heat,
+    write_heat,
+)
 from mi_nerfattack.report.plots.time import TimeAttribution, plot_attribution
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -113,6 +123,32 @@ def test_picture(tmp_path, rng):
     with Image.open(path) as image:
         assert image.width == 1200 and image.height > 1000
     write_heat(path, {"still": side_views(grid, 0 * gradient, 24)})
+
+
+def test_no_label_of_the_picture_is_cut_or_covered(tmp_path, monkeypatch):
+    """Of flat objects with long names, too."""
+    figures = []
+    monkeypatch.setattr(charts, "save", lambda path, figure: figures.append(figure))
+    shapes = {"a_delivery_van_beside_the_exit": (50, 160), "a_hydrant": (160, 90)}
+    objects = {
+        name: [SideView(side, np.ones((*shape, 3)), np.ones(shape)) for side in SIDES]
+        for name, shape in shapes.items()
+    }
+    for shown in (objects, dict([*objects.items()][:1])):
+        write_heat(tmp_path / "heat.png", shown)
+    for figure in figures:
+        FigureCanvasAgg(figure).draw()
+        words = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text()]
+        assert {"as it looks", "sensitivity"} <= {text.get_text() for text in words}
+        boxes, page = (
+            [text.get_window_extent() for text in words],
+            figure.bbox.padded(1),
+        )
+        for box in boxes:
+            assert page.x0 <= box.x0 < box.x1 <= page.x1
+            assert page.y0 <= box.y0 < box.y1 <= page.y1
+        for one, other in itertools.combinations(boxes, 2):
+            assert not one.overlaps(other)
 
 
 def test_a_failure_is_taken_apart(tmp_path):

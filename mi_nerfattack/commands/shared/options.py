@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 from mi_nerfattack.errors import InputError
 
@@ -22,6 +23,15 @@ def given(options: object, names: Iterable[str]) -> str | None:
         if getattr(options, name) != getattr(usual, name):
             return _option(name)
     return None
+
+
+def check_empty(path: Path) -> None:
+    """Raise `InputError` unless a folder can be made, or is there and empty."""
+    from mi_nerfattack.io import files
+
+    files.check_folder(path)
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"-o: {path}; is not an empty folder, choose another")
 
 
 def check_positive(options: object, *names: str) -> None:

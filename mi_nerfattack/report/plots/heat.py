@@ -24,6 +24,8 @@ from mi_nerfattack.report.plots.charts import DPI, WIDTH_PX, chart
 SIDES = {"from +x": 0.0, "from +y": 90.0, "from -x": 180.0, "from -y": 270.0}
 #: Opacity below which a pixel counts as beside the object.
 VISIBLE = 0.1
+_ROWS = ("as it looks", "sensitivity")  # of an object
+_BAR_IN = 0.8  # of the colour bar with its label
 COLOUR_MAP = "viridis"  # perceptually uniform
 #: The finest level that is shown has at most so many vertices along an edge: finer
 #: ones show which rays were traced rather than where the object matters.
@@ -161,27 +163,29 @@ def write_heat(
     with chart(path, _height_in(objects)) as figure:
         axes = figure.subplots(rows, len(SIDES), squeeze=False)
         for i, (name, views) in enumerate(objects.items()):
+            axes[2 * i, 0].set_title(name, fontsize=9, loc="left")
             for column, view in enumerate(views):
-                _show(axes[2 * i, column], view.colour, f"{name} {view.name}")
-                _show(axes[2 * i + 1, column], _coloured(view, norm), "")
-            axes[2 * i, 0].set_ylabel("as it looks")
-            axes[2 * i + 1, 0].set_ylabel("sensitivity")
+                _show(axes[2 * i, column], view.colour)
+                _show(axes[2 * i + 1, column], _coloured(view, norm))
+                axes[2 * i + 1, column].set_xlabel(view.name)
+            for axis, label in zip(axes[2 * i :, 0], _ROWS, strict=False):
+                axis.set_ylabel(label, rotation=0, ha="right", va="center")
         bar = figure.colorbar(
             ScalarMappable(norm, COLOUR_MAP),
             ax=axes.ravel().tolist(),
             extend="max",
-            fraction=0.03,
-            aspect=40,
+            location="bottom",
+            aspect=60,
         )
         bar.set_label(f"|d {unit} / d raw colour| per m³")
 
 
 def _height_in(objects: Mapping[str, Sequence[SideView]]) -> float:
     """Return the height at which views fill their cells, inches."""
-    cell_in = WIDTH_PX / DPI / (len(SIDES) + 0.7)
+    cell_in = WIDTH_PX / DPI / (len(SIDES) + 0.4)
     aspects = [views[0].heat.shape for views in objects.values()]
     rows = sum(2 * height / width for height, width in aspects)
-    return rows * cell_in + 0.35 * len(objects)
+    return rows * cell_in + 0.6 * len(objects) + _BAR_IN
 
 
 def _shown_level(grid: GridField) -> tuple[int, int]:
@@ -202,9 +206,8 @@ def _coloured(view: SideView, norm: Normalize) -> np.ndarray:
     return np.where(known[..., None], mapped[..., :3], PAPER)
 
 
-def _show(axis: Axes, image: np.ndarray, title: str) -> None:
+def _show(axis: Axes, image: np.ndarray) -> None:
     axis.imshow(image, interpolation="nearest")
     axis.set_xticks([])
     axis.set_yticks([])
     axis.spines[:].set_visible(False)
-    axis.set_title(title, fontsize=9)

@@ -206,6 +206,15 @@ class TestCommand:
         told = self.told(capsys, str(tmp_path / "walk.mp4"), "-o", out)
         assert "file" in told and "walk.mp4" not in told
 
+    @pytest.mark.parametrize("source", ["scene.xml", "photographs", "walk.mp4"])
+    def test_no_folder_is_written_over(self, source, tmp_path, capsys):
+        kept = tmp_path / "out/transforms.json"
+        kept.parent.mkdir()
+        kept.write_text("kept")
+        told = self.told(capsys, source, "-o", str(kept.parent))
+        assert f"-o: {kept.parent}; is not an empty folder" in told
+        assert kept.read_text() == "kept" and len(list(kept.parent.iterdir())) == 1
+
     @pytest.mark.slow
     def test_a_film_is_placed(self, tmp_path, capsys):
         pytest.importorskip("pycolmap")
