@@ -13,9 +13,12 @@ from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
+    from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.deploy.sites import PlaceSite
+    from mi_nerfattack.experiment.retrain.compare import Comparison
     from mi_nerfattack.experiment.transfer.found import FoundAttack
+    from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.settings import ImitationSettings
 
 #: New frames by environment, a tenth of the preset laptop of 'train'.
@@ -29,7 +32,8 @@ class Retrain:
     Drives past the attacks, and past those held out; collects frames among the
     attacked objects, labelled by the expert; trains the policy further on them and on
     those that it was trained on (--more); and drives again. Only runs count whose
-    scenario the expert itself can drive. Stopped, it continues from DATA. Beside the
+    scenario the expert itself can drive. Stopped, it continues from DATA, and so it
+    does with more --held-out or --adaptive, without training again. Beside the
     policy come its program, its record as 'train' writes it, and NAME-retrain.json: the
     runs, and errors before and after.
     """
@@ -67,6 +71,9 @@ class Retrain:
     """Environments of the drives before and after, as of 'transfer'."""
     starts: int = 4
     """Drives before and after: of each run, past its attack and without objects."""
+    adaptive: bool = False
+    """Attack the new policy in the same scenarios, too, which takes as long as the
+    runs did, and drive past what that finds."""
     workers: int | None = None
     """Processes that collect and drive; one a core by default, 1 works in this one."""
     seed: int = 0
@@ -123,13 +130,37 @@ class Retrain:
             record = training_record(settings, sites, self.data, result, command)
             write_trained(self.output, result.module, record)
             after = drives.drive(AFTER, workers, bars.counter, self.output)
-        document = _describe(policy, groups, others)
+            anew = self._adapt(drives, before, after, workers, bars)
+        document = _describe(policy, groups, anew, others)
         document["table"] = table_rows(before, after)
         files.write_json(about, document)
-        Console().print(card_table(result.card))
-        Console().print(retrain_table(document))
+        Console().print(card_table(result.card), retrain_table(document))
         print(f"{self.output}: written; program, record and table are beside it")
         return 0
+
+    def _adapt(
+        self,
+        drives: Comparison,
+        before: dict[str, Any],
+        after: dict[str, Any],
+        workers: AbstractWorkers,
+        bars: StageBars,
+    ) -> list[FoundAttack]:
+        """Attack the new policy, if asked, and add a group to both stages."""
+        from dataclasses import replace
+
+        from mi_nerfattack.experiment.retrain.anew import attack_anew
+        from mi_nerfattack.experiment.retrain.compare import ADAPTIVE, AFTER, OLD
+
+        if not self.adaptive:
+            return []
+        show = bars.counter("attacking anew", "attack ")
+        rest = self.output, self.data / ADAPTIVE, workers, show
+        anew = attack_anew(drives.groups[OLD], *rest)
+        again = replace(drives, groups={ADAPTIVE: anew})
+        after.update(again.drive(AFTER, workers, bars.counter))
+        before[ADAPTIVE] = before[OLD]  # past the attacks on the policy before
+        return anew
 
     def _place(self, attacks: Sequence[FoundAttack]) -> Place:
         from mi_nerfattack.experiment.retrain.among import found_place
@@ -204,7 +235,10 @@ class Retrain:
 
 
 def _describe(
-    policy: Path, groups: Mapping[str, Sequence[FoundAttack]], others: dict[str, str]
+    policy: Path,
+    groups: Mapping[str, Sequence[FoundAttack]],
+    anew: Sequence[FoundAttack],
+    others: dict[str, str],
 ) -> dict[str, Any]:
     from mi_nerfattack.experiment.retrain.compare import HELD_OUT, OLD
     from mi_nerfattack.io import files
@@ -214,6 +248,7 @@ def _describe(
         "policy": {"file": policy.name, "sha256": files.sha256(policy)},
         "runs": [_about(found) for found in groups[OLD]],
         "held_out": [_about(found) for found in groups.get(HELD_OUT, ())],
+        "adaptive": [_about(found) for found in anew],
         "left_out": others,
     }
 

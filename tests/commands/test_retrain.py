@@ -102,16 +102,41 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     check_table(files.read_json(other / "new-retrain.json"), other)
     record = files.read_json(other / "new.json")
     assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
+    # the new policy is attacked later, and not trained again
+    weights = (other / "new.safetensors").read_bytes()
+    assert retrain(other, near, *frames, *more, "--adaptive") == 0
+    about = files.read_json(other / "new-retrain.json")
+    assert (other / "new.safetensors").read_bytes() == weights
+    check_table(about, other, "adaptive")
+    (cell,) = (other / "data" / "adaptive" / "cells").iterdir()
+    assert (cell / "_complete").exists()
+    (found,), (old,) = read_found([cell]), read_found([near])
+    assert found.scenario.policy.file.file == other / "new.safetensors"
+    same = {"policy": old.scenario.policy}
+    assert found.scenario.model_copy(update=same).digest() == old.scenario.digest()
+    (anew,) = about["adaptive"]
+    assert anew["label"] == cell.name and anew["found_sha256"] == found.digest
+    made = cell.stat().st_mtime_ns
+    assert retrain(other, near, *frames, *more, "--adaptive") == 0
+    assert cell.stat().st_mtime_ns == made
+    assert files.read_json(other / "new-retrain.json") == about
+    page = other / "page.html"
+    words = ["report", str(other / "new-retrain.json"), "-o", str(page)]
+    assert cli.main(words) == 0
+    assert "Adaptive: the policy before past" in page.read_text()
 
 
-def check_table(about: dict, folder: Path) -> None:
+def check_table(about: dict, folder: Path, *more: str) -> None:
     """Before and after are the drives of a transfer of each group by each policy."""
     rows = about["table"]
-    assert [row["group"] for row in rows] == ["old", "held_out"]
+    assert [row["group"] for row in rows] == ["old", "held_out", *more]
     assert [item["label"] for item in about["held_out"]] == ["run"]
     for row in rows:
         for stage in ("before", "after"):
-            kept = folder / "data" / f"{row['group']}_{stage}" / "transfer.json"
+            group = row["group"]
+            if group == "adaptive" and stage == "before":
+                group = "old"
+            kept = folder / "data" / f"{group}_{stage}" / "transfer.json"
             (column,) = files.read_json(kept)["columns"]
             assert row[stage] == column["cases"]
             figures = row[stage]["attack"]

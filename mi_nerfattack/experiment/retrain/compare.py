@@ -15,7 +15,7 @@ from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.named_file import NamedFile
 from mi_nerfattack.system.workers import AbstractWorkers
 
-OLD, HELD_OUT = "old", "held_out"
+OLD, HELD_OUT, ADAPTIVE = "old", "held_out", "adaptive"
 BEFORE, AFTER = "before", "after"
 _CASES = (NO_OBJECT, ATTACK)
 _SEED = 1

@@ -175,12 +175,12 @@ class GridReader:
 
     @functools.cached_property
     def _routes(self) -> tuple[Choice, ...]:
-        return self.grid.routes or (Choice(name=_label(self.base.scene.route)),)
+        return self.grid.routes or (Choice(name=axis_name(self.base.scene.route)),)
 
     @functools.cached_property
     def _objects(self) -> tuple[ObjectsChoice, ...]:
         ids = "+".join(item.id for item in self.base.objects)
-        return self.grid.objects or (ObjectsChoice(name=_label(ids)),)
+        return self.grid.objects or (ObjectsChoice(name=axis_name(ids)),)
 
     def _places_of(self) -> Iterator[tuple[int, int]]:
         """Yield the indices of routes, and of objects beside them."""
@@ -303,8 +303,8 @@ def _check_distinct(key: str, values: Sequence[Any]) -> None:
         refuse(key, f"{list(values)}; give each once")
 
 
-def _label(text: str) -> str:
-    """Make a name of an axis of any text."""
+def axis_name(text: str) -> str:
+    """Return a name of a choice, made of any text."""
     return re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).strip("_.+-")[:40] or "own"
 
 

@@ -1,0 +1,77 @@
+"""Attacks made anew on a retrained policy: what one that knows it still finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mi_nerfattack.experiment.retrain.compare import with_policy
+from mi_nerfattack.experiment.run_folder import SCENARIO
+from mi_nerfattack.experiment.sweep.cell import Cell, folder_of
+from mi_nerfattack.experiment.sweep.grid import axis_name
+from mi_nerfattack.experiment.sweep.sweep import Cells
+from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
+from mi_nerfattack.io import files, locks
+from mi_nerfattack.scenario.scenario import portable_text
+from mi_nerfattack.system.workers import AbstractWorkers, raise_failure
+
+
+def attack_anew(
+    attacks: Sequence[FoundAttack],
+    policy: Path,
+    folder: Path,
+    workers: AbstractWorkers,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[FoundAttack]:
+    """Make the attacks of runs again, their scenarios unchanged but for the policy.
+
+    Each is a cell of a sweep, and done as one: what is there is not done again, and an
+    interrupted attack goes on from its checkpoint.
+
+    Args:
+        attacks: whose scenarios are attacked.
+        policy: weights that are attacked.
+        folder: of the cells; made if missing.
+        workers: who does them.
+        progress: called with attacks done and wanted.
+
+    Returns:
+        what was found, in the order of `attacks`.
+
+    Raises:
+        InputError: another process works in the folder, or an attack fails.
+    """
+    cells = tuple(_cell(found, policy) for found in attacks)
+    done = 0
+
+    def on_end(index: int, error: Exception | None) -> None:
+        nonlocal done
+        raise_failure(index, error)
+        done += 1
+        progress(done, len(cells))
+
+    files.make_folder(folder)
+    with locks.exclusive(folder):
+        every = range(len(cells))
+        workers.run(Cells(cells, folder), every, lambda units: None, on_end)
+    return list(read_found([folder_of(folder, cell) for cell in cells]))
+
+
+def _cell(found: FoundAttack, policy: Path) -> Cell:
+    """Return a run's scenario with another policy as a cell of a sweep.
+
+    What the checks before an attack find is told by its flags, and refuses nothing: the
+    run counted, too.
+    """
+    scenario = with_policy(found, policy).scenario
+    ids = "+".join(item.id for item in scenario.objects)
+    return Cell(
+        axis_name(found.route.name),
+        axis_name(ids),
+        scenario.attack.method.method,
+        None,
+        scenario.seed,
+        portable_text(scenario, files.read_text(found.folder / SCENARIO)),
+        scenario.digests(),
+        anyway=True,
+    )
