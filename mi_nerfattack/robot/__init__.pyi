@@ -1,5 +1,8 @@
 from .attacked import AttackedBox as AttackedBox
 from .attacked import read_box as read_box
+from .camera.open import ZedOptions as ZedOptions
+from .camera.open import open_camera as open_camera
+from .camera.rendered import RenderedCamera as RenderedCamera
 from .monitor import Screen as Screen
 from .monitor import screen_image as screen_image
 from .overlay import Overlay as Overlay
@@ -7,4 +10,8 @@ from .paper import write_net as write_net
 from .remote.pilot import RemotePilot as RemotePilot
 from .remote.sealed import Endpoint as Endpoint
 from .remote.sealed import read_key as read_key
+from .tracker.motion_capture import MotionCaptureTracker as MotionCaptureTracker
+from .tracker.open import open_tracker as open_tracker
+from .tracker.turns import tell_convention as tell_convention
+from .tracker.vicon import ViconTracker as ViconTracker
 from .vesc.motor import VescMotor as VescMotor

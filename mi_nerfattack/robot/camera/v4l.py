@@ -86,13 +86,12 @@ class V4lCamera(AbstractCamera):
             for frame in self._decoded():
                 if self._is_closed.is_set():
                     break
-                now = time.monotonic()
+                now, came_s = time.monotonic(), self._clock()
                 age_s = now - frame.time if frame.time is not None else 0.0
                 age_s = age_s if 0 <= age_s < _KERNEL_S else 0.0
                 check_size(self._device, frame.width, frame.height, self._prepare)
-                taken_s = self._clock() - age_s
                 image = self._prepare.apply(frame.to_ndarray(format="rgb24"))
-                self._frame = Frame(image, taken_s, index)
+                self._frame = Frame(image, came_s - age_s, index)
                 self._heard_s, self._longest_s = now, _SILENT_S
                 index += 1
             self._error = self._error or "it gives no more images"

@@ -6,9 +6,13 @@ import os
 import sys
 import threading
 import time
+from fractions import Fraction
+from typing import Any
 
+import av
 import numpy as np
 import pytest
+from av.video.frame import VideoFrame
 from helpers.waiting import wait_for
 from helpers.zed_files import calibration_text
 
@@ -99,6 +103,27 @@ def test_only_the_newest_is_kept_and_nothing_waits(pipe, monkeypatch):
     wait_for(lambda: camera._error)
     with pytest.raises(DeviceLostError, match="no more images"):
         camera.newest()
+
+
+def test_the_kernels_times_are_kept(tmp_path):
+    now, base = time.monotonic(), Fraction(1, 1_000_000)
+    with av.open(str(tmp_path / "device"), "w", format="nut") as container:
+        stream: Any = container.add_stream("rawvideo", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 32, 16, "rgb24"
+        stream.codec_context.time_base = stream.time_base = base
+        frame = VideoFrame.from_ndarray(np.zeros((16, 32, 3), np.uint8), "rgb24")
+        frame.pts, frame.time_base = round((now - 0.25) / base), base
+        container.mux(stream.encode(frame))
+    # a clock that is 1000 s behind
+    camera = V4lCamera(
+        str(tmp_path / "device"),
+        SMALL,
+        clock=lambda: time.monotonic() - 1000,
+        driver="nut",
+    )
+    wait_for(lambda: camera._error)
+    assert camera._frame is not None
+    assert camera._frame.time_s == pytest.approx(now - 1000.25, abs=0.1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="V4L is Linux's")
