@@ -13,12 +13,13 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.robot.devices import Frame
 
-_FRAME = struct.Struct(">qddHHB")
+_FRAME = struct.Struct(">qddIIB")
 _DECISION = struct.Struct(">qdddd")
 PING = struct.Struct(">d")
 PONG = struct.Struct(">ddd")
 _RAW, _JPEG = 0, 1
-MAX_EDGE = (1 << 16) - 1
+#: Of a frame; its message stays below the largest that is looked at.
+MAX_PIXELS = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,33 +96,35 @@ class SentDecision:
         return cls(control, index, *times)
 
 
-def pack_frame(frame: Frame, ahead_s: float, jpeg_quality: int | None) -> bytes:
-    """Return the body of a frame's message.
-
-    Args:
-        frame: uint8, (height, width, 3).
-        ahead_s: by how much the server's clock is ahead.
-        jpeg_quality: 1 to 95; None sends the pixels as they are.
-
-    Raises:
-        InputError: it is no such image, or too large.
-    """
+def check_frame(frame: Frame) -> None:
+    """Raise `InputError` unless a frame is one that can be sent."""
     image = frame.image
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise InputError(
             f"frame {frame.index}: {image.dtype} {image.shape}; needs uint8 (height, "
             "width, 3)"
         )
-    height, width = image.shape[:2]
-    if max(height, width) > MAX_EDGE:
+    if not 0 < image.size <= MAX_PIXELS * 3:
         raise InputError(
-            f"frame {frame.index}: {width} x {height} px; at most {MAX_EDGE}"
+            f"frame {frame.index}: {image.shape[1]} x {image.shape[0]} px; from 1 to "
+            f"{MAX_PIXELS} pixels are sent"
         )
+
+
+def pack_frame(frame: Frame, ahead_s: float, jpeg_quality: int | None) -> bytes:
+    """Return the body of a frame's message.
+
+    Args:
+        frame: one that `check_frame` lets pass.
+        ahead_s: by how much the server's clock is ahead.
+        jpeg_quality: 1 to 95; None sends the pixels as they are.
+    """
+    height, width = frame.image.shape[:2]
     if jpeg_quality is None:
-        data, code = image.tobytes(), _RAW
+        data, code = frame.image.tobytes(), _RAW
     else:
         buffer = io.BytesIO()
-        Image.fromarray(image).save(buffer, "JPEG", quality=jpeg_quality)
+        Image.fromarray(frame.image).save(buffer, "JPEG", quality=jpeg_quality)
         data, code = buffer.getvalue(), _JPEG
     about = frame.index, frame.time_s, ahead_s, height, width, code
     return _FRAME.pack(*about) + data

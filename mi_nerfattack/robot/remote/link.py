@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from mi_nerfattack.errors import InputError
@@ -14,12 +16,15 @@ from mi_nerfattack.system.extras import load_extra
 TO_POLICY, TO_CAR = "mi_nerfattack/to_policy", "mi_nerfattack/to_car"
 #: Largest message that is looked at.
 MAX_BYTES = 1 << 26
+_CLOSE_S = 1.0  # zenoh waits for 10 s where the other side has stopped
 
 
 class Link:
-    """A connection on which bytes go both ways; what cannot be sent in time is dropped.
+    """A connection on which bytes go both ways.
 
-    Nothing is searched for in the network, and nothing else connected to.
+    The car waits until what it sends is on its way, and so knows when the network is
+    slow; the server drops what finds no room. Nothing is searched for in the network,
+    and nothing else connected to.
 
     Args:
         endpoint: of the server.
@@ -74,14 +79,35 @@ class Link:
 
         there, here = (TO_CAR, TO_POLICY) if listens else (TO_POLICY, TO_CAR)
         self._subscriber = self._session.declare_subscriber(here, received)
+        control = zenoh.CongestionControl
         self._publisher = self._session.declare_publisher(
-            there, congestion_control=zenoh.CongestionControl.DROP, express=True
+            there,
+            congestion_control=control.DROP if listens else control.BLOCK,
+            express=True,
         )
+        self._error: type[Exception] = zenoh.ZError
 
     def send(self, raw: bytes) -> None:
-        """Send, or drop; nothing is raised where the other side is gone."""
-        self._publisher.put(raw)
+        """Send; nothing is raised where nobody listens.
 
-    def close(self) -> None:
-        """End the connection; more than once does no harm."""
-        self._session.close()
+        The server's are dropped after a millisecond; the car's may wait for 5 s.
+        """
+        with suppress(self._error):
+            self._publisher.put(raw)
+
+    def close(self, farewell: bytes | None = None) -> None:
+        """End the connection, within a second; more than once does no harm.
+
+        Args:
+            farewell: sent before.
+        """
+
+        def end() -> None:
+            if farewell is not None:
+                self.send(farewell)
+            with suppress(self._error):
+                self._session.close()
+
+        thread = threading.Thread(target=end, daemon=True)
+        thread.start()
+        thread.join(_CLOSE_S)

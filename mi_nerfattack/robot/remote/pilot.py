@@ -28,9 +28,10 @@ from mi_nerfattack.robot.remote.sealed import (
     draw_id,
 )
 
+_JOIN_S = 0.5  # the most that closing waits for what is being sent
 _ASK_S = 0.25  # between two questions for the time
 _FIRST_ASKS, _FIRST_ASK_S = 8, 0.02
-_AGAIN_S = 0.1  # after which an unanswered frame no longer holds up the next
+_AGAIN_S = 0.5  # after which an unanswered frame no longer holds up the next
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,12 @@ class RemotePilot(AbstractPilot):
         self._decision: Decision | None = None
         self.delays: Delays | None = None
         self._link = Link(endpoint, False, self._receive, connect_s)
+        self._thread = threading.Thread(target=self._work, daemon=True)
         try:
             self._connect(connect_s)
         except BaseException:
-            self.close()
+            self._link.close()
             raise
-        self._thread = threading.Thread(target=self._ask, daemon=True)
         self._thread.start()
 
     @property
@@ -115,10 +116,11 @@ class RemotePilot(AbstractPilot):
 
     def submit(self, frame: Frame) -> None:
         """Give it a frame; one that was not sent yet is replaced."""
+        frames.check_frame(frame)
         with self._changed:
             self._check()
             self._waiting = frame
-            self._send_frame()
+            self._changed.notify_all()
 
     def newest(self) -> Decision | None:
         """Return the newest decision, whose time is that of its arrival."""
@@ -129,10 +131,11 @@ class RemotePilot(AbstractPilot):
     def close(self) -> None:
         """End the connection."""
         with self._changed:
-            self._send(Kind.BYE, b"")
             self._closed = True
             self._changed.notify_all()
-        self._link.close()
+        self._thread.join(_JOIN_S)
+        is_free = not self._thread.is_alive()  # and sends nothing any more
+        self._link.close(self._sealed(Kind.BYE, b"") if is_free else None)
 
     def _connect(self, connect_s: float) -> None:
         """Wait for the server's session, and for the first offset."""
@@ -155,12 +158,31 @@ class RemotePilot(AbstractPilot):
                     self._send(Kind.HELLO, b"")
                 self._changed.wait(_FIRST_ASK_S)
 
-    def _ask(self) -> None:
-        """Ask for the time, again and again, until it is closed."""
-        with self._changed:
-            while not self._closed:
+    def _work(self) -> None:
+        """Send frames, and ask for the time, again and again, until it is closed."""
+        due_s = self._clock()
+        while True:
+            with self._changed:
+                wait_s = max(due_s - self._clock(), 0)
+                self._changed.wait_for(lambda: self._closed or self._is_free(), wait_s)
+                if self._closed:
+                    return
+                frame, ahead_s = None, self.offset.ahead_s
+                if self._is_free():
+                    frame, self._waiting = self._waiting, None
+                    self._on_way_s = self._clock()
+            if frame is not None:
+                body = frames.pack_frame(frame, ahead_s, self._jpeg_quality)
+                self._send(Kind.FRAME, body)
+            if self._clock() >= due_s:
                 self._send(Kind.PING, frames.PING.pack(self._clock()))
-                self._changed.wait_for(lambda: self._closed, _ASK_S)
+                due_s = self._clock() + _ASK_S
+
+    def _is_free(self) -> bool:
+        """Whether a frame waits, and no other is on its way."""
+        on_way = self._on_way_s
+        is_free = on_way is None or self._clock() >= on_way + _AGAIN_S
+        return self._waiting is not None and is_free
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -174,22 +196,13 @@ class RemotePilot(AbstractPilot):
             raise DeviceLostError(self._failure)
 
     def _send(self, kind: Kind, body: bytes) -> None:
-        if not self._closed:
-            self._sent += 1
-            message = Message(kind, self._id, self._session, self._sent, body)
-            self._link.send(self._sealer.seal(message))
+        """Send a message; of one thread at a time."""
+        self._link.send(self._sealed(kind, body))
 
-    def _send_frame(self) -> None:
-        """Send the frame that waits, unless another is on its way."""
-        frame, now = self._waiting, self._clock()
-        if frame is None:
-            return
-        if self._on_way_s is not None and now < self._on_way_s + _AGAIN_S:
-            return
-        assert self._offset.best is not None, "known since it is connected"
-        ahead = self._offset.best.ahead_s
-        self._waiting, self._on_way_s = None, now
-        self._send(Kind.FRAME, frames.pack_frame(frame, ahead, self._jpeg_quality))
+    def _sealed(self, kind: Kind, body: bytes) -> bytes:
+        self._sent += 1
+        message = Message(kind, self._id, self._session, self._sent, body)
+        return self._sealer.seal(message)
 
     def _receive(self, raw: bytes) -> None:
         """Take up a message; what is not the server's is left alone."""
@@ -236,4 +249,3 @@ class RemotePilot(AbstractPilot):
                 offset,
             )
         self._decision = Decision(sent.control, sent.index, sent.time_s, now)
-        self._send_frame()

@@ -7,7 +7,7 @@ import pytest
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import Frame
-from mi_nerfattack.robot.remote.frames import pack_frame, unpack_frame
+from mi_nerfattack.robot.remote.frames import check_frame, pack_frame, unpack_frame
 from mi_nerfattack.robot.remote.offset import ClockOffset
 from mi_nerfattack.robot.remote.sealed import (
     Endpoint,
@@ -79,9 +79,10 @@ def test_frames():
     for image, message in (
         (np.zeros((4, 4), np.uint8), r"frame 1: uint8 \(4, 4\)"),
         (np.zeros((4, 4, 3)), "frame 1: float64"),
+        (np.zeros((4, 0, 3), np.uint8), "frame 1: 0 x 4 px; from 1 to 16777216"),
     ):
         with pytest.raises(InputError, match=message):
-            pack_frame(Frame(image, 0.0, 1), 0.0, None)
+            check_frame(Frame(image, 0.0, 1))
 
 
 def test_places_to_listen():

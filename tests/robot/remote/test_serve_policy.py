@@ -13,7 +13,7 @@ import pytest
 from helpers.loopback import free_port
 
 from mi_nerfattack import cli
-from mi_nerfattack.robot.devices import Frame
+from mi_nerfattack.robot.devices import DeviceLostError, Frame
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint
 
@@ -51,10 +51,19 @@ def test_a_server_of_its_own(tmp_path):
                 time.sleep(0.01)
             assert decision is not None and decision.frame_index == 7
             assert decision.control == pytest.approx(2.2, abs=1e-6)
+            # stopped, it is missed; and neither frames nor the end wait for it
+            process.send_signal(signal.SIGSTOP)
+            large = np.zeros((1000, 1000, 3), np.uint8)
+            with pytest.raises(DeviceLostError, match="silent for"):
+                for index in range(8, 6000):
+                    pilot.submit(Frame(large, time.monotonic(), index))
+                    time.sleep(0.01)
+        pilot.close()
     finally:
+        process.send_signal(signal.SIGCONT)
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60)
-    assert process.returncode == 0 and "Ended: 1 decisions, on frames " in out
+    assert process.returncode == 0 and " decisions, on frames " in out
 
 
 def test_refused(tmp_path, capsys):
