@@ -18,6 +18,7 @@ from mi_nerfattack.commands.check import Check
 from mi_nerfattack.commands.compare_drives import CompareDrives
 from mi_nerfattack.commands.demo import Demo
 from mi_nerfattack.commands.doctor import Doctor
+from mi_nerfattack.commands.drive import DriveCommand
 from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
@@ -60,6 +61,7 @@ COMMANDS: dict[str, type[Command]] = {
     "refine": Refine,
     "retrain": Retrain,
     "overlay": OverlayCommand,
+    "drive": DriveCommand,
     "serve-policy": ServePolicy,
     "compare-drives": CompareDrives,
     "calibrate": Calibrate,

@@ -12,12 +12,12 @@ from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.deploy.vehicle import planar_body
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.robot import devices
-from mi_nerfattack.robot.drive.fence import Fence
-from mi_nerfattack.robot.drive.judge import Ages, Judge, Stop
-from mi_nerfattack.robot.drive.limits import Limits, Steering
 from mi_nerfattack.robot.drive.log import DriveLog
 from mi_nerfattack.robot.drive.loop import Devices, DriveLoop, DriveSettings
-from mi_nerfattack.robot.drive.watchdog import Watchdog
+from mi_nerfattack.robot.drive.safety.fence import Fence
+from mi_nerfattack.robot.drive.safety.judge import Ages, Judge, Stop
+from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
+from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
 
 CAMERA = from_fov(16, 8, 90.0)
 WALL_NS = 1_790_000_000_123_456_789

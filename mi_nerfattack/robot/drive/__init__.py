@@ -1,1 +1,1 @@
-"""The loop that drives a real car, what stops it, and what it writes down."""
+"""The loop that drives a real car, its devices, and what it writes down."""

@@ -25,7 +25,7 @@ from mi_nerfattack.robot.devices import (
     TrackedPose,
 )
 from mi_nerfattack.robot.drive import messages
-from mi_nerfattack.robot.drive.judge import Cause, Stop
+from mi_nerfattack.robot.drive.safety.judge import Cause, Stop
 from mi_nerfattack.system.extras import load_extra
 
 #: Bytes that are gathered before they are written: half a second of a drive.

@@ -23,12 +23,12 @@ from mi_nerfattack.robot.devices import (
     MotorValues,
     TrackedPose,
 )
-from mi_nerfattack.robot.drive.judge import Cause, Judge, Stop, asked
-from mi_nerfattack.robot.drive.limits import Limits, Steering
 from mi_nerfattack.robot.drive.log import DriveLog
 from mi_nerfattack.robot.drive.measures import Measures
 from mi_nerfattack.robot.drive.messages import FATAL, INFO
-from mi_nerfattack.robot.drive.watchdog import Watchdog
+from mi_nerfattack.robot.drive.safety.judge import Cause, Judge, Stop, asked
+from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
+from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
 
 _EARLY = 0.25  # of a period that a frame may come before it is due
 _BRAKE_EVERY_S, _BRAKE_FOR_S = 0.05, 1.0
@@ -66,7 +66,7 @@ class DriveSettings:
     limits: Limits
     steering: Steering
     duration_s: float = float("inf")
-    poll_s: Seconds = 0.005
+    poll_s: Seconds = 0.01
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class DriveLoop:
         self._decided: int | None = None  # frame of the decision sent last
         self._round_s = clock()  # when it came round last
         self._longest_s = 0.0  # round since the last command
-        self._sent, self._sent_s = Command(0.0, 0.0), clock()
+        self._allowed, self._sent_s = Command(0.0, 0.0), clock()
         self._first_command_s: float | None = None
 
     def run(self, interrupted: Callable[[], None]) -> Stop:
@@ -268,9 +268,11 @@ class DriveLoop:
         wanted = Command(settings.speed_ms, angle)
         now = self._clock()
         elapsed = min(now - self._sent_s, 2 * settings.judge.period_s)
-        allowed = settings.limits.apply(wanted, self._sent, elapsed)
+        allowed = settings.limits.apply(wanted, self._allowed, elapsed)
         send = partial(self._devices.motor.send, allowed)
-        self._sent = asked(Cause.MOTOR_LOST, send)
+        sent = asked(Cause.MOTOR_LOST, send)
+        # not what was sent: a motor that brakes below its slowest turns never starts
+        self._allowed = allowed
         self._sent_s, self._decided = self._clock(), decision.frame_index
         if self._first_command_s is None:
             self._first_command_s = self._sent_s
@@ -278,7 +280,7 @@ class DriveLoop:
         assert pose is not None and frame is not None
         self.measures.add(self._sent_s, decision, pose)
         log, sent_s = self._log, self._sent_s
-        self._notes.append(partial(log.command, sent_s, decision, wanted, self._sent))
+        self._notes.append(partial(log.command, sent_s, decision, wanted, sent))
         ages = {
             "frame_s": now - frame.time_s,
             "pose_s": now - pose.time_s,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mi_nerfattack.robot.devices import Decision, TrackedPose
+from mi_nerfattack.robot.drive.pilot import planar_state
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -47,9 +48,7 @@ class Measures:
 
     def add(self, sent_s: float, decision: Decision, pose: TrackedPose) -> None:
         """Note a command."""
-        body = pose.body_to_world
-        heading = float(np.arctan2(body[1, 0], body[0, 0]))
-        x, y = map(float, body[:2, 3])
+        x, y, heading = planar_state(pose.body_to_world).tolist()
         self.rows.append((sent_s, decision.frame_time_s, x, y, heading))
 
     def figures(self, route: Route) -> Figures | None:

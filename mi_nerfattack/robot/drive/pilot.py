@@ -1,7 +1,8 @@
-"""Pilots on this computer: a policy in a thread of its own, and the expert."""
+"""Who decides on this computer: a policy or an expert, in a thread of its own."""
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 
@@ -19,6 +20,9 @@ from mi_nerfattack.robot.devices import (
 )
 from mi_nerfattack.vehicle.expert.base import AbstractExpert
 
+#: What is to be done, of a frame, in the unit of the policy's vehicle.
+Control = Callable[[Frame], float]
+
 
 class LocalPilot(AbstractPilot):
     """A policy that is evaluated beside the loop, always with the newest frame.
@@ -26,12 +30,12 @@ class LocalPilot(AbstractPilot):
     What takes long, or for ever, shows as a decision that grows old.
 
     Args:
-        control: from a frame's image (height, width, 3), uint8 sRGB, to a control;
-            called by the pilot's thread alone, see `policy_control`.
+        control: of a frame; called by the pilot's thread alone. See `policy_control`
+            and `expert_control`.
         clock: of the loop.
     """
 
-    def __init__(self, control: Callable[[np.ndarray], float], clock: Clock) -> None:
+    def __init__(self, control: Control, clock: Clock) -> None:
         self._control, self._clock = control, clock
         self._changed = threading.Condition()
         self._waiting: Frame | None = None
@@ -76,7 +80,9 @@ class LocalPilot(AbstractPilot):
                 if self._closed or frame is None:
                     return
             try:
-                decision = decide(self._control, frame, self._clock)
+                value = self._control(frame)
+                now = self._clock()
+                decision = Decision(value, frame.index, frame.time_s, now)
             except BaseException as error:  # a thread has nobody else to tell
                 with self._changed:
                     self._error = error
@@ -85,50 +91,8 @@ class LocalPilot(AbstractPilot):
                 self._decision = decision
 
 
-class ExpertPilot(AbstractPilot):
-    """An expert that knows the tracked pose, and looks at no frame.
-
-    Args:
-        expert: called once a frame, that is once a control period.
-        tracker: of the pose.
-        body: name of the car.
-        clock: of the loop.
-    """
-
-    def __init__(
-        self, expert: AbstractExpert, tracker: AbstractTracker, body: str, clock: Clock
-    ) -> None:
-        self._expert, self._tracker, self._body = expert, tracker, body
-        self._clock = clock
-        self._decision: Decision | None = None
-
-    def submit(self, frame: Frame) -> None:
-        """Decide at once."""
-        pose = self._tracker.newest(self._body)
-        if pose is not None:
-            x_axis, position = pose.body_to_world[:2, 0], pose.body_to_world[:2, 3]
-            state = [*position, np.arctan2(x_axis[1], x_axis[0])]
-            control = float(self._expert.control(np.array(state))[0])
-            self._decision = Decision(control, frame.index, frame.time_s, self._clock())
-
-    def newest(self) -> Decision | None:
-        """Return the newest decision; None before the first."""
-        return self._decision
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def decide(
-    control: Callable[[np.ndarray], float], frame: Frame, clock: Clock
-) -> Decision:
-    """Return what is decided of a frame."""
-    value = control(frame.image)
-    return Decision(value, frame.index, frame.time_s, clock())
-
-
 def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], float]:
-    """Return what a policy makes of images, one after the other.
+    """Return what a policy makes of images (height, width, 3), one after the other.
 
     Args:
         policy: one with memory starts with its initial one.
@@ -142,3 +106,31 @@ def policy_control(policy: AbstractPolicy, goal: int) -> Callable[[np.ndarray], 
         return float(np.array(row)[0])
 
     return control
+
+
+def expert_control(
+    expert: AbstractExpert, tracker: AbstractTracker, body: str
+) -> Control:
+    """Return what an expert makes of the tracked pose, once a frame.
+
+    It looks at no image; before the first pose its control is not a number.
+
+    Args:
+        expert: of the route.
+        tracker: of the pose.
+        body: name of the car.
+    """
+
+    def control(frame: Frame) -> float:
+        pose = tracker.newest(body)
+        if pose is None:
+            return math.nan
+        return float(expert.control(planar_state(pose.body_to_world))[0])
+
+    return control
+
+
+def planar_state(body_to_world: np.ndarray) -> np.ndarray:
+    """Return x, y (metres) and heading (radians) of a pose (4, 4)."""
+    (x, y), ahead = body_to_world[:2, 3], body_to_world[:2, 0]
+    return np.array([x, y, math.atan2(ahead[1], ahead[0])])

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.robot.drive.enable import JoystickEnable
+from mi_nerfattack.robot.drive.safety.enable import JoystickEnable
 
 BUTTON, AXIS, INITIAL = 1, 2, 0x80
 

@@ -15,7 +15,7 @@ from helpers.driving_stand_ins import SETTINGS, Bench
 from mi_nerfattack.io import growing
 from mi_nerfattack.robot.devices import DeviceLostError
 from mi_nerfattack.robot.drive import log as drive_log
-from mi_nerfattack.robot.drive.judge import Cause
+from mi_nerfattack.robot.drive.safety.judge import Cause
 
 HOLD_S = 0.5
 #: Longest time from a fault to the first brake: a decision, a frame and a round.

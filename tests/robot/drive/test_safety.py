@@ -17,10 +17,10 @@ from mi_nerfattack.deploy.vehicle import planar_body
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.robot.devices import Command, DeviceLostError, Frame
-from mi_nerfattack.robot.drive.fence import Fence, car_corners
-from mi_nerfattack.robot.drive.limits import Limits, Steering
-from mi_nerfattack.robot.drive.pilot import ExpertPilot, LocalPilot
-from mi_nerfattack.robot.drive.watchdog import Watchdog
+from mi_nerfattack.robot.drive.pilot import LocalPilot, expert_control
+from mi_nerfattack.robot.drive.safety.fence import Fence, car_corners
+from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
+from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
 from mi_nerfattack.vehicle.expert.choose import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -132,10 +132,10 @@ def wait_for(condition) -> None:
 def test_a_pilot_decides_of_the_newest_frame():
     begun, go = threading.Event(), threading.Event()
 
-    def control(image):
+    def control(frame):
         begun.set()
         assert go.wait(10)
-        return 0.01 * float(image[0, 0, 0])
+        return 0.01 * float(frame.image[0, 0, 0])
 
     pilot = LocalPilot(control, lambda: 7.0)
     assert pilot.newest() is None
@@ -154,7 +154,7 @@ def test_a_pilot_decides_of_the_newest_frame():
 
 
 def test_a_pilot_that_fails_is_lost():
-    def control(image):
+    def control(frame):
         raise ValueError("wrong size")
 
     pilot = LocalPilot(control, time.monotonic)
@@ -180,10 +180,7 @@ def test_the_expert_decides_by_the_tracked_pose():
     expert = expert_for("rad", route, 0.1, 0.4, SMALL_CAR.wheelbase, lag=0.0)
     bench = Bench()
     bench.sleep(1.0)
-    pilot = ExpertPilot(expert, StandInTracker(bench), "car", bench.clock)
-    pilot.submit(frame(10))
-    decision = pilot.newest()
-    assert decision is not None and decision.frame_index == 10
+    control = expert_control(expert, StandInTracker(bench), "car")
     # on the circle: the angle that keeps it there
     circle = math.atan(SMALL_CAR.wheelbase / RADIUS)
-    assert decision.control == pytest.approx(circle, abs=0.01)
+    assert control(frame(10)) == pytest.approx(circle, abs=0.01)

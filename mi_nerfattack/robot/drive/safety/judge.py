@@ -18,7 +18,7 @@ from mi_nerfattack.robot.devices import (
     MotorValues,
     TrackedPose,
 )
-from mi_nerfattack.robot.drive.fence import Fence, car_corners
+from mi_nerfattack.robot.drive.safety.fence import Fence, car_corners
 
 _T = TypeVar("_T")
 _AHEAD_S = 0.05  # that a device's time may be ahead of ours before its clock is wrong

@@ -1,0 +1,317 @@
+"""``mi-nerfattack drive``: a real car, or one in the simulated room."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions, policy_camera
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.policy.base import AbstractPolicy
+    from mi_nerfattack.robot.drive.config import DriveConfig
+    from mi_nerfattack.robot.drive.loop import DriveLoop, DriveSettings
+    from mi_nerfattack.robot.drive.rig import Rig, Seeing
+    from mi_nerfattack.robot.drive.safety.judge import Stop
+    from mi_nerfattack.vehicle.route.route import Route
+
+
+@dataclass(frozen=True)
+class DriveCommand:
+    """Let a policy drive a car along a route, as long as a button is held.
+
+    Whatever is old, lost, outside the fence or out of range brakes the car, centres its
+    wheels and ends the drive; so does letting the button go. Options are keys of CONFIG
+    with underscores, and come before it.
+    """
+
+    config: Annotated[
+        tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[CONFIG.toml]")
+    ] = None
+    """What is said below, as a file; its paths start from its folder."""
+    policy: str | None = None
+    """File as for evaluate, expert (by the tracked pose), or remote:HOST:PORT of
+    serve-policy. A TOML file with [policy] may also have the [camera] of training."""
+    control_unit: str | None = None
+    """Of the policy: rad, a steering angle (default), or rad/s."""
+    key: str | None = None
+    """File with the key of a remote policy."""
+    routes_file: str | None = None
+    """Routes, JSON; the bundled room's by default."""
+    route: str | None = None
+    """Name of the route: square."""
+    speed_ms: float | None = None
+    """Metres per second; the route's by default."""
+    duration_s: float | None = None
+    """Seconds after which the drive ends: 600."""
+    camera: str | None = None
+    """zed:/dev/video0 (default), v4l:/dev/videoN or video:FILE."""
+    zed_calibration: str | None = None
+    """SN<serial>.conf of the ZED; the only one of its settings by default."""
+    zed_mode: str | None = None
+    """VGA (default), HD720, HD1080, HD2K."""
+    tracker: str | None = None
+    """vicon:0.0.0.0 (default), vicon:HOST:PORT, motioncapture:KIND:HOST or
+    replay:FILE."""
+    rotation: str | None = None
+    """VICON's convention: euler (default) or rotation-vector."""
+    body: str | None = None
+    """The tracker's name of the car: racecar. Its origin is the middle of the rear
+    axle, on the floor; x ahead, y left, z up."""
+    port: str | None = None
+    """Serial port of the VESC: /dev/ttyACM0."""
+    calibration: str | None = None
+    """File of calibrate; that of a RACECAR/J by default."""
+    enable: str | None = None
+    """Joystick with the button to hold: /dev/input/js0."""
+    button: int | None = None
+    """Its number, from 0: 5."""
+    silence_s: float | None = None
+    """Seconds without any event of the joystick after which the button counts as let
+    go; for wireless ones that send all the time. Never by default."""
+    fence: str | None = None
+    """TOML file with points_m = [[x, y], ...] that the car's outline stays inside of;
+    by default the rectangle around the route and --margin-m."""
+    margin_m: float | None = None
+    """Of that rectangle: 0.5."""
+    max_speed_ms: float | None = None
+    """Limit: 1.5."""
+    max_steering_rad: float | None = None
+    """Limit: 0.34."""
+    max_acceleration_ms2: float | None = None
+    """Limit: 1.0."""
+    max_steering_rate: float | None = None
+    """Limit, radians per second: 3.2."""
+    wheelbase_m: float | None = None
+    """Of the car: 0.325."""
+    length_m: float | None = None
+    """Of the car: 0.45."""
+    width_m: float | None = None
+    """Of the car: 0.296."""
+    log: str | None = None
+    """New file for the log (.mcap); runs/drives/TIME.mcap by default."""
+    simulated: bool = False
+    """Drive in the rendered room, with none of the devices, as fast as it renders."""
+    spp: int | None = None
+    """Samples per pixel of the simulated camera: 4."""
+    check: bool = False
+    """Say what would be refused, and drive nothing."""
+    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    """How the policy is called."""
+
+    def run(self) -> int:
+        """Read, open, state, arm, drive and sum up."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.robot.drive.config import read_config
+        from mi_nerfattack.robot.drive.rig import open_rig
+
+        config = read_config(self.config, self._given())
+        variant.ensure()
+        route = config.read_route()
+        settings = config.settings(route)
+        policy, seeing = self._policy(config)
+        _say(_statement(config, route, settings))
+        with open_rig(config, route, policy, seeing, _confirm) as rig:
+            if self.check:
+                return _check(rig, settings)
+            stop, loop = _drive(rig, config, settings)
+        figures = loop.measures.figures(route)
+        if figures is not None:
+            _say(_summary(dataclasses.asdict(figures)))
+        return _code(stop)
+
+    def _given(self) -> dict[str, Any]:
+        """Return the options of the drive that are on the command line."""
+        own = ("config", "check", "options")
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {
+            name: value
+            for name, value in values.items()
+            if name not in own and value is not None and value is not False
+        }
+
+    def _policy(self, config: DriveConfig) -> tuple[AbstractPolicy | None, Seeing]:
+        from mi_nerfattack.robot.drive.rig import EXPERT, REMOTE, Seeing
+
+        name = config.policy
+        if name is None:
+            raise InputError(
+                f"--policy: none; give a file, {EXPERT}, or {REMOTE}HOST:PORT"
+            )
+        if name == EXPERT or name.startswith(REMOTE):
+            return None, Seeing()
+        policy = self.options.section(name).build()
+        return policy, Seeing(*(policy_camera(name) or (None, None)))
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _confirm(question: str) -> bool:
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> str:
+    """Say all that matters before anything moves."""
+    ages, limits = settings.judge.ages, settings.limits
+    corners = " ".join(f"({x:.2f}, {y:.2f})" for x, y in settings.judge.fence.points)
+    where = "the simulated room" if config.simulated else config.camera
+    lines = [
+        f"Policy     {config.policy}, control in {config.control_unit}",
+        f"Route      {route.name}, {route.length:.1f} m, at {route.speed_ms:g} m/s",
+        f"Fence      {corners}, m",
+        f"Limits     {limits.speed_ms:g} m/s, {limits.acceleration_ms2:g} m/s2, "
+        f"{limits.steering_rad:g} rad, {limits.steering_rate:g} rad/s",
+        f"Ages       frame {ages.frame_s:g} s, pose {ages.pose_s:g} s, loop "
+        f"{ages.loop_s:g} s",
+        f"Camera     {where}",
+    ]
+    if not config.simulated:
+        lines += [
+            f"Tracker    {config.tracker}, body {config.body!r}, {config.rotation}",
+            f"Motor      {config.port}, {config.calibration or 'as a RACECAR/J'}",
+            f"Enable     {config.enable}, button {config.button}",
+        ]
+    return "\n".join(lines)
+
+
+def _drive(
+    rig: Rig, config: DriveConfig, settings: DriveSettings
+) -> tuple[Stop, DriveLoop]:
+    """Arm, and run the loop with its log and its watchdog."""
+    import time
+    from contextlib import closing
+    from datetime import datetime
+
+    import mi_nerfattack
+    from mi_nerfattack.backend.interrupts import held_interrupts
+    from mi_nerfattack.robot.drive.log import DriveLog
+    from mi_nerfattack.robot.drive.loop import DriveLoop
+    from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
+
+    path = config.log_path(datetime.now())
+    about = {key: str(value) for key, value in config.model_dump().items()}
+    about["version"] = mi_nerfattack.__version__
+    devices, clock = rig.devices, rig.clock
+    camera = devices.camera.camera
+    log = DriveLog(path, camera, clock, time.time_ns(), about)
+    _say(f"Log        {path}")
+    watchdog = Watchdog(devices.motor.brake, settings.judge.ages.loop_s, clock)
+    with closing(log), closing(watchdog):
+        if not config.simulated:
+            watchdog.start()  # the time of the simulated room stands still meanwhile
+            _say(
+                "Lift the wheels off the floor: they turn for a second. Hold the "
+                "enable button to arm."
+            )
+            _wait_for_press(rig)
+        devices.motor.arm()
+        _say("Armed.")
+        loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
+        with held_interrupts() as interrupted, _hangups():
+            stop = loop.run(interrupted)
+        _say(f"{stop}: braked, wheels centred")
+    written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
+    _say(f"{path}: {written}")
+    return stop, loop
+
+
+def _wait_for_press(rig: Rig) -> None:
+    """Wait until the enable was seen released, and then held."""
+    was_released = False
+    while not (was_released and rig.devices.enable.is_held()):
+        was_released = was_released or not rig.devices.enable.is_held()
+        rig.sleep(0.02)
+
+
+@contextmanager
+def _hangups() -> Iterator[None]:
+    """Let a terminal that is closed, as by the lid, end the drive like SIGTERM."""
+    import signal
+
+    number = getattr(signal, "SIGHUP", None)  # not on Windows
+    if number is None:
+        yield
+        return
+    before = signal.signal(number, lambda *_: signal.raise_signal(signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+def _check(rig: Rig, settings: DriveSettings) -> int:
+    """Ask every device for five seconds, and say what speaks against driving."""
+    from mi_nerfattack.robot.drive.safety.judge import Cause, Stop, asked
+
+    devices, judge = rig.devices, settings.judge
+    body, end = settings.body, rig.clock() + 5.0
+
+    def pose() -> None:
+        newest = asked(Cause.TRACKER_LOST, lambda: devices.tracker.newest(body))
+        judge.pose(newest, rig.clock(), devices.tracker, body)
+
+    def frame() -> None:
+        newest = asked(Cause.CAMERA_LOST, devices.camera.newest)
+        judge.frame(newest, rig.clock())
+        if newest is not None:
+            asked(Cause.PILOT_LOST, lambda: devices.pilot.submit(newest))
+
+    def decision() -> None:
+        newest = asked(Cause.PILOT_LOST, devices.pilot.newest)
+        judge.decision(newest, rig.clock(), False)
+
+    def motor() -> None:
+        judge.motor(asked(Cause.MOTOR_LOST, devices.motor.read))
+
+    asks: dict[str, Callable[[], None]] = {
+        "camera": frame,
+        "tracker": pose,
+        "motor": motor,
+        "policy": decision,
+    }
+    found = dict.fromkeys(asks, "")
+    while rig.clock() < end:
+        for name, ask in asks.items():
+            try:
+                ask()
+                found[name] = ""
+            except Stop as stop:
+                found[name] = str(stop)
+        rig.sleep(settings.poll_s)
+    for name, problem in found.items():
+        _say(f"{name:10} {problem or 'ready'}")
+    return 1 if any(found.values()) else 0
+
+
+def _summary(values: dict[str, float]) -> str:
+    return (
+        f"{values['laps']:.2f} laps in {values['duration_s']:.1f} s, "
+        f"{values['commands']} commands\n"
+        f"cross-track error: largest {values['largest_error_m']:.3f} m, mean "
+        f"{values['mean_error_m']:.3f} m\n"
+        f"period: {1e3 * values['period_s']:.1f} ms, standard deviation "
+        f"{1e3 * values['period_jitter_s']:.1f} ms, longest "
+        f"{1e3 * values['longest_period_s']:.1f} ms\n"
+        f"frame to command: median {1e3 * values['latency_median_s']:.1f} ms, 99 % "
+        f"within {1e3 * values['latency_99_s']:.1f} ms"
+    )
+
+
+def _code(stop: Stop) -> int:
+    """Return the exit code; a mistake of ours and Ctrl-C are raised as ever."""
+    from mi_nerfattack.robot.drive.safety.judge import Cause
+
+    if stop.cause is Cause.INTERRUPTED:
+        raise KeyboardInterrupt
+    if stop.cause is Cause.EXCEPTION and stop.__cause__ is not None:
+        raise stop.__cause__
+    return 0 if stop.cause.is_planned else 1

@@ -1,0 +1,170 @@
+"""What ``mi-nerfattack drive`` is told, on the command line or by a TOML file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from mi_nerfattack.deploy.car import SMALL_CAR, Car
+from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.io import files
+from mi_nerfattack.ranges import Acute, Count, NonNegative, Positive, Seconds, Whole
+from mi_nerfattack.robot.drive.loop import DriveSettings
+from mi_nerfattack.robot.drive.safety.fence import Fence
+from mi_nerfattack.robot.drive.safety.judge import Ages, Judge
+from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
+from mi_nerfattack.scenario.section import Section, read_section
+from mi_nerfattack.vehicle.route.route import Route
+
+_PATHS = ("routes_file", "calibration", "fence", "log", "zed_calibration", "key")
+_OUT_OF_RANGE = 2.0  # of the largest steering: a control beyond it is nonsense
+PERIOD_S = 0.1
+
+
+class DriveConfig(Section):
+    """A drive, all but its policy; keys of the file, and options.
+
+    Attributes:
+        policy: file, as for `evaluate`; "expert", which follows the route by the
+            tracked pose; or "remote:HOST:PORT", a policy that `serve-policy` serves.
+        control_unit: of the policy: "rad" of a steering angle, or "rad/s".
+        key: file of the key that both computers share.
+        route: name in `routes_file`, which is the bundled room's by default.
+        speed_ms: to be kept; the route's by default.
+        duration_s: after which the drive ends.
+        camera: see `robot.camera.open`.
+        zed_calibration, zed_mode: of a ZED.
+        tracker: see `robot.tracker.open`.
+        rotation: VICON's convention.
+        body: the tracker's name of the car.
+        port: of the VESC.
+        calibration: its file; that of a RACECAR/J by default.
+        enable: joystick.
+        button: its number.
+        silence_s: after which without any event it counts as let go.
+        fence: file; the rectangle around the route and `margin_m` by default.
+        max_speed_ms, max_steering_rad, max_acceleration_ms2, max_steering_rate: limits.
+        wheelbase_m, length_m, width_m: of the car.
+        log: file; of the time of day by default.
+        simulated: in the rendered room, with none of the devices.
+        spp: samples per pixel of its camera.
+    """
+
+    policy: str | None = None
+    control_unit: Literal["rad", "rad/s"] = "rad"
+    key: str | None = None
+    routes_file: str | None = None
+    route: str = "square"
+    speed_ms: Positive | None = None
+    duration_s: Seconds = 600.0
+    camera: str = "zed:/dev/video0"
+    zed_calibration: str | None = None
+    zed_mode: str = "VGA"
+    tracker: str = "vicon:0.0.0.0"
+    rotation: Literal["euler", "rotation-vector"] = "euler"
+    body: Annotated[str, Field(min_length=1)] = "racecar"
+    port: str = "/dev/ttyACM0"
+    calibration: str | None = None
+    enable: str = "/dev/input/js0"
+    button: Whole = 5
+    silence_s: Seconds | None = None
+    fence: str | None = None
+    margin_m: NonNegative = 0.5
+    max_speed_ms: Positive = 1.5
+    max_steering_rad: Acute = 0.34
+    max_acceleration_ms2: Positive = 1.0
+    max_steering_rate: Positive = 3.2
+    wheelbase_m: Positive = SMALL_CAR.wheelbase
+    length_m: Positive = SMALL_CAR.length
+    width_m: Positive = SMALL_CAR.width
+    log: str | None = None
+    simulated: bool = False
+    spp: Count = 4
+
+    @property
+    def car(self) -> Car:
+        """The car's size, and how far it steers."""
+        return Car(
+            wheelbase=self.wheelbase_m,
+            length=self.length_m,
+            width=self.width_m,
+            max_steer=self.max_steering_rad,
+            control_unit="rad",
+            max_control=self.max_steering_rad,
+        )
+
+    def read_route(self) -> Route:
+        """Read the route, at the speed that is driven."""
+        path = self.routes_file or bundled_place("room").routes
+        found = Route.from_file(path, self.route)
+        speed = self.speed_ms or found.speed_ms
+        return Route(
+            found.name,
+            found.goal,
+            found.points,
+            found.lane_width_m,
+            min(speed, self.max_speed_ms),
+            found.closed,
+        )
+
+    def settings(self, route: Route) -> DriveSettings:
+        """Return what the loop is told.
+
+        Raises:
+            InputError: the fence cannot be read.
+        """
+        fence = (
+            Fence.around(route, self.margin_m)
+            if self.fence is None
+            else Fence.from_file(self.fence)
+        )
+        most = self.max_steering_rad
+        if self.control_unit == "rad/s":
+            most = route.speed_ms * math.tan(most) / self.wheelbase_m
+        limits = Limits(
+            self.max_speed_ms,
+            self.max_steering_rad,
+            self.max_acceleration_ms2,
+            self.max_steering_rate,
+        )
+        return DriveSettings(
+            body=self.body,
+            speed_ms=route.speed_ms,
+            judge=Judge(Ages(), fence, self.car, _OUT_OF_RANGE * most, PERIOD_S),
+            limits=limits,
+            steering=Steering(self.control_unit, self.wheelbase_m),
+            duration_s=self.duration_s,
+        )
+
+    def log_path(self, now: datetime) -> Path:
+        """Return the file for the log."""
+        default = Path("runs/drives") / f"{now:%Y%m%d-%H%M%S}.mcap"
+        return default if self.log is None else Path(self.log)
+
+
+def read_config(path: Path | None, given: Mapping[str, Any]) -> DriveConfig:
+    """Read a configuration.
+
+    Args:
+        path: TOML file, whose paths start from its folder; None without one.
+        given: on the command line; these come first.
+
+    Raises:
+        InputError: the file cannot be read, or a value is not usable.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        values = files.read_toml(path)
+        for key in _PATHS:
+            if isinstance(value := values.get(key), str):
+                values[key] = str(path.parent / value)
+        policy = values.get("policy")
+        if isinstance(policy, str) and (path.parent / policy).is_file():
+            values["policy"] = str(path.parent / policy)
+    name = "drive" if path is None else str(path)
+    return read_section(name, DriveConfig, {**values, **given}, Path())

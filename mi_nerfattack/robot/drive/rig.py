@@ -1,0 +1,195 @@
+"""A car's devices, opened as they are told, or those of the simulated room."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.policy.base import AbstractPolicy
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.robot.camera.open import ZedOptions, open_camera
+from mi_nerfattack.robot.devices import AbstractPilot, AbstractTracker, Clock
+from mi_nerfattack.robot.drive.config import PERIOD_S, DriveConfig
+from mi_nerfattack.robot.drive.loop import Devices
+from mi_nerfattack.robot.drive.pilot import (
+    Control,
+    LocalPilot,
+    expert_control,
+    policy_control,
+)
+from mi_nerfattack.robot.drive.room import (
+    SimulatedEnable,
+    SimulatedMotor,
+    SimulatedPilot,
+    SimulatedRoom,
+    SimulatedTracker,
+    simulated_camera,
+)
+from mi_nerfattack.robot.drive.safety.enable import JoystickEnable
+from mi_nerfattack.robot.remote.pilot import RemotePilot
+from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
+from mi_nerfattack.robot.tracker.open import open_tracker
+from mi_nerfattack.robot.vesc.calibration import Calibration, read_calibration
+from mi_nerfattack.robot.vesc.motor import VescMotor
+from mi_nerfattack.vehicle.expert.choose import expert_for
+from mi_nerfattack.vehicle.route.route import Route
+
+EXPERT, REMOTE = "expert", "remote:"
+_LAG_S = 0.1  # of the car's steering, which the expert reckons with
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Open devices, and their time.
+
+    Attributes:
+        devices: all of them.
+        clock: of them.
+        sleep: lets time pass.
+    """
+
+    devices: Devices
+    clock: Clock
+    sleep: Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """What a policy was trained with; None where nobody says.
+
+    Args:
+        camera: its intrinsics.
+        mount: its place on the car.
+    """
+
+    camera: Camera | None = None
+    mount: CameraMount | None = None
+
+
+@contextmanager
+def open_rig(
+    config: DriveConfig,
+    route: Route,
+    policy: AbstractPolicy | None,
+    seeing: Seeing,
+    confirm: Callable[[str], bool],
+) -> Iterator[Rig]:
+    """Open the devices one after the other, and close all at the end.
+
+    Nothing moves by this.
+
+    Args:
+        config: what to open.
+        route: that is driven.
+        policy: that decides here; None of the expert and of a remote one.
+        seeing: as the policy does.
+        confirm: asked before the flash memory of an old motor controller is written.
+
+    Raises:
+        InputError: a device cannot be opened; the message names it.
+        DeviceLostError: it does not answer.
+        SetupError: a package is not installed.
+    """
+    opened = _simulated if config.simulated else _real
+    with ExitStack() as stack:
+        yield opened(stack, config, route, policy, seeing, confirm)
+
+
+def _real(
+    stack: ExitStack,
+    config: DriveConfig,
+    route: Route,
+    policy: AbstractPolicy | None,
+    seeing: Seeing,
+    confirm: Callable[[str], bool],
+) -> Rig:
+    mount = seeing.mount or bundled_place("room").mount
+    clock = time.monotonic
+
+    def path(name: str | None) -> Path | None:
+        return None if name is None else Path(name)
+
+    camera = seeing.camera
+    size = None if camera is None else (camera.width, camera.height)
+    zed = ZedOptions(path(config.zed_calibration), config.zed_mode, size)
+    if not config.camera.startswith("zed:"):
+        zed = None
+    seen = open_camera(config.camera, camera, zed, clock=clock)
+    stack.callback(seen.close)
+    tracker = open_tracker(config.tracker, mount, config.rotation, clock=clock)
+    stack.callback(tracker.close)
+    enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
+    stack.callback(enable.close)
+    pilot = _pilot(config, route, policy, tracker, clock)
+    stack.callback(pilot.close)
+    scales = Calibration()
+    if config.calibration is not None:
+        scales = read_calibration(config.calibration)
+    motor = VescMotor(config.port, scales, confirm)
+    stack.callback(motor.close)
+    return Rig(Devices(seen, tracker, motor, pilot, enable), clock, time.sleep)
+
+
+def _pilot(
+    config: DriveConfig,
+    route: Route,
+    policy: AbstractPolicy | None,
+    tracker: AbstractTracker,
+    clock: Clock,
+) -> AbstractPilot:
+    name = config.policy or ""
+    if name.startswith(REMOTE):
+        endpoint = Endpoint.parse(name.removeprefix(REMOTE))
+        key = read_key(None if config.key is None else Path(config.key), endpoint)
+        return RemotePilot(endpoint, key, clock=clock)
+    return LocalPilot(_control(config, route, policy, tracker), clock)
+
+
+def _control(
+    config: DriveConfig,
+    route: Route,
+    policy: AbstractPolicy | None,
+    tracker: AbstractTracker,
+) -> Control:
+    if policy is not None:
+        control = policy_control(policy, route.goal)
+        return lambda frame: control(frame.image)
+    car = config.car
+    expert = expert_for(
+        car.control_unit, route, PERIOD_S, car.max_control, car.wheelbase, _LAG_S
+    )
+    return expert_control(expert, tracker, config.body)
+
+
+def _simulated(
+    stack: ExitStack,
+    config: DriveConfig,
+    route: Route,
+    policy: AbstractPolicy | None,
+    seeing: Seeing,
+    confirm: Callable[[str], bool],
+) -> Rig:
+    del confirm  # its motor controller has no memory
+    if (config.policy or "").startswith(REMOTE):
+        raise InputError(
+            "--simulated: its time is not that of another computer; give a policy that "
+            "decides here"
+        )
+    place = bundled_place("room")
+    place = replace(
+        place,
+        camera=seeing.camera or place.camera,
+        mount=seeing.mount or place.mount,
+    )
+    room = SimulatedRoom(config.car, route.pose_at(0.0))
+    tracker, camera = SimulatedTracker(room), simulated_camera(room, place, config.spp)
+    stack.callback(camera.close)
+    pilot = SimulatedPilot(_control(config, route, policy, tracker), room)
+    motor, enable = SimulatedMotor(room), SimulatedEnable(room)
+    stack.callback(motor.close)
+    return Rig(Devices(camera, tracker, motor, pilot, enable), room.clock, room.sleep)

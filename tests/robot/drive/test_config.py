@@ -1,0 +1,65 @@
+"""What drive is told: files, options, and what follows from them."""
+
+from __future__ import annotations
+
+import math
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.robot.drive.config import read_config
+
+
+def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path):
+    folder = tmp_path / "car"
+    folder.mkdir()
+    files.write_text(folder / "policy.toml", "")
+    files.write_text(
+        folder / "fence.toml", "points_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]"
+    )
+    files.write_text(
+        folder / "drive.toml",
+        'policy = "policy.toml"\nfence = "fence.toml"\nbutton = 4\nspeed_ms = 0.5\n',
+    )
+    config = read_config(folder / "drive.toml", {"button": 7, "max_speed_ms": 0.4})
+    assert config.policy == str(folder / "policy.toml") and config.button == 7
+    route = config.read_route()
+    assert route.name == "square" and route.speed_ms == 0.4  # the limit
+    settings = config.settings(route)
+    np.testing.assert_array_equal(settings.judge.fence.points[2], (3.0, 3.0))
+    assert settings.limits.speed_ms == 0.4 and settings.speed_ms == 0.4
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("buton = 4", r"drive.toml.buton: unknown key; allowed: .*button"),
+        ("speed_ms = -1.0", r"drive.toml.speed_ms: .*greater than 0"),
+        ('control_unit = "deg"', r"drive.toml.control_unit: .*'rad'"),
+        ("speed_ms = [", "must be valid TOML"),
+        ('fence = "gone.toml"', "gone.toml: does not exist"),
+        ('route = "round"', "no route 'round'; it has 'square'"),
+    ],
+)
+def test_files_that_say_something_wrong(tmp_path, text, message):
+    files.write_text(tmp_path / "drive.toml", text)
+    with pytest.raises(InputError, match=message):
+        config = read_config(tmp_path / "drive.toml", {})
+        config.settings(config.read_route())
+
+
+def test_defaults_fence_the_route_and_take_twice_the_largest_control():
+    config = read_config(None, {})
+    route = config.read_route()
+    judge = config.settings(route).judge
+    assert judge.fence.holds(route.points) and judge.max_control == 0.68
+    assert not judge.fence.holds(route.points + [0.6, 0.0])
+    rate = read_config(None, {"control_unit": "rad/s"}).settings(route).judge
+    assert rate.max_control == pytest.approx(2 * math.tan(0.34) / 0.325)
+    assert config.log_path(datetime(2026, 5, 4, 3, 2, 1)) == Path(
+        "runs/drives/20260504-030201.mcap"
+    )
