@@ -10,10 +10,20 @@ from sphinx.application import Sphinx
 sys.path.append(str(Path(__file__).parent / "extensions"))
 import plugin_reference  # noqa: E402
 
+from mi_nerfattack import ranges  # noqa: E402
+
 project = "mi-nerfattack"
 copyright = "The mi-nerfattack authors"
 
-extensions = ["myst_parser", "sphinx_tabs.tabs", "mathml", "plugin_reference"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_tabs.tabs",
+    "mathml",
+    "plugin_reference",
+    "signatures",
+]
 rst_prolog = plugin_reference.PROLOG
 exclude_patterns = ["extensions", "examples"]
 # Nothing is fetched, neither while the site is built nor while it is read.
@@ -22,6 +32,15 @@ html_math_renderer = "mathml"
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["math"]  # ```math, which GitHub shows too
+
+autodoc_member_order = "bysource"
+_ranges = [
+    name for name, type_ in vars(ranges).items() if hasattr(type_, "__metadata__")
+]
+autodoc_type_aliases = {name: name for name in (*_ranges, "ArrayLike")}
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
 
 html_theme = "furo"
 html_title = "mi-nerfattack"

@@ -107,12 +107,12 @@ class GradientAttack(AbstractAttack):
         return record
 
     def finish(self) -> None:
-        """See :meth:`AbstractAttack.finish`."""
+        """See ``AbstractAttack.finish``."""
         self._last = self.measure()
         self.restore_best()
 
     def curve(self, backward_multiple: float) -> np.ndarray:
-        """See :meth:`AbstractAttack.curve`; once finished, the last update counts too.
+        """See ``AbstractAttack.curve``; once finished, the last update counts too.
 
         A measurement is a drive, after which an update takes a pass back.
         """
@@ -138,7 +138,7 @@ class GradientAttack(AbstractAttack):
 
     @property
     def without_gradient(self) -> list[int]:
-        """See :attr:`AbstractAttack.without_gradient`."""
+        """See ``AbstractAttack.without_gradient``."""
         if not self.history:
             return []
         found = np.zeros(len(self.sensor.fields), bool)

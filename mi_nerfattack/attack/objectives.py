@@ -107,7 +107,7 @@ class DepartureTime(AbstractObjective):
     after t control periods, and ``S_t = p_1 ... p_t``, the chance to have been there
     all the time, the cost is ``dt (S_1 + ... + S_T)``. As the softness goes to zero,
     it becomes ``dt (k - 1)`` where the k-th period is the first that ends with
-    |e| > limit, i.e. the time of the last state before the departure, and ``dt T``
+    ``|e| > limit``, i.e. the time of the last state before the departure, and ``dt T``
     where there is none.
 
     Far inside the lane the derivative fades as ``exp(-(limit - |e|) / softness)``,
@@ -126,7 +126,7 @@ class DepartureTime(AbstractObjective):
     softness_m: Positive = 0.25
 
     def evaluate(self, states: StateHistory) -> Any:
-        """See :meth:`AbstractObjective.evaluate`."""
+        """See :meth:`.AbstractObjective.evaluate`."""
         distance = dr.abs(self.route.cross_track(states.rows))
         stayed = _log_sigmoid((self.limit_m - distance) / self.softness_m)
         return states.dt * states.total(dr.exp(states.running(stayed)))

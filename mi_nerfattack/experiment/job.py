@@ -64,7 +64,7 @@ class Job:
         on_progress: told about every time step.
         on_notice: told what a resumed run ignores, or that there is none.
         started: `time.perf_counter()` from which the wall time counts.
-        frames: of each case, see :func:`pictures.frames.frame_steps`; None writes no
+        frames: of each case, see ``pictures.frames.frame_steps``; None writes no
             pictures at all: no frames, plots, attribution and page.
     """
 

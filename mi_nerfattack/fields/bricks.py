@@ -96,7 +96,7 @@ class BrickField(AbstractField):
     """Density and colour at the vertices of bricks, one in each occupied cell.
 
     A brick divides its cell into n^3 parts, n = 1, 2, 4 or 8, and has (n + 1)^3
-    vertices. What they keep (:class:`Codes`) is interpolated trilinearly, and becomes
+    vertices. What they keep (``Codes``) is interpolated trilinearly, and becomes
     density and radiance then. The radiance does not depend on the direction. Made by
     `fit.bake`; there is nothing to optimise, but it is differentiable by the position.
 

@@ -248,7 +248,7 @@ class NGPField(AbstractField):
 
     @property
     def has_gradients(self) -> bool:
-        """Whether derivatives with respect to what :meth:`eval` reads are asked for."""
+        """Whether derivatives with respect to what ``eval`` reads are asked for."""
         values = self.parameters()
         with dr.resume_grad():  # derivative passes ask while gradients are suspended
             return any(dr.grad_enabled(values[k]) for k in values if k != "sky")

@@ -221,7 +221,7 @@ class AbstractComposite(ABC):
 class DepthComposite(AbstractComposite):
     """Every layer by itself, then folded front to back by expected depth.
 
-    Exact where layers do not overlap along a ray; see :func:`depth_composite`.
+    Exact where layers do not overlap along a ray; see ``depth_composite``.
     Takes backdrops as well as fields. Cost: one march a layer. Source: appendix A.4
     to A.6.
     """

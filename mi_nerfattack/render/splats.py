@@ -94,7 +94,7 @@ class SplatBackground(AbstractBackdrop):
     in proportion to the splats that rays enter until they are opaque.
 
     Args:
-        splats: from :func:`fields.splats.read_splats`.
+        splats: from :func:`.read_splats`.
         pose: the file's frame to the world, with the metres per unit of the file as
             its scale; identity by default.
     """
@@ -118,12 +118,12 @@ class SplatBackground(AbstractBackdrop):
         dr.make_opaque(self._columns, self._records, self._harmonics, numbers)
 
     def state(self) -> list[Any]:
-        """See :meth:`AbstractBackdrop.state`."""
+        """See ``AbstractBackdrop.state``."""
         tiers = [(x.scene, x.first, x.back, x.zoom, x.near) for x in self._tiers]
         return [self, tiers, self._columns, self._records, self._harmonics]
 
     def march(self, rays: Rays, stop: float) -> March:
-        """See :meth:`AbstractBackdrop.march`; evaluated when it returns.
+        """See ``AbstractBackdrop.march``; evaluated when it returns.
 
         A kernel that ran later might find the acceleration structures gone.
         """

@@ -44,7 +44,7 @@ class Drive:
     Args:
         environment: its name, one of `ENVIRONMENTS` or your own.
         route: name of the reference route.
-        case: one of `CASES`, or of :func:`random_case`.
+        case: one of `CASES`, or of ``random_case``.
         run: index among the drives of one route, environment and case, from 0.
         seed: seed of this drive.
         states: (T+1, 3), x and y in metres and heading in radians, initial state

@@ -123,7 +123,7 @@ class Rollout:
     def by_images(
         self, drive: Trajectory, steps: Collection[int]
     ) -> dict[int, np.ndarray]:
-        """Differentiate by what the sensor gave; see :func:`backward_to_images`.
+        """Differentiate by what the sensor gave; see ``backward_to_images``.
 
         Args:
             drive: through the loop; `kept` is the policy's memory before each period,

@@ -65,9 +65,9 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """Accumulate the parameters' gradients and return the state's.
 
         Args:
-            observation: from :meth:`observe` with the same state and step; there may
+            observation: from ``observe`` with the same state and step; there may
                 have been others since.
-            state: (m, n), as given to :meth:`observe`.
+            state: (m, n), as given to ``observe``.
             d_image: derivative of the objective by the image, of its shape.
             attached: whether to differentiate by the state.
 
@@ -141,7 +141,7 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """Return an observation from what :meth:`keep` gave.
 
         Args:
-            state: (m, n), as given to :meth:`observe`.
+            state: (m, n), as given to ``observe``.
             step: likewise.
             kept: of that observation.
         """
@@ -152,8 +152,8 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """Differentiate the image in the direction of the parameters' tangents.
 
         Args:
-            observation: from :meth:`observe` with the same state and step.
-            state: (m, n), as given to :meth:`observe`.
+            observation: from ``observe`` with the same state and step.
+            state: (m, n), as given to ``observe``.
             t_state: (m, n) tangent of the state; None when the image does not
                 follow it.
 

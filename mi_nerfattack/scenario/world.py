@@ -159,7 +159,7 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     """Load all files of a scenario.
 
     Args:
-        scenario: from :func:`scenario.load_scenario`.
+        scenario: from :func:`load_scenario`.
         policy: the policy under test.
 
     Raises:

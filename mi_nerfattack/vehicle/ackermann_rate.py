@@ -31,8 +31,8 @@ class RateLimitedAckermann(AbstractDynamics):
     Args:
         speed: v, metres per second, of the rear axle.
         wheelbase: l, metres.
-        max_steer: limit of |u|, radians, below pi/2.
-        max_steer_rate: limit of |d delta/dt|, radians per second.
+        max_steer: limit of ``|u|``, radians, below pi/2.
+        max_steer_rate: limit of ``|d delta/dt|``, radians per second.
         time_constant: tau, seconds.
     """
 

@@ -29,7 +29,7 @@ class KinematicBicycle(AbstractDynamics):
         speed: v, metres per second, of the centre of gravity.
         front_m: f, distance from the centre of gravity to the front axle, metres.
         rear_m: r, the same to the rear axle.
-        max_steer: limit of |u|, radians, below pi/2.
+        max_steer: limit of ``|u|``, radians, below pi/2.
     """
 
     speed: Positive = 5.0

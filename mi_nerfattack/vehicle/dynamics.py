@@ -130,7 +130,7 @@ class Dubins(AbstractDynamics):
 
     Args:
         speed: v, metres per second.
-        max_heading_rate: limit of |u|, radians per second.
+        max_heading_rate: limit of ``|u|``, radians per second.
     """
 
     speed: Positive = 5.0
@@ -158,7 +158,7 @@ class Ackermann(AbstractDynamics):
     Args:
         speed: v, metres per second.
         wheelbase: l, metres.
-        max_steer: limit of |u|, radians, below pi/2.
+        max_steer: limit of ``|u|``, radians, below pi/2.
     """
 
     speed: Positive = 5.0

@@ -31,7 +31,7 @@ class TorchDynamics(AbstractUserDynamics):
             the device and in the precision of the loop, to the derivative (n, m). It
             treats each vehicle alone, and changes nothing between two calls.
         size: m, at least 3; the first columns are px, py, theta.
-        limit: of |control|, in its unit; applied by `soft_limit`.
+        limit: of ``|control|``, in its unit; applied by `soft_limit`.
         rest: initial values of the m - 3 columns after theta; zeros if left out.
     """
 

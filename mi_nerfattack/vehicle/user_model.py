@@ -73,7 +73,7 @@ class FunctionDynamics(AbstractUserDynamics):
             type, or a list or tuple of rows. It treats each vehicle alone and reads
             nothing that changes, for it is called once and its kernels are recorded.
         size: m, at least 3; the first rows are px, py, theta.
-        limit: of |control|, in its unit; applied by `soft_limit`.
+        limit: of ``|control|``, in its unit; applied by `soft_limit`.
         rest: initial values of the m - 3 rows after theta; zeros if left out.
     """
 

@@ -1,4 +1,4 @@
-"""Links of pages that are no part of the site, which `make docs` does not check."""
+"""What `make docs` does not check, or only where its extra is installed."""
 
 from __future__ import annotations
 
@@ -29,3 +29,19 @@ def test_links_lead_to_files_and_headings(page):
         assert target.exists(), f"{page.name}: {link}"
         if heading:
             assert heading in anchors(target), f"{page.name}: {link}"
+
+
+def test_every_page_is_in_the_contents():
+    contents = (ROOT / "docs/index.md").read_text("utf-8")
+    listed = set(re.findall(r"^([\w/]+)$", contents, re.MULTILINE))
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.rst")]
+    assert {page.stem for page in pages} - {"index"} <= listed
+
+
+def test_every_package_with_public_names_is_in_the_reference():
+    pages = (ROOT / "docs/api").glob("*.rst")
+    text = "".join(page.read_text("utf-8") for page in pages)
+    documented = set(re.findall(r"automodule:: (\S+)", text))
+    stubs = (ROOT / "mi_nerfattack").glob("**/__init__.pyi")
+    names = {".".join(stub.parent.relative_to(ROOT).parts) for stub in stubs}
+    assert documented == names | {"mi_nerfattack"}

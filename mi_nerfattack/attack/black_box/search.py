@@ -59,8 +59,8 @@ class Judged:
 
     Attributes:
         objective: what is minimised.
-        cross_track_mean_m: mean |e| over steps and drives, metres.
-        cross_track_max_m: largest |e|, metres.
+        cross_track_mean_m: mean ``|e|`` over steps and drives, metres.
+        cross_track_max_m: largest ``|e|``, metres.
         frames: that were rendered for it.
     """
 
@@ -134,7 +134,7 @@ class BlackBoxAttack:
         """Return the best so far against the cost, a row a judgement.
 
         Returns:
-            (n, 3): see :func:`best_so_far`.
+            (n, 3): see ``best_so_far``.
         """
         frames = np.cumsum([judged.frames for judged in self.history])
         objectives = [judged.objective for judged in self.history]

@@ -89,22 +89,22 @@ class SurrogateSearch(AbstractAttack):
 
     @property
     def is_over(self) -> bool:
-        """See :attr:`AbstractAttack.is_over`."""
+        """See ``AbstractAttack.is_over``."""
         return self._attack.is_over
 
     @property
     def has_converged(self) -> bool:
-        """See :attr:`AbstractAttack.has_converged`."""
+        """See ``AbstractAttack.has_converged``."""
         return has_settled(self._objectives)
 
     @property
     def best(self) -> list[np.ndarray]:
-        """See :attr:`AbstractAttack.best`."""
+        """See ``AbstractAttack.best``."""
         found = self._attack.best
         return self._original if found is None else found
 
     def step(self, on_step: OnStep | None = None) -> IterationRecord:
-        """See :meth:`AbstractAttack.step`."""
+        """See ``AbstractAttack.step``."""
         self._add(self._attack.step(on_step))
         return self.history[-1]
 
@@ -116,16 +116,16 @@ class SurrogateSearch(AbstractAttack):
         self.history.append(IterationRecord(self.iteration, *numbers))
 
     def curve(self, backward_multiple: float) -> np.ndarray:
-        """See :meth:`AbstractAttack.curve`; nothing passes back here."""
+        """See ``AbstractAttack.curve``; nothing passes back here."""
         del backward_multiple
         return self._attack.curve()
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """See :meth:`AbstractAttack.tensors`."""
+        """See ``AbstractAttack.tensors``."""
         return self._attack.tensors()
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
-        """See :meth:`AbstractAttack.load_tensors`."""
+        """See ``AbstractAttack.load_tensors``."""
         self._attack.load_tensors(tensors)
         for judged in self._attack.history:
             self._add(judged)

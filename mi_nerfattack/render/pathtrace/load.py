@@ -29,10 +29,10 @@ def load_scene(
 
     Args:
         path: XML file; the files it names are relative to its folder.
-        parameters: values of its `$NAME`s, in place of the `<default>` ones.
+        parameters: values of its ``$NAME``, in place of the `<default>` ones.
         size_px: width and height of all films, as if the file gave them; None keeps
             the file's.
-        shapes: `mi.Shape`s by name that the scene gets besides its own.
+        shapes: `mi.Shape` by name that the scene gets besides its own.
 
     Returns:
         `mi.Scene`.

@@ -281,7 +281,7 @@ def smooth_absolute(error: Any, width: float = 0.05) -> Any:
         width: w, metres, radius of the rounded corner.
 
     Returns:
-        (n,), metres, between |e| - w and |e|.
+        (n,), metres, between ``|e| - w`` and ``|e|``.
     """
     return dr.sqrt(dr.square(error) + width**2) - width
 
