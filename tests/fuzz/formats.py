@@ -341,7 +341,12 @@ def _zed(folder: Path) -> list[tuple[Path, Read]]:
 
     path = folder / "SN1.conf"
     path.write_text(calibration_text())
-    return [(path, lambda path: LeftEye(read_left_eye(path)))]
+
+    def read(path: Path) -> None:
+        eye = read_left_eye(path)
+        LeftEye(eye, eye.camera())
+
+    return [(path, read)]
 
 
 _TEXT, _JSON = one_of(of_text, of_text, of_bytes), one_of(of_json, of_json, of_text)

@@ -25,8 +25,10 @@ class ZedOptions:
     Args:
         calibration: `SN<serial>.conf`; None for the only one in `SETTINGS`.
         mode: of `zed.MODES`.
-        size_px: width and height of frames; None for half of the mode's.
-        is_undistorted: whether lens distortion is taken out.
+        size_px: width and height of frames, where no camera is asked for; None for half
+            of the mode's.
+        is_undistorted: whether lens distortion is taken out, where no camera is asked
+            for.
     """
 
     calibration: Path | None = None
@@ -34,15 +36,20 @@ class ZedOptions:
     size_px: tuple[int, int] | None = None
     is_undistorted: bool = True
 
-    def build(self) -> LeftEye:
+    def build(self, camera: Camera | None = None) -> LeftEye:
         """Read the calibration.
+
+        Args:
+            camera: whose frames are made; None for one of the eye's own.
 
         Raises:
             InputError: it cannot be found or used.
         """
-        path = self.calibration or _only_calibration()
-        eye = read_left_eye(path, self.mode)
-        return LeftEye(eye, self.size_px, self.is_undistorted)
+        eye = read_left_eye(self.calibration or _only_calibration(), self.mode)
+        own = (
+            eye.camera(self.size_px, self.is_undistorted) if camera is None else camera
+        )
+        return LeftEye(eye, own)
 
 
 def open_camera(
@@ -57,7 +64,8 @@ def open_camera(
 
     Args:
         text: one of `FORMS`.
-        camera: intrinsics of `v4l` and `video`, whose frames must have its size.
+        camera: intrinsics of `v4l` and `video`, whose frames must have its size; a
+            ZED's are made into those of it, if it is given.
         zed: for `zed`, and for a `video` of both its eyes.
         fps: frames per second to ask a device for.
         is_looped: whether a video starts again after its end.
@@ -72,7 +80,7 @@ def open_camera(
         raise InputError(f"camera {text!r}: must be {FORMS}")
     prepare: AbstractPreparation
     if kind == "zed" or (kind == "video" and zed is not None):
-        prepare = (zed or ZedOptions()).build()
+        prepare = (zed or ZedOptions()).build(camera)
     elif camera is not None:
         prepare = AsTheyCome(camera)
     else:

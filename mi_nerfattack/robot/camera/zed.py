@@ -18,6 +18,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.distortion import undistort
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.robot.camera.preparation import AbstractPreparation
 from mi_nerfattack.system.extras import load_extra
@@ -46,6 +47,41 @@ class EyeCalibration:
     where: str
     pinhole: Camera
     distortion: tuple[float, ...]
+
+    def camera(
+        self, size_px: tuple[int, int] | None = None, is_undistorted: bool = True
+    ) -> Camera:
+        """Return a camera of the eye's own focal lengths and principal point.
+
+        Args:
+            size_px: width and height; None for half, 336 x 188 of VGA. With another
+                ratio, such as 366 x 188, the picture is stretched, and fx with it.
+            is_undistorted: whether it has none of the lens' distortion.
+
+        Raises:
+            InputError: a size that is none, or a distortion that no camera of a scene
+                can have.
+        """
+        whole = self.pinhole
+        width, height = size_px or (whole.width // 2, whole.height // 2)
+        if not (0 < width <= whole.width and 0 < height <= whole.height):
+            raise InputError(
+                f"ZED: {width} x {height} px; from 1 x 1 to {whole.width} x "
+                f"{whole.height} px"
+            )
+        found = whole.resized(width, height)
+        if is_undistorted:
+            return found
+        *first, k3 = self.distortion
+        if k3:
+            raise InputError(
+                f"{self.where}: k3 is {k3:g}; rendered cameras have k1, k2, p1, p2 "
+                "alone: take the distortion out"
+            )
+        try:
+            return replace(found, **dict(zip(_DISTORTION, first, strict=False)))
+        except InputError as error:
+            raise InputError(f"{self.where}: {error}") from error
 
 
 def read_left_eye(path: Path, mode: str = "VGA") -> EyeCalibration:
@@ -104,93 +140,79 @@ def _number(
 
 
 class LeftEye(AbstractPreparation):
-    """Makes frames of the left eye of those of both.
+    """Makes a camera's frames of the left half of both eyes'.
 
-    Reduced by area means to the size asked for, then undistorted: straight lines are
-    straight, with the focal lengths and the principal point that the eye has. Or left
-    distorted, for scenes that are rendered and policies that are trained with the same
-    distortion; `camera` says which it is.
+    Each pixel shows what lies in its direction by the intrinsics and the distortion of
+    the camera asked for, whatever those of the eye are: frames are what a scene that is
+    rendered by this camera shows. The eye's picture is reduced by area means first,
+    where the camera has fewer pixels.
 
     Args:
         eye: calibration in the mode that the device is in.
-        size_px: width and height of the result; None for half, 336 x 188 of VGA. With
-            another ratio, such as 366 x 188, the picture is stretched, and fx with it.
-        is_undistorted: whether lens distortion is taken out.
+        camera: such as `eye.camera()`, or the one that a policy was trained with.
 
     Raises:
-        InputError: a size that is none, distortion that a scene's camera cannot have,
-            or one that leaves parts of the image empty.
+        InputError: the camera sees more than the eye.
         SetupError: OpenCV is not installed.
     """
 
-    def __init__(
-        self,
-        eye: EyeCalibration,
-        size_px: tuple[int, int] | None = None,
-        is_undistorted: bool = True,
-    ) -> None:
+    def __init__(self, eye: EyeCalibration, camera: Camera) -> None:
         self._cv2 = load_extra("cv2", "markers", "a ZED")
         whole = eye.pinhole
-        size = size_px or (whole.width // 2, whole.height // 2)
-        if not (0 < size[0] <= whole.width and 0 < size[1] <= whole.height):
-            raise InputError(
-                f"ZED: {size[0]} x {size[1]} px; from 1 x 1 to {whole.width} x "
-                f"{whole.height} px"
-            )
         self.source_px = 2 * whole.width, whole.height
-        self.camera = whole.resized(*size)
-        self._maps = None
-        if is_undistorted:
-            self._maps = self._undistortion(eye)
-        elif eye.distortion[4]:
-            raise InputError(
-                f"{eye.where}: k3 is {eye.distortion[4]:g}; rendered cameras have k1, "
-                "k2, p1, p2 alone: take the distortion out"
-            )
-        else:
-            self.camera = _distorted(eye, self.camera)
+        self.camera = camera
+        self._reduced_px = (
+            min(whole.width, max(1, round(whole.width * camera.fx / whole.fx))),
+            min(whole.height, max(1, round(whole.height * camera.fy / whole.fy))),
+        )
+        self._maps = self._places(eye)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """Return the left eye's picture."""
-        size = self.camera.width, self.camera.height
+        """Return what the camera sees."""
+        cv2 = self._cv2
         left = np.ascontiguousarray(image[:, : image.shape[1] // 2])
-        small = self._cv2.resize(left, size, interpolation=self._cv2.INTER_AREA)
-        if self._maps is None:
-            return small
-        return self._cv2.remap(small, *self._maps, self._cv2.INTER_LINEAR)
+        reduced = cv2.resize(left, self._reduced_px, interpolation=cv2.INTER_AREA)
+        return cv2.remap(reduced, *self._maps, cv2.INTER_LINEAR)
 
-    def _undistortion(self, eye: EyeCalibration) -> tuple[np.ndarray, np.ndarray]:
-        """Return the column and the row (height, width) that each pixel is from."""
-        camera = self.camera
-        size = camera.width, camera.height
+    def _places(self, eye: EyeCalibration) -> tuple[np.ndarray, np.ndarray]:
+        """Return the column and the row (h, w) of the reduced picture of each pixel."""
+        camera, source = self.camera, eye.pinhole.resized(*self._reduced_px)
+        columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+        x, y = np.meshgrid(
+            (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
+        )
+        if camera.is_distorted:
+            x, y = undistort(x, y, *camera.distortion)
+        k1, k2, _, _, k3 = eye.distortion
+        r2 = np.linspace(0, float((x * x + y * y).max()), 1000)
+        if not (1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all():
+            raise InputError(
+                f"{eye.where}: distortion {eye.distortion} folds the image over itself "
+                "where the camera looks; check the file, or take one that sees less"
+            )
         matrix = np.array(
             [
-                [camera.fx, 0, camera.cx - 0.5],
-                [0, camera.fy, camera.cy - 0.5],
+                [source.fx, 0, source.cx - 0.5],
+                [0, source.fy, source.cy - 0.5],
                 [0, 0, 1],
             ]
         )
-        columns, rows = self._cv2.initUndistortRectifyMap(
-            matrix, np.array(eye.distortion), None, matrix, size, self._cv2.CV_32FC1
+        points, _ = self._cv2.projectPoints(
+            np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3),
+            np.zeros(3),
+            np.zeros(3),
+            matrix,
+            np.array(eye.distortion),
         )
-        beyond = max(
-            -columns.min(),
-            -rows.min(),
-            columns.max() - (size[0] - 1),
-            rows.max() - (size[1] - 1),
-        )
+        places = points.reshape(camera.height, camera.width, 2)
+        last = np.array([source.width - 1, source.height - 1])
+        beyond = float(np.maximum(-places, places - last).max())
         if not beyond <= 1:
             raise InputError(
-                f"{eye.where}: distortion {eye.distortion} leaves parts of the image "
-                f"empty when taken out ({beyond:.1f} px); check the file, or keep it"
+                f"{eye.where}: the camera sees {beyond:.0f} px beyond the eye's picture"
+                f" of {source.width} x {source.height} px; take one that sees less, "
+                "such as the eye's own"
             )
         # up to a pixel beyond its edge is that edge
-        return np.clip(columns, 0, size[0] - 1), np.clip(rows, 0, size[1] - 1)
-
-
-def _distorted(eye: EyeCalibration, camera: Camera) -> Camera:
-    names = dict(zip(_DISTORTION[:4], eye.distortion, strict=False))
-    try:
-        return replace(camera, **names)
-    except InputError as error:
-        raise InputError(f"{eye.where}: {error}") from error
+        inside = np.clip(places, 0, last).astype(np.float32)
+        return inside[..., 0], inside[..., 1]

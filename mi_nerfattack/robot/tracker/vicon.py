@@ -107,7 +107,8 @@ class ViconTracker(AbstractTracker):
     def _require_alive(self) -> None:
         if not self._thread.is_alive():
             host, port = self.address
-            why = self._error or "the receiver is closed"
+            closed = self._is_closed.is_set()
+            why = self._error or f"the receiver {'is closed' if closed else 'failed'}"
             raise DeviceLostError(f"VICON at {host}:{port}: {why}")
 
     def _receive(self) -> None:

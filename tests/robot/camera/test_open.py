@@ -27,6 +27,13 @@ def test_a_video_of_both_eyes_gives_the_left_one(tmp_path, monkeypatch):
     expected = ZedOptions(tmp_path / "SN1.conf").build().apply(both_eyes())
     assert abs(frame.image.astype(int) - expected).mean() < 4
     camera.close()
+    # into the camera that a policy knows
+    asked = from_fov(100, 40, 80.0)
+    camera = open_camera(f"video:{tmp_path / 'both.mp4'}", asked, ZedOptions())
+    frame = camera.newest()
+    assert camera.camera is asked
+    assert frame is not None and frame.image.shape == (40, 100, 3)
+    camera.close()
     (tmp_path / "SN2.conf").write_text(calibration_text())
     with pytest.raises(InputError, match="SN1.conf, SN2.conf: name the file"):
         open_camera("zed:/dev/video99")

@@ -39,7 +39,8 @@ def test_the_left_half_of_a_live_device(tmp_path, monkeypatch):
     pytest.importorskip("cv2")
     monkeypatch.setattr(v4l, "_FIRST_S", 60.0)
     (tmp_path / "SN1.conf").write_text(calibration_text())
-    prepare = LeftEye(read_left_eye(tmp_path / "SN1.conf"))
+    eye = read_left_eye(tmp_path / "SN1.conf")
+    prepare = LeftEye(eye, eye.camera())
     halves = [f"color={c}:s=672x376:r=50[{c}]" for c in ("red", "blue")]
     source = ";".join([*halves, "[red][blue]hstack,realtime"])
     before = time.monotonic()

@@ -8,8 +8,8 @@ from helpers.zed_files import DISTORTION, both_eyes, calibration_text, pattern
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.distortion import undistort
-from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.robot.camera.zed import LeftEye, read_left_eye
+from mi_nerfattack.render.camera.intrinsics import Camera, from_fov
+from mi_nerfattack.robot.camera.zed import EyeCalibration, LeftEye, read_left_eye
 
 pytest.importorskip("cv2")
 
@@ -32,37 +32,62 @@ def test_the_file_is_read(conf):
         read_left_eye(conf, "4K")
 
 
-@pytest.mark.parametrize("size", [None, (672, 376), (366, 188)])
-@pytest.mark.parametrize("is_undistorted", [True, False])
-def test_pixels_look_where_the_camera_says(conf, size, is_undistorted):
-    prepare = LeftEye(read_left_eye(conf), size, is_undistorted)
-    camera, image = prepare.camera, prepare.apply(both_eyes())
-    assert (camera.width, camera.height) == (size or (336, 188))
-    assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.uint8
-    assert camera.is_distorted != is_undistorted
+def error_of(eye: EyeCalibration, camera: Camera, distortion=DISTORTION) -> np.ndarray:
+    """Return how far each pixel is from what lies in its direction, levels."""
+    prepare = LeftEye(eye, camera)
+    image = prepare.apply(both_eyes(distortion))
+    assert prepare.camera is camera and image.dtype == np.uint8
+    assert image.shape == (camera.height, camera.width, 3)
     columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
     x, y = np.meshgrid(
         (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
     )
-    if not is_undistorted:
+    if camera.is_distorted:
         x, y = undistort(x, y, *camera.distortion)
-    error = abs(image - pattern(x, y))[2:-2, 2:-2]
+    return abs(image - pattern(x, y))[2:-2, 2:-2]
+
+
+@pytest.mark.parametrize("size", [None, (672, 376), (366, 188)])
+@pytest.mark.parametrize("is_undistorted", [True, False])
+def test_pixels_look_where_the_eyes_camera_says(conf, size, is_undistorted):
+    eye = read_left_eye(conf)
+    camera = eye.camera(size, is_undistorted)
+    assert (camera.width, camera.height) == (size or (336, 188))
+    assert camera.is_distorted != is_undistorted
+    error = error_of(eye, camera)
     # a tenth of a pixel of half size is 1.4 levels; rounding makes up to 1.5
     assert error.mean() < 0.7 and error.max() < 2.5
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(336, 188, 172.0, 168.0, 168.0, 94.0),
+        Camera(200, 66, 100.0, 100.0, 97.0, 35.0, k1=0.05, p1=1e-3),
+        from_fov(640, 200, 60.0),  # finer than the eye
+    ],
+)
+def test_a_zed_shows_what_another_camera_would(conf, camera):
+    error = error_of(read_left_eye(conf), camera)
+    assert error.mean() < 0.8 and error.max() < 4
+
+
+def test_a_camera_that_sees_more_is_refused(conf):
+    wide = from_fov(200, 66, 110.0)
+    with pytest.raises(InputError, match="sees .* px beyond the eye's picture of"):
+        LeftEye(read_left_eye(conf), wide)
+    conf.write_text(calibration_text((-0.3, 0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(InputError, match="folds the image over itself where the"):
+        LeftEye(read_left_eye(conf), wide)
 
 
 def test_a_third_radial_term_is_only_taken_out(tmp_path):
     distortion = (*DISTORTION[:4], -0.004)
     (tmp_path / "SN1.conf").write_text(calibration_text(distortion))
     eye = read_left_eye(tmp_path / "SN1.conf")
-    prepare = LeftEye(eye)
-    camera, image = prepare.camera, prepare.apply(both_eyes(distortion))
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    error = abs(image - pattern(*np.meshgrid(x, y)))[2:-2, 2:-2]
-    assert error.max() < 2.5
+    assert error_of(eye, eye.camera(), distortion).max() < 2.5
     with pytest.raises(InputError, match="k3 is -0.004.* take the distortion out"):
-        LeftEye(eye, is_undistorted=False)
+        eye.camera(is_undistorted=False)
 
 
 @pytest.mark.parametrize(
@@ -86,10 +111,14 @@ def test_damaged_files_are_refused(conf, old, new, message):
 def test_impossible_pictures_are_refused(conf):
     eye = read_left_eye(conf)
     with pytest.raises(InputError, match="700 x 376 px; from 1 x 1 to 672 x 376"):
-        LeftEye(eye, (700, 376))
+        eye.camera((700, 376))
     conf.write_text(calibration_text((0.3, 0.0, 0.0, 0.0, 0.0)))
-    with pytest.raises(InputError, match="leaves parts of the image empty"):
-        LeftEye(read_left_eye(conf))
+    eye = read_left_eye(conf)
+    with pytest.raises(InputError, match="px beyond the eye's picture"):
+        LeftEye(eye, eye.camera())
     conf.write_text(calibration_text((-2.0, 0.0, 0.0, 0.0, 0.0)))
+    eye = read_left_eye(conf)
     with pytest.raises(InputError, match="SN12345678.conf.*folds"):
-        LeftEye(read_left_eye(conf), is_undistorted=False)
+        eye.camera(is_undistorted=False)
+    with pytest.raises(InputError, match="SN12345678.conf.*folds"):
+        LeftEye(eye, eye.camera())
