@@ -42,6 +42,8 @@ class PosedImages:
             outliers, as structure from motion leaves them; None if unknown.
         unit: what one unit of the poses is, as its source says: "metre",
             "arbitrary", "unknown" or another word.
+        masks: n masks (height, width), bool, as `stacked` puts them together: whether a
+            pixel counts; None where all do.
 
     Raises:
         InputError: the shapes contradict each other or a pose is not rigid.
@@ -55,6 +57,7 @@ class PosedImages:
     cameras: tuple[Camera, ...] = ()
     points: np.ndarray | None = None
     unit: str = "metre"
+    masks: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and poses."""
@@ -75,6 +78,9 @@ class PosedImages:
             )
         for index in range(n):
             self._check_image(index)
+        shapes = [image.shape[:2] for image in self.images]
+        if self.masks is not None and [m.shape for m in self.masks] != shapes:
+            raise InputError("masks: must have the sizes of the images, one for each")
 
     def _check_image(self, index: int) -> None:
         image, camera = self.images[index], self.camera_of(index)

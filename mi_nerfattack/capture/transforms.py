@@ -14,6 +14,7 @@ import numpy as np
 
 from mi_nerfattack.capture.colmap.model import MODEL_FOLDERS, find_model, read_colmap
 from mi_nerfattack.capture.intrinsics import intrinsics_table, read_cameras
+from mi_nerfattack.capture.masks import load_masks
 from mi_nerfattack.capture.posed_images import (
     PosedImages,
     differing,
@@ -100,7 +101,7 @@ def read_transforms(
 
     Reads intrinsics at the top level or in the frames (see
     `intrinsics.read_cameras`). Images are reduced by averaging areas in linear light;
-    they are never enlarged.
+    they are never enlarged. A frame's `mask_path` names its mask; see `masks`.
 
     Args:
         path: JSON file, or the folder of `transforms.json` (or, for Blender's
@@ -133,18 +134,31 @@ def read_transforms(
     used = {i: frames[i] for i, _ in found}
     cameras = read_cameras(source, table, used, first.shape)
     paths = [image for _, image in found]
-    images, cameras = load_images(paths, cameras, source, long_edge_px)
+    images, reduced = load_images(paths, cameras, source, long_edge_px)
+    masks = load_masks(
+        [_mask_path(source, i, frame) for i, frame in used.items()], cameras, reduced
+    )
     names = tuple(str(frame["file_path"]) for frame in used.values())
     return PosedImages(
         images,
         poses,
-        cameras[0],
+        reduced[0],
         names,
         tuple(missing),
-        differing(cameras),
+        differing(reduced),
         _read_points(source, table),
         str(table.get("units", "unknown")),
+        masks,
     )
+
+
+def _mask_path(source: Path, index: int, frame: Mapping[str, Any]) -> Path | None:
+    name = frame.get("mask_path")
+    if name is None:
+        return None
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{source}: frames[{index}].mask_path: {name!r}; needs a path")
+    return source.parent / name.replace("\\", "/")
 
 
 def _read_points(source: Path, table: Mapping[str, Any]) -> np.ndarray | None:
@@ -190,6 +204,7 @@ def write_poses(
     camera_to_world: np.ndarray,
     extra: Mapping[str, Any] | None = None,
     times_s: Sequence[float] | None = None,
+    masks: Mapping[str, str] | None = None,
 ) -> None:
     """Write a `transforms.json` for images that exist.
 
@@ -200,6 +215,7 @@ def write_poses(
         camera_to_world: (n, 4, 4), OpenCV axes.
         extra: more keys for the top level.
         times_s: of the images, seconds: `time_s`, which recorded drives have.
+        masks: paths of masks, relative to the folder, by the names of the images.
     """
     cameras = [camera] * len(names) if isinstance(camera, Camera) else list(camera)
     has_one = len(set(cameras)) == 1
@@ -215,6 +231,9 @@ def write_poses(
         }
         for name, own, matrix in zip(names, cameras, matrices, strict=True)
     ]
+    for frame in table["frames"]:
+        if masks is not None and frame["file_path"] in masks:
+            frame["mask_path"] = masks[frame["file_path"]]
     if times_s is not None:
         for frame, time_s in zip(table["frames"], times_s, strict=True):
             frame["time_s"] = time_s

@@ -101,6 +101,9 @@ class PhotographArguments:
     """Of the markers: apriltag_36h11, 4x4_50, 6x6_250, ... as OpenCV has them."""
     markers_flat: bool = False
     """All markers lie on the ground, which becomes z = 0."""
+    masks: Path | None = None
+    """PNG, black where all images show what is no part of the still scene, as a car's
+    bonnet; or, of photographs, a folder with such a NAME.jpg.png for some."""
 
     def write(
         self, source: Path, output: Path, seed: int, bars: StageBars
@@ -128,12 +131,18 @@ class PhotographArguments:
             self.metres_per_unit,
             None if self.distance is None else Distance(*self.distance),
             self._markers(),
+            self.masks,
             seed,
         )
         if not is_video:
             if option := given(self, ("frames", "baseline")):
                 raise InputError(f"{option}: not for {source}, which is no video")
             return estimate_poses(source, output, options, show)
+        if self.masks is not None and self.masks.is_dir():
+            raise InputError(
+                f"--masks: {self.masks} is a folder; give one PNG for all frames of a "
+                "video, or extract its frames first and give their folder"
+            )
         with tempfile.TemporaryDirectory() as folder:
             chosen = FrameOptions(self.frames, self.baseline)
             extract_frames(source, Path(folder), chosen, show)

@@ -96,11 +96,13 @@ def check_unfinished(path: Path, resume: bool) -> None:
 
 
 def _digest(training: Training) -> str:
-    """Hash what decides a fit: images, poses, depth, options, architecture, box."""
+    """Hash what decides a fit: images, masks, poses, depth, options, field, box."""
     digest = hashlib.sha256()
     images = training.images
     for image in images.images:
         digest.update(np.ascontiguousarray(image).data)
+    for mask in () if images.masks is None else images.masks:
+        digest.update(np.ascontiguousarray(mask).data)
     digest.update(np.ascontiguousarray(images.camera_to_world).data)
     if training.depth is not None:
         for depth in training.depth:

@@ -52,12 +52,12 @@ class RayBank:
         depth: (n, height, width), metres along the ray, NaN where unknown, of all
             images; or None.
         box: lower and upper corner, metres: only pixels whose rays meet the box are
-            drawn. None draws from all.
+            drawn. None draws from all. Nor are those drawn that masks leave out.
         corrections: of the cameras; none by default.
 
     Raises:
         InputError: depth has another shape than the images, more pixels than
-            32 bits can number, or no pixel sees the box.
+            32 bits can number, or no pixel that counts sees the box.
     """
 
     def __init__(
@@ -100,6 +100,8 @@ class RayBank:
         self._chosen = None
         if box is not None:
             self._chosen = self._seeing(*box)
+        if images.masks is not None:
+            self._chosen = self._counting(_flat(images.masks, indices))
 
     def state(self) -> list[Any]:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
@@ -178,6 +180,17 @@ class RayBank:
                 "box, give bounds around what the cameras look at"
             )
         return dr.concat(found)
+
+    def _counting(self, masks: np.ndarray) -> Any:
+        kept = np.flatnonzero(masks)
+        if self._chosen is not None:
+            kept = np.intersect1d(kept, self._chosen.numpy())
+        if not len(kept):
+            raise InputError(
+                "masks: leave no pixel of the images that sees the box; what is to be "
+                "fitted must be white in some"
+            )
+        return mi.UInt32(kept.astype(np.uint32))
 
 
 def _check_depth(images: PosedImages, depth: np.ndarray | None) -> None:

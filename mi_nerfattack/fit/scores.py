@@ -21,6 +21,7 @@ from mi_nerfattack.render.rays import Rays
 HAZY = (0.05, 0.95)  # opacities between are neither a surface nor free space
 SOLID = 0.5  # opacity from which on a field stops a ray
 MIN_EDGE_PX = 11  # of the window of SSIM
+_WINDOW = 5  # half a window of SSIM, pixels: 3.5 standard deviations of 1.5
 _WHITE = 1.0  # behind images with alpha, as is usual for Blender's synthetic scenes
 
 
@@ -148,7 +149,9 @@ def evaluate(
     depth: np.ndarray | None = None,
     keep: int = 4,
 ) -> list[ViewScore]:
-    """Score a field against images; those with alpha lie over white.
+    """Score a field against the pixels of images that count.
+
+    Those with alpha lie over white.
 
     Args:
         field: the field; its background lies behind it, or white where the images
@@ -167,7 +170,8 @@ def evaluate(
     for index in map(int, indices):
         pose, camera = images.camera_to_world[index], images.camera_of(index)
         rendering = renderer.render(camera, pose)
-        psnr, ssim = compare(rendering.image, reference(images, index))
+        mask = None if images.masks is None else images.masks[index]
+        psnr, ssim = compare(rendering.image, reference(images, index), mask)
         holes = float("nan")
         if depth is not None:
             holes = renderer.holes(rendering, camera, pose, depth[index])
@@ -184,13 +188,24 @@ def worst_views(scores: Iterable[ViewScore], count: int) -> list[ViewScore]:
     return sorted(kept, key=lambda score: score.psnr_db)[:count]
 
 
-def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Return PSNR (dB) and SSIM of two sRGB images (h, w, 3) in [0, 1]."""
+def compare(
+    image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[float, float]:
+    """Return PSNR (dB) and SSIM of two sRGB images (h, w, 3) in [0, 1].
+
+    Args:
+        image: to compare.
+        reference: with this one.
+        mask: (h, w), bool, the pixels that count; None for all. Both images are alike
+            in the others, as far as windows of SSIM reach into them.
+    """
     from skimage.metrics import structural_similarity
 
-    error = float(np.mean((image.astype(np.float64) - reference) ** 2))
+    mask = np.ones(image.shape[:2], bool) if mask is None else mask
+    reference = np.where(mask[..., None], reference, image)
+    error = float(np.mean((image.astype(np.float64) - reference)[mask] ** 2))
     psnr = float("inf") if error == 0 else -10 * float(np.log10(error))
-    ssim: Any = structural_similarity(
+    similar: Any = structural_similarity(
         image,
         reference,
         data_range=1.0,
@@ -198,5 +213,13 @@ def compare(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
         gaussian_weights=True,
         sigma=1.5,
         use_sample_covariance=False,
+        full=True,
+    )[1]
+    whole = np.s_[_WINDOW:-_WINDOW, _WINDOW:-_WINDOW]  # windows within the image
+    counted = mask[whole]
+    ssim = (
+        similar[whole][counted].mean(dtype=np.float64)
+        if counted.any()
+        else float("nan")
     )
     return psnr, float(ssim)

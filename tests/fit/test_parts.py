@@ -24,6 +24,7 @@ from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.loss import LossWeights, huber, loss_and_cotangent
 from mi_nerfattack.fit.rays import RayBank, RayBatch
+from mi_nerfattack.fit.scores import compare
 from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -222,3 +223,31 @@ def test_samples_are_counted_by_the_cells_that_rays_cross():
     grid, origin, direction = small.half_occupied()
     count = sample_count(PosedField(grid), Rays(origin, direction))
     assert count.numpy().tolist() == [4, 2, 0]
+
+
+def test_masked_pixels_are_not_drawn():
+    images, _ = sphere_views(3)
+    masks = np.zeros(images.images.shape[:3], bool)
+    masks[1, 4, 5:8] = True
+    shape, indices = masks.shape[1:], np.array([0, 1])
+    bank = RayBank(replace(images, masks=masks), indices)
+    drawn = bank.draw(mi.PCG32(4000, 1)).numpy()
+    wanted = np.ravel_multi_index((1, 4, np.arange(5, 8)), (2, *shape))
+    assert sorted(set(drawn.tolist())) == wanted.tolist()
+    with pytest.raises(InputError, match="masks: leave no pixel"):
+        RayBank(replace(images, masks=masks), np.array([0, 2]))
+
+
+def test_masked_pixels_are_not_scored():
+    rng = np.random.default_rng(3)
+    image = rng.random((24, 30, 3)).astype(np.float32)
+    other = np.clip(image + 0.1, 0, 1)
+    mask = np.ones((24, 30), bool)
+    mask[14:] = False
+    psnr, ssim = compare(image, other)
+    wrong = other.copy()
+    wrong[~mask] = 1 - image[~mask]
+    masked = compare(image, wrong, mask)
+    assert masked[0] == pytest.approx(compare(image[:14], other[:14])[0])
+    assert masked[1] > ssim - 0.02 and compare(image, wrong)[0] < psnr - 5
+    assert compare(image, np.where(mask[..., None], image, 0), mask)[0] == np.inf

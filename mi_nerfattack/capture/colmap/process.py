@@ -144,7 +144,9 @@ def _reconstruct(
             folder,
             names,
             pycolmap.CameraMode.SINGLE,
-            pycolmap.ImageReaderOptions(camera_model=task["lens"]),
+            pycolmap.ImageReaderOptions(
+                camera_model=task["lens"], mask_path=task["masks"]
+            ),
             pycolmap.FeatureExtractionOptions(
                 max_image_size=task["long_edge_px"], use_gpu=False
             ),

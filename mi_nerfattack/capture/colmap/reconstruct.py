@@ -54,6 +54,7 @@ def reconstruct(
     long_edge_px: int,
     seed: int,
     progress: StageCallback,
+    masks: Path | None = None,
 ) -> Structure:
     """Estimate poses and cameras of photographs, on the CPU.
 
@@ -69,6 +70,7 @@ def reconstruct(
         long_edge_px: features are looked for at most at this size.
         seed: of the random choices. Threads leave differences from run to run.
         progress: called with stage, done and total.
+        masks: folder of ``NAME.png``, black where no features are taken.
 
     Raises:
         InputError: fewer than 3 photographs could be placed, or the lens is impossible.
@@ -82,6 +84,7 @@ def reconstruct(
         "lens": lens,
         "long_edge_px": long_edge_px,
         "seed": seed,
+        "masks": "" if masks is None else str(masks),
     }
     stages = Stages(progress)
     code = run_task(task, stages)

@@ -16,6 +16,7 @@ from mi_nerfattack.capture.colmap.reconstruct import (
     Structure,
     reconstruct,
 )
+from mi_nerfattack.capture.masks import SUFFIX, stage_masks
 from mi_nerfattack.capture.photographs.alignment import Distance, Scale, align
 from mi_nerfattack.capture.photographs.markers import Markers
 from mi_nerfattack.capture.photographs.quality import Quality, assess, quality_table
@@ -45,6 +46,8 @@ class PoseOptions:
         distance: between two photographs.
         markers: of known size in the scene. With none of these three, the unit stays
             arbitrary.
+        masks: folder of ``NAME.png``, black where a photograph, upright, shows what
+            moves or is no part of the scene; or one such picture for all.
         seed: of the random choices.
     """
 
@@ -54,6 +57,7 @@ class PoseOptions:
     metres_per_unit: Positive | None = None
     distance: Distance | None = None
     markers: Markers | None = None
+    masks: Path | None = None
     seed: Seed = 0
 
     def __post_init__(self) -> None:
@@ -114,14 +118,16 @@ def estimate_poses(
         photographs: folder of at least 3 JPEG, PNG or WebP images; at least 3 of each
             camera, of each of its focal lengths, and of each way that it was held.
             Their EXIF data and sizes tell these apart.
-        output: folder for `transforms.json`, `images`, `points.safetensors` and
-            `capture.json`, which says what each photograph gave.
+        output: folder for `transforms.json`, `images`, `masks` if there are any,
+            `points.safetensors`, and `capture.json`, which says what each photograph
+            gave.
         options: None for the defaults.
         progress: called with stage, done and total.
 
     Raises:
-        InputError: too few photographs, an unreadable one, too few could be placed, or
-            markers are not seen or contradict each other. Nothing is written then.
+        InputError: too few photographs, an unreadable one, too few could be placed,
+            masks do not fit (see `masks.stage_masks`), or markers are not seen or
+            contradict each other. Nothing is written then.
         SetupError: pycolmap failed or crashed, or markers need OpenCV, which is not
             installed; nothing is written either.
     """
@@ -130,11 +136,13 @@ def estimate_poses(
     names = list_photographs(root)
     files.check_folder(output)
     with tempfile.TemporaryDirectory() as folder:
-        staged, work = Path(folder) / "images", Path(folder) / "work"
-        staged.mkdir()
-        work.mkdir()
+        staged, masks, work = (Path(folder) / n for n in ("images", "masks", "work"))
+        for each in (staged, masks, work):
+            each.mkdir()
         groups = stage(root, names, staged, progress)
         check_in_place(root, names, staged, Path(output) / "images")
+        if options.masks is not None:
+            stage_masks(options.masks, staged, names, masks)
         found = reconstruct(
             staged,
             list(groups.values()),
@@ -144,23 +152,32 @@ def estimate_poses(
             options.long_edge_px,
             options.seed,
             progress,
+            None if options.masks is None else masks,
         )
         told = options.markers or options.distance or options.metres_per_unit
         found, scale = align(found, staged, told, progress)
-        return _write(Path(output), staged, found, names, scale)
+        return _write(Path(output), staged, masks, found, names, scale)
 
 
 def _write(
     output: Path,
     staged: Path,
+    masks: Path,
     found: Structure,
     names: Sequence[str],
     scale: Scale,
 ) -> PoseEstimate:
     path = begin_posed(output)
+    masked = {}
     for name in found.names:
         raw = files.read_bytes(staged / name, files.MAX_IMAGE_BYTES)
         files.write_bytes(output / "images" / name, raw)
+        mask = masks / (name + SUFFIX)
+        if mask.exists():
+            files.make_folder(output / "masks")
+            raw = files.read_bytes(mask, files.MAX_IMAGE_BYTES)
+            files.write_bytes(output / "masks" / mask.name, raw)
+            masked[f"images/{name}"] = f"masks/{mask.name}"
     files.write_safetensors(
         output / "points.safetensors", {"points": found.points.astype(np.float32)}
     )
@@ -176,8 +193,9 @@ def _write(
         "left_out": list(left_out),
     }
     stored = [f"images/{name}" for name in found.names]
-    write_poses(path, stored, found.cameras, found.camera_to_world, extra)
-    eyes = found.camera_to_world[:, :3, 3]
+    poses = found.camera_to_world
+    write_poses(path, stored, found.cameras, poses, extra, masks=masked)
+    eyes = poses[:, :3, 3]
     apart = np.linalg.norm(eyes[:, None] - eyes[None], axis=2)
     a, b = np.unravel_index(int(apart.argmax()), apart.shape)
     return PoseEstimate(

@@ -28,6 +28,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 CAMERA = from_fov(240, 180, 60.0)
 COUNT = 8
+LEFT_HALF = np.zeros((180, 240), np.uint8)
+LEFT_HALF[:, 120:] = 255
 
 
 def noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -90,10 +92,14 @@ def corner(tmp_path_factory):
     (root / "photographs").mkdir()
     for i, pose in enumerate(corner_poses()):
         files.write_image(root / "photographs" / f"{i}.png", corner_photograph(pose))
+    (root / "masks").mkdir()
+    files.write_image(root / "masks" / "0.png.png", LEFT_HALF)
     flat = np.full((180, 240, 3), 90, np.uint8)
     files.write_image(root / "photographs" / "flat.png", flat)
     stages = []
-    options = PoseOptions(lens="SIMPLE_PINHOLE", metres_per_unit=2.0)
+    options = PoseOptions(
+        lens="SIMPLE_PINHOLE", metres_per_unit=2.0, masks=root / "masks"
+    )
     result = estimate_poses(
         root / "photographs", root / "out", options, lambda *call: stages.append(call)
     )
@@ -122,6 +128,14 @@ class TestCorner:
         np.testing.assert_allclose(
             posed.camera_to_world[:, :3, 3].mean(0), 0, atol=1e-9
         )
+
+    def test_a_mask_takes_features_away_and_is_written(self, corner):
+        root, result, _ = corner
+        features = result.found.features
+        assert 0 < features["0.png"] < 0.75 * features["1.png"]
+        masks = read_images(root / "out").masks
+        np.testing.assert_array_equal(masks[0], LEFT_HALF > 0)
+        assert masks[1:].all()
 
     def test_points_lie_on_the_corner(self, corner):
         posed = read_images(corner[0] / "out")
