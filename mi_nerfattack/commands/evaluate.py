@@ -16,8 +16,8 @@ from mi_nerfattack.commands.shared.evaluate_options import (
     PolicyOptions,
     parse_conditions,
     parse_scales,
-    policy_camera,
 )
+from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -44,8 +44,9 @@ class Evaluate:
 
     policy: tyro.conf.Positional[str | None] = None
     """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML
-    file with the sections [policy] and, for a camera of its own, [camera] of a
-    scenario; the bundled policy by default."""
+    file: a scenario, which is driven in its own scene unless options name another, or
+    the sections [policy] and, where these are its own, [camera] and [vehicle] of one;
+    the bundled policy by default."""
     environments: tuple[str, ...] = ("surrogate", "mitsuba", "mujoco")
     """Environments: surrogate, mitsuba, mujoco, mujoco_gl, carla (needs --server and
     --routes-file)."""
@@ -150,18 +151,22 @@ class Evaluate:
         """Check everything that can be checked before the first drive."""
         from mi_nerfattack.evaluation.identity import identify
         from mi_nerfattack.evaluation.work import EvaluateWork, check_policy
+        from mi_nerfattack.scenario.world import at_own_speed
 
         section = self.options.section(self.policy)
         under = self._environments()
-        place, seen = self.where.build(), policy_camera(self.policy)
-        if seen is not None:
-            place = replace(place, camera=seen[0], mount=seen[1])
-        routes, settings = self._routes(place.routes), self._settings(place)
+        file, is_chosen = PolicyFile.read(self.policy), self.where != PlaceOptions()
+        place = file.place(self.where.build(), is_chosen)
+        self._check_wheels(file)
+        routes, settings = self._routes(place.routes, file), self._settings(place)
+        if file.vehicle is not None:
+            motion = file.vehicle.motion()
+            routes = tuple(at_own_speed(route, motion) for route in routes)
+            settings = replace(settings, car_width_m=place.car.width)
         check_policy(section.build(), place, routes)
-        identities = identify(section, place, under, routes, settings)
-        return EvaluateWork(
-            section, place, under, routes, settings, self.drives, identities
-        )
+        chosen = section, place, under, routes, settings
+        identities = identify(*chosen, file.vehicle)
+        return EvaluateWork(*chosen, self.drives, identities, file.vehicle)
 
     def _settings(self, place: Place) -> EvaluateSettings:
         from mi_nerfattack.training.presets import EVALUATIONS
@@ -179,12 +184,25 @@ class Evaluate:
             horizon=self.horizon,
         )
 
-    def _routes(self, path: Path) -> tuple[Route, ...]:
+    def _routes(self, path: Path, file: PolicyFile) -> tuple[Route, ...]:
         from mi_nerfattack.vehicle.route.route import load_routes
 
-        if self.routes:
-            _check_different("--routes", self.routes)
-        return tuple(load_routes(path, self.routes))
+        names = self.routes
+        if names:
+            _check_different("--routes", names)
+        elif file.scenario is not None and self.where == PlaceOptions():
+            names = (file.scenario.scene.route,)
+        return tuple(load_routes(path, names))
+
+    def _check_wheels(self, file: PolicyFile) -> None:
+        from mi_nerfattack.scenario.vehicle import CustomSection
+
+        wheels = [name for name in self.environments if name.startswith("mujoco")]
+        if wheels and isinstance(file.vehicle, CustomSection):
+            raise InputError(
+                f"--environments: {wheels[0]} drives a car with wheels, whose control "
+                "is not that of a custom vehicle; leave it out"
+            )
 
     def _environments(self) -> tuple[EnvironmentUnder, ...]:
         from mi_nerfattack.deploy.registry import ENVIRONMENTS

@@ -14,6 +14,8 @@ from mi_nerfattack.deploy.sites import PlaceSite, Weather
 from mi_nerfattack.evaluation.evaluate import EvaluateSettings
 from mi_nerfattack.scenario.named_file import NamedFile
 from mi_nerfattack.scenario.policy import AbstractPolicySection
+from mi_nerfattack.scenario.section import Section
+from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.vehicle.route.route import Route
 
 FORMAT = "mi_nerfattack evaluated drive 4"
@@ -46,6 +48,7 @@ def identify(
     environments: Sequence[EnvironmentUnder],
     routes: Sequence[Route],
     settings: EvaluateSettings,
+    vehicle: AbstractVehicleSection | None = None,
 ) -> dict[tuple[str, str], dict[str, str]]:
     """Describe all that decides about the drives of each environment and route.
 
@@ -55,6 +58,7 @@ def identify(
         environments: likewise.
         routes: likewise.
         settings: the numbers of runs and objects do not count.
+        vehicle: likewise.
 
     Returns:
         by label of the environment and name of the route, for `resumable.Unit`.
@@ -64,9 +68,11 @@ def identify(
     """
     shared = {
         "format": FORMAT,
-        "policy": _digest("policy", policy_content(policy)),
+        "policy": _digest("policy", section_content(policy)),
         **{f"version.{name}": value for name, value in versions().items()},
     }
+    if vehicle is not None:
+        shared["vehicle"] = _digest("vehicle", section_content(vehicle))
     worlds = {
         under.label: PlaceSite(under.name, place, _weather(under.conditions)).describe()
         for under in environments
@@ -93,10 +99,10 @@ def _route_content(route: Route) -> list[Any]:
     return [*values, route.points.tolist()]
 
 
-def policy_content(policy: AbstractPolicySection) -> dict[str, Any]:
-    """Return what a policy's section says as JSON, files by their checksums."""
-    values = policy.model_dump(mode="json", exclude_defaults=True)
-    for (key, *_), value in policy.leaves():
+def section_content(section: Section) -> dict[str, Any]:
+    """Return what a policy's or vehicle's section says as JSON, files by checksums."""
+    values = section.model_dump(mode="json", exclude_defaults=True)
+    for (key, *_), value in section.leaves():
         if isinstance(value, NamedFile):
             values.pop(str(key))
             values[f"{key}_sha256"] = value.content()["sha256"]

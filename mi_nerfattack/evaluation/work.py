@@ -29,7 +29,7 @@ from mi_nerfattack.evaluation.evaluate import (
 )
 from mi_nerfattack.evaluation.identity import (
     EnvironmentUnder,
-    policy_content,
+    section_content,
     short_digest,
 )
 from mi_nerfattack.fields.grid import GridField
@@ -41,6 +41,7 @@ from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import from_fov
 from mi_nerfattack.rollout.drive import NO_OBJECT, Drive, departure_limits
 from mi_nerfattack.scenario.policy import AbstractPolicySection
+from mi_nerfattack.scenario.vehicle import AbstractVehicleSection
 from mi_nerfattack.system.workers import (
     AbstractWork,
     AbstractWorkers,
@@ -84,6 +85,8 @@ class EvaluateWork(AbstractWork):
         settings: see there.
         folder: of the drives.
         identities: of the drives of each environment and route, see `identify`.
+        vehicle: that drives in the place's surrogate and path-traced scene, where it is
+            no kinematic model of the place's car.
     """
 
     policy: AbstractPolicySection
@@ -93,6 +96,7 @@ class EvaluateWork(AbstractWork):
     settings: EvaluateSettings
     folder: Path
     identities: Mapping[tuple[str, str], Mapping[str, str]]
+    vehicle: AbstractVehicleSection | None = None
 
     @property
     def cases(self) -> tuple[str, ...]:
@@ -110,6 +114,12 @@ class EvaluateWork(AbstractWork):
             for case in sort
             for run in range(self.settings.runs)
         ]
+
+    def build_place(self) -> Place:
+        """Return the place with the vehicle's motion, which no process can send."""
+        if self.vehicle is None:
+            return self.place
+        return replace(self.place, motion=self.vehicle.motion())
 
     def open(self) -> Opened:
         """Load policy, objects and their surroundings."""
@@ -168,7 +178,8 @@ class EvaluateWork(AbstractWork):
             where.append(f"CARLA's {place.server.partition('/')[2] or 'loaded town'}")
         return {
             "policy": _relative(self.policy.source),
-            "policy_section": policy_content(self.policy),
+            "policy_section": section_content(self.policy),
+            "vehicle_section": self.vehicle and section_content(self.vehicle),
             "place": where,
             "routes": [route.name for route in self.routes],
             "environments_under": {
@@ -198,7 +209,7 @@ class Opened:
 
     def __init__(self, work: EvaluateWork) -> None:
         self._work = work
-        self._policy = work.policy.build()
+        self._policy, self._place = work.policy.build(), work.build_place()
         self._objects, self._surroundings = load_objects(work)
         self._key: tuple[str, bool] | None = None
         self._environment: AbstractEnvironment | None = None
@@ -231,7 +242,7 @@ class Opened:
         blind, under = job.case == EXPERT, job.environment
         if self._environment is None or self._key != (under.label, blind):
             self.close()
-            place, conditions = self._work.place, under.conditions
+            place, conditions = self._place, under.conditions
             if blind:
                 place = replace(place, camera=_EXPERT_CAMERA)
                 conditions = replace(conditions, spp=1)
@@ -297,7 +308,7 @@ def run_evaluation(
         arguments = (work.routes, objects, surroundings, work.settings)
         check_places(work.place.period, *arguments)
     for under in dict.fromkeys(jobs[index].environment for index in left):
-        make_environment(under.name, work.place, under.conditions).close()
+        make_environment(under.name, work.build_place(), under.conditions).close()
     files.make_folder(work.folder)
 
     def count(units: int) -> None:

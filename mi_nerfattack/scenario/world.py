@@ -218,14 +218,19 @@ def driven_route(scenario: Scenario, motion: Motion) -> Route:
         InputError: the file is missing or wrong, or the drive begins beyond its end.
     """
     route = Route.from_file(scenario.scene.routes.file, scenario.scene.route)
-    speed = getattr(motion.dynamics, "speed", route.speed_ms)
-    route = replace(route, speed_ms=speed)
+    route = at_own_speed(route, motion)
     if scenario.drive.start_m >= route.length:
         raise InputError(
             f"drive.start_m: {scenario.drive.start_m:g} m; route {route.name!r} is "
             f"{route.length:.1f} m long, start before its end"
         )
     return route
+
+
+def at_own_speed(route: Route, motion: Motion) -> Route:
+    """Return a route with the vehicle's speed, where that is its own."""
+    speed = getattr(motion.dynamics, "speed", route.speed_ms)
+    return replace(route, speed_ms=speed)
 
 
 def judged_frames(scenario: Scenario) -> int:

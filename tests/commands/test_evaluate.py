@@ -7,8 +7,10 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.roadside import Grey, PaintedEnvironment, small_grid
+from helpers.scenario_text import HEAD, write_named_files
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.evaluate import Evaluate
@@ -373,3 +375,94 @@ def test_a_toml_file_can_bring_the_policy_s_camera(place, capsys):
     capsys.readouterr()
     assert cli.main([*place, "--horizon", "2"]) == 2
     assert re.search(r"mine.toml: camera.width: .*\(is .*\)", capsys.readouterr().err)
+
+
+TURNING = """
+[policy]
+kind = "callable"
+file = "turn.py:drive"
+trust_code = true
+[camera]
+width = 8
+height = 4
+[vehicle]
+model = "ackermann"
+speed_ms = 4.0
+wheelbase_m = 2.0
+width_m = 1.5
+dt_s = 0.2
+"""
+
+
+def test_a_toml_file_brings_the_vehicle_whose_control_its_policy_gives(
+    place, monkeypatch, capsys
+):
+    """Radians of steering turn by speed / wheelbase * tan, no heading rate does."""
+    monkeypatch.setattr(evaluate_work, "make_environment", make_environment)
+    Path("mine.toml").write_text(TURNING)
+    Path("turn.py").write_text("def drive(image, goal, step):\n    return [0.2]\n")
+    place = with_policy("mine.toml", place)
+    assert cli.main([*place, "--horizon", "3", "--runs", "1", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)["mitsuba"]["straight"]["no_object"]
+    assert figures["departure_limit_m"] == pytest.approx((3.5 - 1.5) / 2)
+    path = next(Path("runs").rglob("no_object/run_0000.safetensors"))
+    states = files.read_safetensors(path)[0]["states"][:, :3]
+    turned = np.diff(states[:, 2])
+    np.testing.assert_allclose(turned, 0.2 * 4 / 2 * np.tan(0.2), rtol=1e-4)
+    driven = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1)
+    np.testing.assert_allclose(driven, 0.2 * 4, rtol=1e-3)
+    Path("mine.toml").write_text(TURNING.replace("2.0", "3.0"))
+    monkeypatch.setattr(evaluate_work, "make_environment", None)  # other drives
+    with pytest.raises(TypeError):
+        cli.main([*place, "--horizon", "3", "--runs", "1"])
+
+
+def test_a_scenario_is_driven_in_its_own_scene(place, monkeypatch, capsys):
+    painted, seen = evaluate_work.make_environment, []
+
+    def make(name, where, conditions=None):
+        seen.append(where)
+        return painted(name, where, conditions)
+
+    monkeypatch.setattr(evaluate_work, "make_environment", make)
+    write_named_files(Path())
+    Path("deployment.xml").write_text(SCENE)
+    files.write_json("routes.json", {**ROUTES, "lane": ROUTES["straight"]})
+    policy = 'kind = "callable"\nfile = "still.py:drive"\ntrust_code = true'
+    vehicle = '[vehicle]\nmodel = "ackermann"\n'
+    text = HEAD.replace('file = "policy.safetensors"', policy) + vehicle
+    Path("mine.toml").write_text(text)
+    command = with_policy("mine.toml", place)
+    own = [word for word in command if word not in ("--scene", "--routes-file")]
+    own = [word for word in own if word not in ("scene.xml", "routes.json")]
+    short = ["--horizon", "2", "--objects", "0", "--json"]
+    assert cli.main([*own, *short]) == 0
+    assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["lane"]
+    assert seen[0].scene.name == "deployment.xml"
+    assert seen[0].field.name == "scene.safetensors"
+    assert [path.name for path in seen[0].objects] == ["object.safetensors"]
+    assert seen[0].car.control_unit == "rad" and seen[0].motion is not None
+    seen.clear()
+    assert cli.main([*command, *short]) == 0
+    assert list(json.loads(capsys.readouterr().out)["mitsuba"]) == ["straight", "lane"]
+    assert seen[0].scene.name == "scene.xml" and seen[0].car.control_unit == "rad"
+
+
+def test_vehicles_that_do_not_fit_are_one_message(place, capsys):
+    PilotNet(1, 0.6, "rad/s").save("net.safetensors")
+    vehicle = '[vehicle]\nmodel = "ackermann"\n'
+    Path("net.toml").write_text(f'[policy]\nfile = "net.safetensors"\n{vehicle}')
+    assert cli.main(with_policy("net.toml", place)) == 2
+    assert "gives rad/s, the car of the place takes rad" in capsys.readouterr().err
+    Path("net.toml").write_text(
+        f'[policy]\nfile = "net.safetensors"\n{vehicle}lag = 1\n'
+    )
+    assert cli.main(with_policy("net.toml", place)) == 2
+    assert "net.toml: vehicle.lag: unknown key" in capsys.readouterr().err
+    custom = 'model = "custom"\nfunction = "a.py:car"\ncontrol_limit = 1.0\n'
+    Path("net.toml").write_text(
+        f'[policy]\nfile = "net.safetensors"\n[vehicle]\n{custom}'
+    )
+    place = [*with_policy("net.toml", place), "--environments", "mujoco"]
+    assert cli.main(place) == 2
+    assert "mujoco drives a car with wheels" in capsys.readouterr().err

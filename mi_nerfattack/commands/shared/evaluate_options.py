@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING
 
+from mi_nerfattack.commands.shared.policy_file import is_toml, read_toml
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.deploy.place import Place
     from mi_nerfattack.evaluation.identity import EnvironmentUnder
-    from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
     from mi_nerfattack.scenario.policy import AbstractPolicySection
 
 #: The policy that is evaluated where none is given.
@@ -116,14 +116,14 @@ class PolicyOptions:
         from mi_nerfattack.scenario.policy import PolicySection
         from mi_nerfattack.scenario.section import read_section
 
-        if _is_toml(policy):
+        if is_toml(policy):
             if self != PolicyOptions():
                 raise InputError(
                     f"{policy}: says itself how the policy is called; leave out "
                     "--kind, --trust-code, --weights-file, --goal, --goals, "
                     "--control-scale, --column"
                 )
-            values = _read_toml(policy).get("policy")
+            values = read_toml(policy).get("policy")
             if not isinstance(values, dict):
                 raise InputError(f"{policy}: has no section [policy]")
             name, folder = f"{policy}: policy", Path(policy).parent
@@ -188,31 +188,3 @@ def parse_scales(
             f"or of each of the {objects} --object files"
         )
     return pairs
-
-
-def policy_camera(policy: str | None) -> tuple[Camera, CameraMount] | None:
-    """Return the camera that a policy's TOML file describes, where it describes one.
-
-    Args:
-        policy: as given to `PolicyOptions.section`.
-
-    Raises:
-        InputError: the section [camera] is not usable.
-    """
-    from mi_nerfattack.scenario.scenario import CameraSection
-    from mi_nerfattack.scenario.section import read_section
-
-    if not _is_toml(policy) or (values := _read_toml(policy).get("camera")) is None:
-        return None
-    name, folder = f"{policy}: camera", Path(policy).parent
-    return read_section(name, CameraSection, values, folder).build()
-
-
-def _is_toml(policy: str | None) -> TypeGuard[str]:
-    return policy is not None and policy.lower().endswith(".toml")
-
-
-def _read_toml(policy: str) -> dict[str, Any]:
-    from mi_nerfattack.io import files
-
-    return files.read_toml(Path(policy))

@@ -11,7 +11,7 @@ import numpy as np
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.sites import AbstractSite
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.evaluation.identity import policy_content, short_digest
+from mi_nerfattack.evaluation.identity import section_content, short_digest
 from mi_nerfattack.experiment.run_folder import object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import load_grid
@@ -156,7 +156,7 @@ def attacked_policy(attacks: Sequence[FoundAttack]) -> Path:
     first = attacks[0]
     for found in attacks:
         policy = found.scenario.policy
-        about = policy_content(policy)
+        about = section_content(policy)
         if not isinstance(policy, PilotNetSection) or set(about) - _PLAIN:
             raise InputError(
                 f"{found.folder}: attacked {policy.source}; only PilotNet of "
@@ -164,7 +164,7 @@ def attacked_policy(attacks: Sequence[FoundAttack]) -> Path:
                 "retrained; train another one yourself, on frames that "
                 "experiment.retrain.among collects"
             )
-        if about != policy_content(first.scenario.policy):
+        if about != section_content(first.scenario.policy):
             raise InputError(
                 f"{found.folder}: attacked {policy.source}, {first.folder} "
                 f"{first.scenario.policy.source}, of other content; retrain one policy "
