@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions, policy_camera
+from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
+from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -103,7 +104,9 @@ class DriveCommand:
     """Samples per pixel of the simulated camera: 4."""
     check: bool = False
     """Say what would be refused, and drive nothing."""
-    options: tyro.conf.OmitArgPrefixes[PolicyOptions] = PolicyOptions()
+    options: Annotated[
+        PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
+    ] = PolicyOptions()
     """How the policy is called."""
 
     def run(self) -> int:
@@ -148,7 +151,7 @@ class DriveCommand:
         if name == EXPERT or name.startswith(REMOTE):
             return None, Seeing()
         policy = self.options.section(name).build()
-        return policy, Seeing(*(policy_camera(name) or (None, None)))
+        return policy, Seeing(*(PolicyFile.read(name).camera or (None, None)))
 
 
 def _say(text: str) -> None:

@@ -87,10 +87,8 @@ def _motor(folder: Path) -> list[tuple[Path, Read]]:
 
 
 def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
-    from mi_nerfattack.commands.shared.evaluate_options import (
-        PolicyOptions,
-        policy_camera,
-    )
+    from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
+    from mi_nerfattack.commands.shared.policy_file import PolicyFile
 
     path = folder / "policy.toml"
     path.write_text(
@@ -100,7 +98,7 @@ def _policy_toml(folder: Path) -> list[tuple[Path, Read]]:
     )
 
     def read(path: Path) -> None:
-        policy_camera(str(path))
+        PolicyFile.read(str(path))
         PolicyOptions().section(str(path)).build()
 
     return [(path, read)]
