@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import tomlkit
@@ -48,7 +48,6 @@ from mi_nerfattack.vehicle.route.route import Route
 #: Returns the name of a file without its folder, and the SHA-256 of its content.
 Content = Callable[[NamedFile], dict[str, str]]
 STEERED = ("ackermann", "ackermann_rate", "bicycle")
-_LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _MAX_CHARACTERS = 1 << 16
 _LAYER = re.compile(r"scene\d*|background|cost|input")  # of frames, beside objects'
 
@@ -117,11 +116,12 @@ class CameraSection(Section):
     height_m: Positive = 1.4
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
+    later: ClassVar = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
     def build(self) -> tuple[Camera, CameraMount]:
         """Make intrinsics and mount."""
         camera = from_fov(self.width, self.height, self.fov_x_deg)
-        lens = {key: getattr(self, key) for key in _LENS} | {"fy": self.fy or self.fx}
+        lens = {k: getattr(self, k) for k in self.later} | {"fy": self.fy or self.fx}
         camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
         return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
 
@@ -284,7 +284,7 @@ class Scenario(Section):
 
     def _check_named(self, xml: NamedFile) -> None:
         """Refuse what the Mitsuba scene of the surrogate says itself."""
-        lens = ("width", "height", "fov_x_deg", *_LENS)
+        lens = ("width", "height", "fov_x_deg", *CameraSection.later)
         groups = [("camera", self.camera, lens), ("attack", self.attack, ("jitter",))]
         own = ("field", "position_m", "yaw_deg", "scale", "step_m")
         groups += [(f"objects.{i}", item, own) for i, item in enumerate(self.objects)]

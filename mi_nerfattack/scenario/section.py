@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, NoReturn, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -49,6 +49,10 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
+    #: Keys that came when there were scenarios already. At their defaults they do not
+    #: count, so that what was made before them is still known by its digest.
+    later: ClassVar[tuple[str, ...]] = ()
+
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         """Return the keys of the table and their defaults; of kinds, the first's."""
@@ -63,7 +67,7 @@ class Section(BaseModel):
         """Yield the location of each value that counts, and the value."""
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
-            if field.exclude:
+            if field.exclude or (name in self.later and value == field.default):
                 continue
             if isinstance(value, Section):
                 location = () if field.validation_alias else (name,)
