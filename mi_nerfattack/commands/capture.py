@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,7 +16,7 @@ from mi_nerfattack.errors import InputError
 _SHOWN = 10  # photographs to take again; capture.json lists all
 
 if TYPE_CHECKING:
-    from mi_nerfattack.capture.photographs.estimate import PoseEstimate
+    from mi_nerfattack.capture.photographs.estimate import PoseEstimate, PoseOptions
     from mi_nerfattack.capture.photographs.markers import Markers
     from mi_nerfattack.commands.shared.progress import StageBars
 
@@ -91,7 +91,8 @@ class PhotographArguments:
     """How far the picture moves between two frames of a video, in shares of its longer
     edge."""
     metres_per_unit: float | None = None
-    """Multiply all lengths by this. This and the next two tell the scale; give one."""
+    """Multiply all lengths by this. This, the next two and --camera-poses tell the
+    scale; give one."""
     distance: tuple[str, str, float] | None = None
     """Two photographs, and the metres between the places where they were taken."""
     marker_m: float | None = None
@@ -101,6 +102,9 @@ class PhotographArguments:
     """Of the markers: apriltag_36h11, 4x4_50, 6x6_250, ... as OpenCV has them."""
     markers_flat: bool = False
     """All markers lie on the ground, which becomes z = 0."""
+    camera_poses: Path | None = None
+    """Pose file of a body on the camera, by motion capture, whose world is taken over:
+    with the photographs' names, or a video's times from its start."""
     masks: Path | None = None
     """PNG, black where all images show what is no part of the still scene, as a car's
     bonnet; or, of photographs, a folder with such a NAME.jpg.png for some."""
@@ -131,12 +135,13 @@ class PhotographArguments:
             self.metres_per_unit,
             None if self.distance is None else Distance(*self.distance),
             self._markers(),
-            self.masks,
-            seed,
+            masks=self.masks,
+            seed=seed,
         )
         if not is_video:
             if option := given(self, ("frames", "baseline")):
                 raise InputError(f"{option}: not for {source}, which is no video")
+            options = self._tracked(options)
             return estimate_poses(source, output, options, show)
         if self.masks is not None and self.masks.is_dir():
             raise InputError(
@@ -145,8 +150,20 @@ class PhotographArguments:
             )
         with tempfile.TemporaryDirectory() as folder:
             chosen = FrameOptions(self.frames, self.baseline)
-            extract_frames(source, Path(folder), chosen, show)
+            self._tracked(options, {})  # what is wrong with it, before a film is read
+            times = extract_frames(source, Path(folder), chosen, show)
+            options = self._tracked(options, times)
             return estimate_poses(folder, output, options, show)
+
+    def _tracked(
+        self, options: PoseOptions, times: dict[str, float] | None = None
+    ) -> PoseOptions:
+        """Add the tracker's poses, if there are any."""
+        from mi_nerfattack.capture.photographs.tracked import read_tracked
+
+        if self.camera_poses is None:
+            return options
+        return replace(options, tracked=read_tracked(self.camera_poses, times))
 
     def _markers(self) -> Markers | None:
         from mi_nerfattack.capture.photographs.markers import Markers
@@ -187,6 +204,12 @@ class PhotographArguments:
             print(
                 f"Scale by {len(scale.markers)} markers, whose edges differ by "
                 f"{100 * scale.spread:.2f} % (standard deviation)."
+            )
+        if (fit := scale.tracked) is not None:
+            print(
+                f"Scale and world by motion capture of {fit.photographs} photographs, "
+                f"which differ by {1e3 * fit.residual_m:.1f} mm and "
+                f"{fit.residual_deg:.2f} degrees (root mean square)."
             )
         unit = "m" if scale.metres_per_unit is not None else "units"
         apart = f"{result.distance:.4g} {unit}"

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from mi_nerfattack.capture.colmap.follow import StageCallback
 from mi_nerfattack.capture.colmap.reconstruct import Structure
 from mi_nerfattack.capture.photographs.markers import Markers, find_markers
+from mi_nerfattack.capture.photographs.tracked import HandEye, Tracked, fit_tracked
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Positive, checked
 
@@ -36,23 +37,26 @@ class Scale:
         metres_per_unit: of the unit before; None where nothing told it.
         spread: relative standard deviation between markers; None without.
         markers: number of photographs that show each marker, by id.
+        tracked: what motion capture gave; None without.
     """
 
     metres_per_unit: float | None = None
     spread: float | None = None
     markers: Mapping[int, int] = field(default_factory=dict)
+    tracked: HandEye | None = None
 
 
 def align(
     found: Structure,
     folder: Path,
-    told: float | Distance | Markers | None,
+    told: float | Distance | Markers | Tracked | None,
     progress: StageCallback = lambda stage, done, total: None,
 ) -> tuple[Structure, Scale]:
     """Scale lengths to metres, turn z up and move the origin.
 
     z points up, against the mean of the images' downward directions, and the origin is
-    the mean of the cameras; where markers lie flat, z = 0 is their plane.
+    the mean of the cameras; where markers lie flat, z = 0 is their plane. Motion
+    capture gives axes and origin of its own.
 
     Args:
         found: with poses in any frame and unit.
@@ -62,7 +66,8 @@ def align(
 
     Raises:
         InputError: the cameras have no common up, markers are not seen or contradict
-            each other, or a photograph with a known place was not placed.
+            each other, motion capture cannot be used (see `fit_tracked`), or a
+            photograph with a known place was not placed.
         SetupError: markers need OpenCV, which is not installed.
     """
     if isinstance(told, Markers):
@@ -72,6 +77,12 @@ def align(
         if told.flat:
             return _on_ground(found, metres, *seen.ground()), scale
         return upright(found, metres), scale
+    if isinstance(told, Tracked):
+        fit = fit_tracked(found, told)
+        moved = _transformed(
+            found, fit.scale, np.array(fit.rotation), np.array(fit.translation)
+        )
+        return moved, Scale(fit.scale, tracked=fit)
     metres = _between(found, told) if isinstance(told, Distance) else told
     return upright(found, metres or 1.0), Scale(metres)
 
@@ -126,8 +137,14 @@ def _moved(
     found: Structure, scale: float, up: np.ndarray, origin: np.ndarray
 ) -> Structure:
     turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()  # the smallest
+    return _transformed(found, scale, turn, -scale * turn @ origin)
+
+
+def _transformed(
+    found: Structure, scale: float, turn: np.ndarray, shift: np.ndarray
+) -> Structure:
     result = found.camera_to_world.copy()
     result[:, :3, :3] = turn @ result[:, :3, :3]
-    result[:, :3, 3] = scale * (result[:, :3, 3] - origin) @ turn.T
-    points = scale * (found.points - origin) @ turn.T
+    result[:, :3, 3] = scale * result[:, :3, 3] @ turn.T + shift
+    points = scale * found.points @ turn.T + shift
     return replace(found, camera_to_world=result, points=points)

@@ -25,6 +25,7 @@ from mi_nerfattack.capture.photographs.staging import (
     list_photographs,
     stage,
 )
+from mi_nerfattack.capture.photographs.tracked import Tracked
 from mi_nerfattack.capture.transforms import begin_posed, write_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
@@ -44,8 +45,9 @@ class PoseOptions:
         long_edge_px: look for features at most at this size.
         metres_per_unit: of the arbitrary unit of an earlier run.
         distance: between two photographs.
-        markers: of known size in the scene. With none of these three, the unit stays
-            arbitrary.
+        markers: of known size in the scene.
+        tracked: poses of a body on the camera, whose world is taken over. With none of
+            these four, the unit stays arbitrary.
         masks: folder of ``NAME.png``, black where a photograph, upright, shows what
             moves or is no part of the scene; or one such picture for all.
         seed: of the random choices.
@@ -57,6 +59,7 @@ class PoseOptions:
     metres_per_unit: Positive | None = None
     distance: Distance | None = None
     markers: Markers | None = None
+    tracked: Tracked | None = None
     masks: Path | None = None
     seed: Seed = 0
 
@@ -64,7 +67,7 @@ class PoseOptions:
         """Check that at most one thing tells the scale."""
         told = [
             name
-            for name in ("metres_per_unit", "distance", "markers")
+            for name in ("metres_per_unit", "distance", "markers", "tracked")
             if getattr(self, name) is not None
         ]
         if len(told) > 1:
@@ -154,7 +157,8 @@ def estimate_poses(
             progress,
             None if options.masks is None else masks,
         )
-        told = options.markers or options.distance or options.metres_per_unit
+        told = options.markers or options.tracked
+        told = told or options.distance or options.metres_per_unit
         found, scale = align(found, staged, told, progress)
         return _write(Path(output), staged, masks, found, names, scale)
 

@@ -189,7 +189,7 @@ def extract_frames(
     folder: Path,
     options: FrameOptions | None = None,
     progress: StageCallback = lambda stage, done, total: None,
-) -> list[str]:
+) -> dict[str, float]:
     """Write chosen frames of a video as JPEG images, upright.
 
     Args:
@@ -199,7 +199,8 @@ def extract_frames(
         progress: called with stage, done and total.
 
     Returns:
-        names of the files, in the order of the video.
+        times of the frames, seconds from the video's start, by the names of the files,
+        in the order of the video; NaN where the video has none.
 
     Raises:
         InputError: the video cannot be read, is too short, or its camera stands still.
@@ -214,12 +215,13 @@ def extract_frames(
             f"that {len(chosen)} differ by the baseline; walk around the place while "
             "filming, or choose a smaller one (--baseline)"
         )
-    names = []
+    times: dict[str, float] = {}
     for frame in _pick(path, raw, chosen):
-        names.append(f"frame_{chosen[len(names)]:06d}.jpg")
-        files.write_image(folder / names[-1], _upright(frame))
-        progress("frames", len(names), len(chosen))
-    return names
+        name = f"frame_{chosen[len(times)]:06d}.jpg"
+        times[name] = float("nan") if frame.time is None else frame.time
+        files.write_image(folder / name, _upright(frame))
+        progress("frames", len(times), len(chosen))
+    return times
 
 
 def _pick(path: Path, raw: bytes, chosen: Sequence[int]) -> Iterator[Any]:

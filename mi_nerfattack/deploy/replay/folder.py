@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_nerfattack.capture.pose_files import PoseTable, read_poses
 from mi_nerfattack.capture.transforms import FILE_NAMES
-from mi_nerfattack.deploy.replay.poses import PoseTable, read_poses
 from mi_nerfattack.deploy.replay.recording import (
     AbstractRecording,
     Track,
@@ -26,7 +26,7 @@ class FolderRecording(AbstractRecording):
     """A folder with images and one of `transforms.json`, `poses.csv`, `poses.toml`.
 
     Args:
-        folder: as `capture` writes it, or with a pose file (see `replay_poses`) whose
+        folder: as `capture` writes it, or with a pose file (see `pose_files`) whose
             rows name the images.
         camera: intrinsics, for pose files without.
         mount: of the camera, for poses of the vehicle.

@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.capture.pose_files import pose_matrix
 from mi_nerfattack.deploy.replay.folder import required_camera
-from mi_nerfattack.deploy.replay.poses import pose_matrix
 from mi_nerfattack.deploy.replay.recording import (
     AbstractRecording,
     Track,

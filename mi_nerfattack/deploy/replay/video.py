@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.capture.pose_files import SUFFIXES, PoseTable, read_poses
 from mi_nerfattack.deploy.replay.folder import required_camera
-from mi_nerfattack.deploy.replay.poses import SUFFIXES, PoseTable, read_poses
 from mi_nerfattack.deploy.replay.recording import (
     AbstractRecording,
     Track,

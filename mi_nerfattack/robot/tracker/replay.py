@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_nerfattack.capture.pose_files import read_poses
 from mi_nerfattack.deploy.replay.mcap import read_vehicle_poses
-from mi_nerfattack.deploy.replay.poses import read_poses
 from mi_nerfattack.deploy.replay.recording import Track
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix

@@ -137,14 +137,16 @@ def test_sharp_frames_are_written_in_order(tmp_path):
     write_pan(tmp_path / "pan.mp4", 3 * np.arange(80), blurred)
     (tmp_path / "frames").mkdir()
     seen = []
-    names = extract_frames(
+    times = extract_frames(
         tmp_path / "pan.mp4",
         tmp_path / "frames",
         progress=lambda *call: seen.append(call),
     )
+    names = list(times)
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names
     indices = [int(name[6:12]) for name in names]
     assert len(names) >= 10 and all(index % 2 == 0 for index in indices)
+    np.testing.assert_allclose(list(times.values()), np.array(indices) / 30, atol=1e-3)
     shown = files.read_image(tmp_path / "frames" / names[0])
     assert shown.shape == (HEIGHT, WIDTH, 3)
     assert ("motion", 80, 80) in seen and seen[-1] == ("frames", *[len(names)] * 2)

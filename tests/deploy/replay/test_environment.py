@@ -26,8 +26,8 @@ from helpers.recorded_drives import (
 )
 from helpers.small_fields import homogeneous
 
+from mi_nerfattack.capture.pose_files import pose_matrix
 from mi_nerfattack.deploy.replay.environment import ReplayEnvironment, open_recording
-from mi_nerfattack.deploy.replay.poses import pose_matrix
 from mi_nerfattack.deploy.replay.recording import nearest_pose
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
