@@ -2,6 +2,8 @@
 
 Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once, when it is imported. Its own search takes
 the first system LLVM, however old, and never looks into a Python environment.
+``mi_nerfattack_llvm.py`` runs this file by itself where others import Dr.Jit first:
+nothing of this package is imported here before it is needed.
 """
 
 from __future__ import annotations
@@ -14,8 +16,6 @@ import sys
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
-
-from mi_nerfattack.errors import SetupError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 PACKAGE = "karellen-llvm-core"
@@ -49,7 +49,12 @@ def setup() -> Library:
     if library.path is None or VARIABLE in os.environ or "drjit" in sys.modules:
         return library
     if library.origin == "package":
-        _preload_runtime(library.path)
+        try:
+            _preload_runtime(library.path)
+        except FileNotFoundError as err:
+            from mi_nerfattack.errors import SetupError
+
+            raise SetupError(str(err)) from err
     os.environ[VARIABLE] = str(library.path)
     return library
 
@@ -82,6 +87,8 @@ def check_version() -> tuple[int, int, int]:
         SetupError: there is none, or it is older than 17. With 15 and 16 the first
             kernel that takes a minimum aborts the process, which cannot be caught.
     """
+    from mi_nerfattack.errors import SetupError
+
     found = version()
     chosen = os.environ.get(VARIABLE)
     if found is None:
@@ -168,7 +175,7 @@ def _preload_runtime(library: Path) -> None:
             continue
         present = [path for path in paths if path.is_file()]
         if not present:
-            raise SetupError(
+            raise FileNotFoundError(
                 f"{PACKAGE}: {stem} is missing beside {library}; reinstall it with "
                 f"'pip install --force-reinstall {PACKAGE}'"
             )

@@ -13,6 +13,7 @@ from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import SetupError
 
+ROOT = Path(__file__).parents[2]
 needs_package = pytest.mark.skipif(
     not any(
         name.lower() == llvm.PACKAGE
@@ -37,6 +38,7 @@ def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
         text=True,
         timeout=120,
         check=False,
+        cwd=ROOT,
     )
 
 
@@ -64,6 +66,45 @@ def test_package_library_is_the_real_file(without_variable):
     assert library.origin == "package"
     assert library.path is not None
     assert library.path.is_file() and not library.path.is_symlink()
+
+
+ORDER = """
+import {first}
+import os, sys
+assert "drjit" not in sys.modules and "mi_nerfattack" not in sys.modules
+import mitsuba as mi
+assert "mi_nerfattack" not in sys.modules, "nobody asked for it"
+mi.set_variant("llvm_ad_rgb")
+import mi_nerfattack
+from mi_nerfattack.backend import llvm
+print(llvm.check_version()[0], os.environ[llvm.VARIABLE])
+"""
+
+
+@needs_package
+def test_mitsuba_may_be_imported_first():
+    done = run_python(ORDER.format(first="mi_nerfattack_llvm"))
+    assert done.returncode == 0, done.stderr
+    major, path = done.stdout.split()
+    assert int(major) >= 19 and str(llvm._find_in_package()) == path
+
+
+@needs_package
+def test_python_does_so_by_itself_where_the_package_is_installed():
+    files = importlib.metadata.files("mi-nerfattack") or []
+    if not any(file.name == "mi_nerfattack_llvm.pth" for file in files):
+        pytest.skip("installed before there was the file; install it again")
+    done = run_python(ORDER.format(first="os"))
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_user_s_variable_stays_when_mitsuba_is_imported_first():
+    done = run_python(
+        "import mi_nerfattack_llvm, drjit, os, sys\n"
+        f"print(os.environ['{llvm.VARIABLE}'], 'mi_nerfattack' in sys.modules)",
+        **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
+    )
+    assert done.stdout.split() == ["/nowhere/libLLVM.so", "False"], done.stderr
 
 
 def test_users_variable_is_kept(monkeypatch):
