@@ -4,18 +4,15 @@
 It looks for nothing until ``drjit`` is imported.
 """
 
-from __future__ import annotations
-
 import os
-import sys
-from typing import Any
+import sys  # and nothing that takes longer
 
 
 class BeforeDrJit:
     """Finder of modules that finds none; it sets LLVM's path when Dr.Jit is wanted."""
 
     @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> None:
+    def find_spec(cls, name: str, path: object = None, target: object = None) -> None:
         """Prepare the import of `drjit`, once."""
         del path, target
         if name != "drjit":

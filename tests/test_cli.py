@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from helpers.variants import later
@@ -129,6 +130,11 @@ def test_other_threads_may_call(run):
     thread.start()
     thread.join()
     assert codes == [0]
+
+
+def test_the_citation_is_of_this_version():
+    text = (Path(__file__).parents[1] / "CITATION.cff").read_text("utf-8")
+    assert f"version: {mi_nerfattack.__version__}" in text.splitlines()
 
 
 @pytest.mark.parametrize(
