@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -45,8 +46,10 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_title = "mi-nerfattack"
 html_copy_source = False
-html_static_path = ["style"]
-html_css_files = ["tables.css"]
+# A font for equations: few systems bring one.
+_font = find_spec("ziamath").submodule_search_locations[0] + "/fonts"
+html_static_path = ["style", f"{_font}/STIXTwoMath-Regular.ttf"]
+html_css_files = ["site.css"]
 # Fences without a language are commands with their output, or equations.
 highlight_language = "none"
 
