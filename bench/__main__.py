@@ -9,6 +9,7 @@ from bench.commands.experts import BenchExperts
 from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
+from bench.commands.poses import BenchPoses
 from bench.commands.scaling import BenchScaling
 from bench.commands.speed import (
     BenchAttack,
@@ -38,6 +39,7 @@ COMMANDS = {
     "table2": BenchTable2,
     "methods": BenchMethods,
     "overlay": BenchOverlay,
+    "poses": BenchPoses,
 }
 
 
