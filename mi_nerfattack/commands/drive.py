@@ -54,6 +54,9 @@ class DriveCommand:
     """Seconds after which the drive ends: 600."""
     camera: str | None = None
     """zed:/dev/video0 (default), v4l:/dev/videoN or video:FILE."""
+    camera_file: str | None = None
+    """TOML file with the [camera] of training, for expert and remote policies; that of
+    the policy's own file by default."""
     zed_calibration: str | None = None
     """SN<serial>.conf of the ZED; the only one of its settings by default."""
     zed_mode: str | None = None
@@ -148,10 +151,10 @@ class DriveCommand:
             raise InputError(
                 f"--policy: none; give a file, {EXPERT}, or {REMOTE}HOST:PORT"
             )
-        if name == EXPERT or name.startswith(REMOTE):
-            return None, Seeing()
-        policy = self.options.section(name).build()
-        return policy, Seeing(*(PolicyFile.read(name).camera or (None, None)))
+        is_here = name != EXPERT and not name.startswith(REMOTE)
+        policy = self.options.section(name).build() if is_here else None
+        file = config.camera_file or (name if is_here else None)
+        return policy, Seeing(*(PolicyFile.read(file).camera or (None, None)))
 
 
 def _say(text: str) -> None:
@@ -211,10 +214,6 @@ def _drive(
     with closing(log), closing(watchdog):
         if not config.simulated:
             watchdog.start()  # the time of the simulated room stands still meanwhile
-            _say(
-                "Lift the wheels off the floor: they turn for a second. Hold the "
-                "enable button to arm."
-            )
             _wait_for_press(rig)
         devices.motor.arm()
         _say("Armed.")
@@ -229,9 +228,12 @@ def _drive(
 
 def _wait_for_press(rig: Rig) -> None:
     """Wait until the enable was seen released, and then held."""
-    was_released = False
-    while not (was_released and rig.devices.enable.is_held()):
-        was_released = was_released or not rig.devices.enable.is_held()
+    enable = rig.devices.enable
+    was_released = not enable.is_held()
+    _say("Lift the wheels off the floor: they turn for a second.")
+    _say("Release the enable button, if it is held, and hold it to arm.")
+    while not (was_released and enable.is_held()):
+        was_released = was_released or not enable.is_held()
         rig.sleep(0.02)
 
 

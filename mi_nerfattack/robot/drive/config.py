@@ -21,7 +21,15 @@ from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
 from mi_nerfattack.scenario.section import Section, read_section
 from mi_nerfattack.vehicle.route.route import Route
 
-_PATHS = ("routes_file", "calibration", "fence", "log", "zed_calibration", "key")
+_PATHS = (
+    "routes_file",
+    "calibration",
+    "fence",
+    "log",
+    "zed_calibration",
+    "key",
+    "camera_file",
+)
 _OUT_OF_RANGE = 2.0  # of the largest steering: a control beyond it is nonsense
 PERIOD_S = 0.1
 
@@ -38,6 +46,7 @@ class DriveConfig(Section):
         speed_ms: to be kept; the route's by default.
         duration_s: after which the drive ends.
         camera: see `robot.camera.open`.
+        camera_file: TOML file with the section [camera] of training.
         zed_calibration, zed_mode: of a ZED.
         tracker: see `robot.tracker.open`.
         rotation: VICON's convention.
@@ -63,6 +72,7 @@ class DriveConfig(Section):
     speed_ms: Positive | None = None
     duration_s: Seconds = 600.0
     camera: str = "zed:/dev/video0"
+    camera_file: str | None = None
     zed_calibration: str | None = None
     zed_mode: str = "VGA"
     tracker: str = "vicon:0.0.0.0"
