@@ -201,7 +201,7 @@ def _drive(
     from mi_nerfattack.backend.interrupts import held_interrupts
     from mi_nerfattack.robot.drive.log import DriveLog
     from mi_nerfattack.robot.drive.loop import DriveLoop
-    from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
+    from mi_nerfattack.robot.drive.safety.watchdog import SleepCheck, Watchdog
 
     path = config.log_path(datetime.now())
     about = {key: str(value) for key, value in config.model_dump().items()}
@@ -218,8 +218,14 @@ def _drive(
         devices.motor.arm()
         _say("Armed.")
         loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
+        awake = SleepCheck(settings.judge.ages.loop_s)
         with held_interrupts() as interrupted, _hangups():
-            stop = loop.run(interrupted)
+
+            def check() -> None:
+                interrupted()
+                awake.check()
+
+            stop = loop.run(check)
         _say(f"{stop}: braked, wheels centred")
     written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
     _say(f"{path}: {written}")

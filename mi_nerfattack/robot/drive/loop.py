@@ -130,8 +130,8 @@ class DriveLoop:
         """Wait for the enable, drive, and stop.
 
         Args:
-            interrupted: called in every round; raises KeyboardInterrupt where the
-                drive is to end.
+            interrupted: called in every round; raises KeyboardInterrupt or `Stop`
+                where the drive is to end.
 
         Returns:
             Why it ended.

@@ -19,8 +19,9 @@ from mi_nerfattack.io import files
 from mi_nerfattack.robot.devices import Command, DeviceLostError, Frame
 from mi_nerfattack.robot.drive.pilot import LocalPilot, expert_control
 from mi_nerfattack.robot.drive.safety.fence import Fence, car_corners
+from mi_nerfattack.robot.drive.safety.judge import Stop
 from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
-from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
+from mi_nerfattack.robot.drive.safety.watchdog import SleepCheck, Watchdog
 from mi_nerfattack.vehicle.expert.choose import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -116,6 +117,14 @@ def test_the_watchdog_brakes_from_its_own_thread_as_long_as_the_loop_hangs():
     assert threading.get_ident() not in calls
     watchdog.close()
     watchdog.close()
+
+
+def test_a_computer_that_slept_does_not_drive_on(monkeypatch):
+    check, told = SleepCheck(0.2), time.clock_gettime
+    check.check()
+    monkeypatch.setattr(time, "clock_gettime", lambda kind: told(kind) + 3.0)
+    with pytest.raises(Stop, match="loop late: the computer slept for 3.0 s"):
+        check.check()
 
 
 def frame(index: int) -> Frame:

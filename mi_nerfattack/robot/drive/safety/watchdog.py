@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 
 from mi_nerfattack.robot.devices import Clock
+from mi_nerfattack.robot.drive.safety.judge import Cause, Stop
 
 
 class Watchdog:
@@ -58,3 +60,30 @@ class Watchdog:
     def _watch(self) -> None:
         while not self._closed.wait(self.limit_s / 10):
             self.check()
+
+
+class SleepCheck:
+    """Ends the drive if the computer was suspended, as by its lid.
+
+    Nothing else tells: the monotonic clock, and with it all ages, stand still
+    meanwhile.
+
+    Args:
+        limit_s: of the sleep since it was made.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s, self._before_s = limit_s, _asleep_s()
+
+    def check(self) -> None:
+        """Raise `Stop` if it slept."""
+        slept = _asleep_s() - self._before_s
+        if slept > self._limit_s:
+            raise Stop(Cause.LOOP_LATE, f"the computer slept for {slept:.1f} s")
+
+
+def _asleep_s() -> float:
+    """Return how long the computer has slept since it started, where Linux tells."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        return 0.0
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
