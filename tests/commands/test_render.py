@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
 from helpers import film_scenes as scenes
 from PIL import Image
 
 from mi_nerfattack import cli
-from mi_nerfattack.commands.render import Render
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import exr, files
 from mi_nerfattack.io.video import even_size, write_video
@@ -329,13 +327,3 @@ def test_nan_is_refused_by_channel(run, monkeypatch):
         code, _, err = run(f"scene.xml -o a.{suffix}")
         assert code == 2 and f"a.{suffix}: channel 'G' holds NaN" in err
     assert not list(Path().glob("a.*"))
-
-
-def test_documented_commands_parse():
-    text = (Path(__file__).parents[2] / "docs/render.md").read_text("utf-8")
-    joined = text.replace("\\\n", " ")
-    lines = re.findall(r"^mi-nerfattack render (.*)$", joined, re.MULTILINE)
-    assert len(lines) >= 5
-    for line in lines:
-        command = tyro.cli(Render, args=shlex.split(line, comments=True))
-        assert command.output.name

@@ -1,0 +1,111 @@
+"""Commands of the documentation: all parse, and blocks that take no input run.
+
+A block is what stands between fences without a language and calls us. Each is run as it
+stands, or is listed with the reason why not.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+
+from mi_nerfattack.commands import COMMANDS
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUN = {
+    "mi-nerfattack render scenes/intersection/field.xml -o hydrant.exr",
+    "mi-nerfattack render scenes/intersection/field.xml -o hydrant.png \\",
+    "mi-nerfattack render scenes/intersection/field.xml -o by_depth.exr \\",
+    "mi-nerfattack render scenes/intersection/field.xml -o lit.png --sensor 1 "
+    "--set relit=true",
+}
+# Why the other blocks of a page are not run.
+INPUT = "takes files of the user's, or a folder that minutes to hours of work made"
+LONG = "takes more than a minute"
+USAGE = "shows what may be given, in words that stand for it"
+SKIPPED = {
+    "README.md": LONG,
+    "attack.md": USAGE,
+    "bench.md": LONG,
+    "commands.md": "writes into the home folder",
+    "environments.md": "takes CARLA's server, or more than a minute",
+    "fields.md": INPUT,
+    "index.md": LONG,
+    "install.md": "installs",
+    "place.md": INPUT,
+    "policy.md": LONG,
+    "refine.md": INPUT,
+    "render.md": INPUT,
+    "report.md": INPUT,
+    "retrain.md": INPUT,
+    "robot.md": "takes a run, a camera, a tracker or a car",
+    "sweep.md": USAGE,
+    "training.md": LONG,
+    "transfer.md": INPUT,
+}
+
+
+def blocks(page: Path) -> list[str]:
+    """Find the blocks of a page that call us."""
+    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
+    return [
+        text
+        for language, text in fenced
+        if not language and re.search(ours, text, re.M)
+    ]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Split the calls of a block into words, without what the shell does to them."""
+    joined = re.sub(r"\\\n\s*", " ", text)
+    lines = re.findall(r"^(?:\S*/)?mi-nerfattack ([a-z-]+ ?.*)$", joined, re.M)
+    lines = [re.sub(r" [>|&].*|[\[\]]|\.\.\.", "", line) for line in lines]
+    return [shlex.split(line, comments=True) for line in lines if line[0] != "-"]
+
+
+CALLS = [
+    pytest.param(words, id=f"{page.stem}-{k}-{words[0]}")
+    for page in PAGES
+    for k, words in enumerate(w for b in blocks(page) for w in commands(b))
+]
+
+
+@pytest.mark.parametrize("words", CALLS)
+def test_commands_parse(words):
+    name, *args = words
+    flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+    assert tyro.cli(COMMANDS[name], args=args, config=flags) is not None
+
+
+def test_every_block_is_run_or_has_a_reason():
+    found = {page.name: blocks(page) for page in PAGES}
+    first = {text.split("\n")[0] for texts in found.values() for text in texts}
+    assert first >= RUN
+    rest = {
+        name
+        for name, texts in found.items()
+        if any(text.split("\n")[0] not in RUN for text in texts)
+    }
+    assert rest == set(SKIPPED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", sorted(RUN))
+def test_blocks_run(first, tmp_path):
+    (text,) = [b for page in PAGES for b in blocks(page) if b.split("\n")[0] == first]
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    tools = f'PATH="{Path(sys.executable).parent}:$PATH"; export PATH\n'
+    done = subprocess.run(
+        ["bash", "-euc", tools + text], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    outputs = [words[words.index("-o") + 1] for words in commands(text)]
+    assert outputs and all((tmp_path / name).stat().st_size for name in outputs)
