@@ -107,8 +107,8 @@ def _remedy() -> str:
     library = locate()
     if library.origin in ("package", "system"):
         return (
-            "import mi_nerfattack before drjit and mitsuba, or start Python with "
-            f"{VARIABLE}={library.path}"
+            "import mi_nerfattack before drjit and mitsuba, install it again, which "
+            f"lets them come first, or start Python with {VARIABLE}={library.path}"
         )
     if _find_in_package() is not None:
         return f"unset {VARIABLE} to use the library of {PACKAGE}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 MAX_DISTANCE = 255
 
@@ -39,6 +38,8 @@ class Occupancy:
         elif not seen.any():
             distance = np.full(self.shape, MAX_DISTANCE, np.uint8)
         else:
+            from scipy import ndimage  # slow to import
+
             distance = ndimage.distance_transform_cdt(~seen, metric="chessboard")
             distance = np.minimum(distance, MAX_DISTANCE).astype(np.uint8)
         grids = [distance] if self.octants is None else [distance, self.octants]

@@ -77,6 +77,7 @@ assert "mi_nerfattack" not in sys.modules, "nobody asked for it"
 mi.set_variant("llvm_ad_rgb")
 import mi_nerfattack
 from mi_nerfattack.backend import llvm
+assert not {{"torch", "scipy", "matplotlib"}} & set(sys.modules), "who only renders"
 print(llvm.check_version()[0], os.environ[llvm.VARIABLE])
 """
 

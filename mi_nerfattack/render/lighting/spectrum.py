@@ -20,7 +20,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.optimize import nnls
 
 SAMPLES = 95  # of Mitsuba's own tables: every 5 nm from 360 to 830 nm
 _EXACTLY = 1e4  # weight of what must hold, relative to the smoothness
@@ -34,6 +33,8 @@ def basis() -> np.ndarray:
     whose colours under D65 are the primaries of Rec. 709, up to the distance of
     Mitsuba's own D65 from white (2e-4). Not inside a recorded loop or call.
     """
+    from scipy.optimize import nnls  # slow to import
+
     observer = _observer()
     each = np.eye(SAMPLES)
     rows = np.vstack(
