@@ -10,6 +10,7 @@ from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
 from bench.commands.poses import BenchPoses
+from bench.commands.quality import BenchQuality
 from bench.commands.scaling import BenchScaling
 from bench.commands.speed import (
     BenchAttack,
@@ -36,6 +37,7 @@ COMMANDS = {
     "collect": BenchCollect,
     "dagger": BenchDagger,
     "study": BenchStudy,
+    "quality": BenchQuality,
     "table2": BenchTable2,
     "methods": BenchMethods,
     "overlay": BenchOverlay,
