@@ -2,7 +2,7 @@
 
 Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once, when it is imported. Its own search takes
 the first system LLVM, however old, and never looks into a Python environment.
-``mi_nerfattack_llvm.py`` runs this file by itself where others import Dr.Jit first:
+``system/before_drjit.py`` runs this file by itself where others import Dr.Jit first:
 nothing of this package is imported here before it is needed.
 """
 

@@ -12,6 +12,7 @@ import pytest
 from mi_nerfattack import variant
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import SetupError
+from mi_nerfattack.system import before_drjit
 
 ROOT = Path(__file__).parents[2]
 needs_package = pytest.mark.skipif(
@@ -68,6 +69,8 @@ def test_package_library_is_the_real_file(without_variable):
     assert library.path.is_file() and not library.path.is_symlink()
 
 
+#: What a .pth file imports, without one.
+HOOK = f"runpy; runpy.run_path({before_drjit.__file__!r})"
 ORDER = """
 import {first}
 import os, sys
@@ -84,7 +87,7 @@ print(llvm.check_version()[0], os.environ[llvm.VARIABLE])
 
 @needs_package
 def test_mitsuba_may_be_imported_first():
-    done = run_python(ORDER.format(first="mi_nerfattack_llvm"))
+    done = run_python(ORDER.format(first=HOOK))
     assert done.returncode == 0, done.stderr
     major, path = done.stdout.split()
     assert int(major) >= 19 and str(llvm._find_in_package()) == path
@@ -101,7 +104,7 @@ def test_python_does_so_by_itself_where_the_package_is_installed():
 
 def test_the_user_s_variable_stays_when_mitsuba_is_imported_first():
     done = run_python(
-        "import mi_nerfattack_llvm, drjit, os, sys\n"
+        f"import {HOOK}\nimport drjit, os, sys\n"
         f"print(os.environ['{llvm.VARIABLE}'], 'mi_nerfattack' in sys.modules)",
         **{llvm.VARIABLE: "/nowhere/libLLVM.so"},
     )

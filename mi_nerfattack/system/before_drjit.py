@@ -1,6 +1,7 @@
 """Let Dr.Jit load this environment's LLVM, whoever imports it first.
 
-``mi_nerfattack_llvm.pth``, installed beside this module, imports it when Python starts.
+Installed beside the package as ``mi_nerfattack_llvm``, which a .pth file imports when
+Python starts; see packaging.py.
 It looks for nothing until ``drjit`` is imported.
 """
 
