@@ -142,11 +142,14 @@ class Overlay:
         scale = float(stretch[stretch.shape[0] // 2, stretch.shape[1] // 2])
         picture, number, way = self._footprint(face, matrix, rows, scale)
         steps = rows[:, :2] @ way
-        first, last = _within([(a, float(row[:2] @ way)) for a, row in lines])
+        probes: list[Any] = [np.float32(0)]
+        if number > 1:
+            first, last = _within([(a, float(row[:2] @ way)) for a, row in lines])
+            shares = (np.arange(number, dtype=np.float32) + 0.5) / number
+            probes = [first + share * (last - first) for share in shares]
         height, width = picture.shape[:2]
         cover /= number
-        for probe in (np.arange(number, dtype=np.float32) + 0.5) / number:
-            at = first + probe * (last - first)
+        for at in probes:
             z = 1 / np.where(ahead, w + at * steps[2], 1)
             sampled = self._cv2.remap(
                 picture,
@@ -205,7 +208,7 @@ class Overlay:
         size = np.array(pictures[0].shape[1::-1])
         steps = depth * (rows[:2, :2] - 0.5 * rows[2, :2]) * size[:, None] * pixel
         _, (longer, shorter), ways = np.linalg.svd(steps)
-        number = int(np.clip(np.ceil(longer / max(shorter, 1.0)), 1, _PROBES))
+        number = int(np.clip(np.rint(longer / max(shorter, 1.0)), 1, _PROBES))
         level = round(np.log2(max(shorter, longer / number, 1.0)))
         way = (ways[0] / np.abs(ways[0]).max() * pixel).astype(np.float32)
         return pictures[min(level, len(pictures) - 1)], number, way
