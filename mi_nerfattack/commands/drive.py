@@ -201,7 +201,7 @@ def _drive(
     from mi_nerfattack.backend.interrupts import held_interrupts
     from mi_nerfattack.robot.drive.log import DriveLog
     from mi_nerfattack.robot.drive.loop import DriveLoop
-    from mi_nerfattack.robot.drive.safety.watchdog import SleepCheck, Watchdog
+    from mi_nerfattack.robot.drive.safety.watchdog import Watchdog
 
     path = config.log_path(datetime.now())
     about = {key: str(value) for key, value in config.model_dump().items()}
@@ -210,7 +210,7 @@ def _drive(
     camera = devices.camera.camera
     log = DriveLog(path, camera, clock, time.time_ns(), about)
     _say(f"Log        {path}")
-    watchdog = Watchdog(devices.motor.brake, settings.judge.ages.loop_s, clock)
+    watchdog = Watchdog(devices.motor.brake, settings.judge.ages.loop_s, rig.rounds)
     with closing(log), closing(watchdog):
         if not config.simulated:
             watchdog.start()  # the time of the simulated room stands still meanwhile
@@ -218,14 +218,8 @@ def _drive(
         devices.motor.arm()
         _say("Armed.")
         loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
-        awake = SleepCheck(settings.judge.ages.loop_s)
         with held_interrupts() as interrupted, _hangups():
-
-            def check() -> None:
-                interrupted()
-                awake.check()
-
-            stop = loop.run(check)
+            stop = loop.run(interrupted)
         _say(f"{stop}: braked, wheels centred")
     written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
     _say(f"{path}: {written}")

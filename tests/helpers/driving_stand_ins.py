@@ -43,6 +43,7 @@ class Bench:
         offset_m: of the car, along x.
         fault: of the motor controller.
         stall_s: that the camera's next answer takes.
+        asleep_s: that the computer was suspended, which no device tells.
     """
 
     def __init__(self, start_s: float = 1000.0) -> None:
@@ -51,10 +52,13 @@ class Bench:
         self.broken: dict[str, Exception | KeyboardInterrupt] = {}
         self.silent: dict[str, float] = {}
         self.held, self.control, self.offset_m = False, 0.2, 0.0
-        self.fault, self.stall_s = 0, 0.0
+        self.fault, self.stall_s, self.asleep_s = 0, 0.0, 0.0
         self.plans: list[tuple[float, Callable[[], None]]] = []
         self.motor = StandInMotor(self)
-        self.watchdog = Watchdog(self.motor.brake, JUDGE.ages.loop_s, self.clock)
+        limit_s = JUDGE.ages.loop_s
+        self.watchdog = Watchdog(
+            self.motor.brake, limit_s, lambda: self.now + self.asleep_s
+        )
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
         """Plan something after so many seconds."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -121,7 +121,6 @@ class DriveLoop:
         self._pose_index: int | None = None
         self._values_s: float | None = None
         self._decided: int | None = None  # frame of the decision sent last
-        self._round_s = clock()  # when it came round last
         self._longest_s = 0.0  # round since the last command
         self._allowed, self._sent_s = Command(0.0, 0.0), clock()
         self._first_command_s: float | None = None
@@ -130,8 +129,8 @@ class DriveLoop:
         """Wait for the enable, drive, and stop.
 
         Args:
-            interrupted: called in every round; raises KeyboardInterrupt or `Stop`
-                where the drive is to end.
+            interrupted: called in every round; raises KeyboardInterrupt where the
+                drive is to end.
 
         Returns:
             Why it ended.
@@ -155,12 +154,17 @@ class DriveLoop:
     def _wait(self, interrupted: Callable[[], None]) -> None:
         """Wait until the enable is pressed anew, and nothing speaks against driving."""
         was_released, told = False, None
+        came_s = self._watchdog.clock()
         while True:
             interrupted()
             seen = self._look()
+            now_s = self._watchdog.clock()
+            was_late = now_s - came_s > self._watchdog.limit_s
+            came_s = now_s
             self._notes.clear()  # how the car stands and waits is not written
             problem = self._problem(seen)
-            was_released = not seen.is_held or (was_released and problem is None)
+            stays = problem is None and not was_late
+            was_released = not seen.is_held or (was_released and stays)
             if problem is not None:
                 state = f"not ready: {problem}"
             elif not was_released:
@@ -180,37 +184,24 @@ class DriveLoop:
     def _drive(self, interrupted: Callable[[], None]) -> Stop:
         """Drive until the person who drives ends it, or raise what does."""
         end_s = self._clock() + self._settings.duration_s
-        self._round_s = self._sent_s = self._clock()
+        self._sent_s = self._clock()
         while True:
             self._come_round()
             interrupted()
             seen = self._look()
-            self._check_round()
-            if not seen.is_held:
-                return Stop(Cause.RELEASED, "or its device is gone")
-            if seen.now_s >= end_s:
-                return Stop(Cause.TIME_UP, f"{self._settings.duration_s:g} s")
-            self._check(seen, self._first_command_s)
             decision = seen.decision
             is_new = decision is not None and decision.frame_index != self._decided
-            self._settings.judge.decision(decision, seen.now_s, is_new)
+            self._judge(seen, is_new)
+            if seen.now_s >= end_s:
+                return Stop(Cause.TIME_UP, f"{self._settings.duration_s:g} s")
             if decision is not None and is_new:
                 self._send(decision, seen)
             self._pause()
 
     def _come_round(self) -> None:
         """Stop if this round comes too late, else tell the watchdog."""
-        late = self._check_round()
-        self._longest_s = max(self._longest_s, late)
-        self._round_s += late
+        self._longest_s = max(self._longest_s, self._watchdog.round_s())
         self._watchdog.beat()
-
-    def _check_round(self) -> float:
-        """Return how long ago the loop came round; stop if that is too long."""
-        late, limit = self._clock() - self._round_s, self._settings.judge.ages.loop_s
-        if late > limit or self._watchdog.has_fired:
-            raise Stop(Cause.LOOP_LATE, f"took {late:.3f} s, at most {limit:g} s")
-        return late
 
     def _look(self) -> _Seen:
         """Ask all devices, and give the pilot a frame that is due."""
@@ -252,6 +243,19 @@ class DriveLoop:
         judge.pose(seen.pose, seen.now_s, self._devices.tracker, settings.body)
         judge.motor(seen.values, first_command_s)
 
+    def _judge(self, seen: _Seen, is_new: bool) -> None:
+        """Judge all that must be right to drive on.
+
+        Args:
+            seen: in this round.
+            is_new: whether its decision is about to be sent.
+        """
+        self._watchdog.round_s()
+        if not seen.is_held:
+            raise Stop(Cause.RELEASED, "or its device is gone")
+        self._check(seen, self._first_command_s)
+        self._settings.judge.decision(seen.decision, seen.now_s, is_new)
+
     def _problem(self, seen: _Seen) -> Stop | None:
         """Return what speaks against driving."""
         try:
@@ -266,11 +270,14 @@ class DriveLoop:
         settings = self._settings
         angle = settings.steering.angle(decision.control, settings.speed_ms)
         wanted = Command(settings.speed_ms, angle)
-        now = self._clock()
-        elapsed = min(now - self._sent_s, 2 * settings.judge.period_s)
+        elapsed = min(self._clock() - self._sent_s, 2 * settings.judge.period_s)
         allowed = settings.limits.apply(wanted, self._allowed, elapsed)
         send = partial(self._devices.motor.send, allowed)
-        sent = asked(Cause.MOTOR_LOST, send)
+        held = self._devices.enable.is_held()
+        now = self._clock()
+        # again, for this thread may have stood still since it asked
+        self._judge(replace(seen, is_held=held, now_s=now), True)
+        sent = asked(Cause.MOTOR_LOST, partial(self._watchdog.permit, send))
         # not what was sent: a motor that brakes below its slowest turns never starts
         self._allowed = allowed
         self._sent_s, self._decided = self._clock(), decision.frame_index

@@ -31,6 +31,7 @@ from mi_nerfattack.robot.drive.room import (
     simulated_camera,
 )
 from mi_nerfattack.robot.drive.safety.enable import JoystickEnable
+from mi_nerfattack.robot.drive.safety.watchdog import suspended_clock
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
 from mi_nerfattack.robot.tracker.open import open_tracker
@@ -51,11 +52,13 @@ class Rig:
         devices: all of them.
         clock: of them.
         sleep: lets time pass.
+        rounds: clock of the loop's rounds, for the watchdog.
     """
 
     devices: Devices
     clock: Clock
     sleep: Callable[[float], None]
+    rounds: Clock
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,8 @@ def _real(
         scales = read_calibration(config.calibration)
     motor = VescMotor(config.port, scales, confirm)
     stack.callback(motor.close)
-    return Rig(Devices(seen, tracker, motor, pilot, enable), clock, time.sleep)
+    devices = Devices(seen, tracker, motor, pilot, enable)
+    return Rig(devices, clock, time.sleep, suspended_clock)
 
 
 def _pilot(
@@ -192,4 +196,5 @@ def _simulated(
     pilot = SimulatedPilot(_control(config, route, policy, tracker), room)
     motor, enable = SimulatedMotor(room), SimulatedEnable(room)
     stack.callback(motor.close)
-    return Rig(Devices(camera, tracker, motor, pilot, enable), room.clock, room.sleep)
+    devices = Devices(camera, tracker, motor, pilot, enable)
+    return Rig(devices, room.clock, room.sleep, room.clock)

@@ -92,6 +92,63 @@ def test_each_fault_at_random_moments(tmp_path, cause, rng):
         check_fault(cause, float(moment), tmp_path / f"{index}.mcap")
 
 
+class StallingSteering:
+    """Works out one angle for so long, in which the button is let go."""
+
+    def __init__(self, bench: Bench, stall_s: float, releases: bool) -> None:
+        self._bench, self._stall_s, self._releases = bench, stall_s, releases
+
+    def angle(self, control: float, speed_ms: float) -> float:
+        bench = self._bench
+        if bench.now > bench.start_s + 1.5:
+            bench.held = bench.held and not self._releases
+            bench.sleep(self._stall_s)
+        return control
+
+
+@pytest.mark.parametrize(
+    ("stall_s", "releases", "cause"),
+    [
+        (0.6, True, Cause.LOOP_LATE),
+        (0.1, False, Cause.FRAME_OLD),
+        (0.01, True, Cause.RELEASED),
+    ],
+)
+def test_nothing_is_sent_that_was_right_before_a_stall(
+    tmp_path, stall_s, releases, cause
+):
+    bench = Bench()
+    bench.at(HOLD_S, partial(setattr, bench, "held", True))
+    steering = StallingSteering(bench, stall_s, releases)
+    stop, _ = bench.drive(tmp_path / "drive.mcap", duration_s=9.0, steering=steering)
+    assert stop.cause is cause
+    sent = [time for time, what, _ in bench.events if what == "send"]
+    assert len(sent) > 5 and sent[-1] <= bench.start_s + 1.5
+
+
+@pytest.mark.parametrize("moment_s", np.arange(1.5, 1.6, 0.01))
+def test_nothing_is_sent_after_the_computer_was_suspended(tmp_path, moment_s):
+    bench = Bench()
+    bench.at(HOLD_S, partial(setattr, bench, "held", True))
+    bench.at(moment_s, partial(setattr, bench, "asleep_s", 3600.0))
+    stop, _ = bench.drive(tmp_path / "drive.mcap", duration_s=9.0)
+    assert stop.cause is Cause.LOOP_LATE and "took 3600" in stop.message
+    sent = [time for time, what, _ in bench.events if what == "send"]
+    assert len(sent) > 5 and sent[-1] <= bench.start_s + moment_s
+
+
+def test_an_enable_held_while_the_computer_was_suspended_is_pressed_again(tmp_path):
+    bench = Bench()
+    bench.silent["camera"] = bench.start_s  # not ready yet
+    bench.at(1.0, partial(setattr, bench, "asleep_s", 3600.0))
+    bench.at(1.0, bench.silent.clear)
+    bench.at(1.0, partial(setattr, bench, "held", True))
+    bench.at(2.0, partial(setattr, bench, "held", False))
+    bench.at(3.0, partial(setattr, bench, "held", True))
+    bench.drive(tmp_path / "drive.mcap", duration_s=1.0)
+    assert bench.events[0][0] >= bench.start_s + 3.0
+
+
 def test_a_full_disk_ends_the_drive(tmp_path, monkeypatch):
     monkeypatch.setattr(drive_log, "_CHUNK_BYTES", 4096)
     bench = Bench()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
 
 import numpy as np
 import pytest
 from helpers.driving_stand_ins import RADIUS, SPEED, Bench, StandInTracker
+from helpers.waiting import wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +23,7 @@ from mi_nerfattack.robot.drive.pilot import LocalPilot, expert_control
 from mi_nerfattack.robot.drive.safety.fence import Fence, car_corners
 from mi_nerfattack.robot.drive.safety.judge import Stop
 from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
-from mi_nerfattack.robot.drive.safety.watchdog import SleepCheck, Watchdog
+from mi_nerfattack.robot.drive.safety.watchdog import Watchdog, suspended_clock
 from mi_nerfattack.vehicle.expert.choose import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -119,23 +121,55 @@ def test_the_watchdog_brakes_from_its_own_thread_as_long_as_the_loop_hangs():
     watchdog.close()
 
 
-def test_a_computer_that_slept_does_not_drive_on(monkeypatch):
-    check, told = SleepCheck(0.2), time.clock_gettime
-    check.check()
-    monkeypatch.setattr(time, "clock_gettime", lambda kind: told(kind) + 3.0)
-    with pytest.raises(Stop, match="loop late: the computer slept for 3.0 s"):
-        check.check()
+def test_no_command_goes_out_once_the_watchdog_has_braked():
+    now, sent = [0.0], []
+    watchdog = Watchdog(lambda: sent.append("brake"), 0.2, lambda: now[0])
+    watchdog.beat()
+    now[0] = 0.2
+    watchdog.permit(lambda: sent.append("send"))
+    now[0] = 0.21
+    for _ in range(2):
+        with pytest.raises(Stop, match=r"loop late: took 0\.210 s, at most 0\.2 s"):
+            watchdog.permit(lambda: sent.append("late"))
+        watchdog.check()
+    watchdog.beat()  # too late
+    with pytest.raises(Stop, match="loop late"):
+        watchdog.permit(lambda: sent.append("late"))
+    assert sent == ["send", "brake", "brake"]
+
+
+def test_the_watchdog_brakes_behind_a_command_but_for_one_that_hangs():
+    now, sent = [0.0], []
+    braked = threading.Event()
+
+    def brake() -> None:
+        sent.append("brake")
+        braked.set()
+
+    def hang() -> None:
+        now[0] = 0.21
+        assert braked.wait(10)  # though this one does not come back
+        sent.append("hung")
+
+    watchdog = Watchdog(brake, 0.2, lambda: now[0])
+    watchdog.beat()
+    watchdog.start()
+    watchdog.permit(hang)
+    count = len(sent)
+    wait_for(lambda: len(sent) > count)  # and braked after it
+    watchdog.close()
+    assert sent[0] == "brake" and sent[-1] == "brake" and "hung" in sent
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell")
+def test_the_clock_of_rounds_goes_on_while_the_computer_is_suspended(monkeypatch):
+    clocks = {time.CLOCK_BOOTTIME: 7200.0, time.CLOCK_MONOTONIC: 3600.0}
+    monkeypatch.setattr(time, "clock_gettime", clocks.__getitem__)
+    assert suspended_clock() == 7200.0
 
 
 def frame(index: int) -> Frame:
     return Frame(np.full((2, 2, 3), index, np.uint8), 0.1 * index, index)
-
-
-def wait_for(condition) -> None:
-    end = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.001)
 
 
 def test_a_pilot_decides_of_the_newest_frame():

@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import TypeVar
 
 from mi_nerfattack.robot.devices import Clock
 from mi_nerfattack.robot.drive.safety.judge import Cause, Stop
+
+_T = TypeVar("_T")
+
+
+def suspended_clock() -> float:
+    """Return seconds that go on while the computer is suspended, as by a closed lid.
+
+    `time.monotonic` stands still meanwhile on Linux: what was measured before would
+    look as if it had just come.
+    """
+    if sys.platform == "linux":
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
 
 
 class Watchdog:
     """A thread of its own that brakes while the loop is late, again and again.
 
-    It never sends a command and never keeps a motor alive: all it can do is brake. A
-    car whose whole computer stands still is braked by its motor controller.
+    It never sends a command and never keeps a motor alive: all it can do is brake, and
+    refuse commands from then on. A car whose whole computer stands still is braked by
+    its motor controller.
 
     Args:
         brake: `AbstractMotor.brake`, from another thread than the loop's.
         limit_s: between two rounds of the loop.
-        clock: of the loop.
+        clock: of the rounds; see `suspended_clock`.
 
     Attributes:
+        limit_s, clock: as given.
         has_fired: whether the loop was late; it stays so.
     """
 
     def __init__(self, brake: Callable[[], None], limit_s: float, clock: Clock) -> None:
         self.limit_s, self.has_fired = limit_s, False
-        self._brake, self._clock = brake, clock
+        self._brake, self.clock = brake, clock
         self._last_s: float | None = None
-        self._closed = threading.Event()
+        self._sending, self._closed = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def start(self) -> None:
@@ -39,17 +56,43 @@ class Watchdog:
 
     def beat(self) -> None:
         """Say that the loop has come round."""
-        self._last_s = self._clock()
+        self._last_s = self.clock()
+
+    def round_s(self) -> float:
+        """Return seconds since the last `beat`, 0 before the first.
+
+        Raises:
+            Stop: these are too many, or the car was braked for that.
+        """
+        late = 0.0 if self._last_s is None else self.clock() - self._last_s
+        if late > self.limit_s or self.has_fired:
+            found = f"took {late:.3f} s, at most {self.limit_s:g} s"
+            raise Stop(Cause.LOOP_LATE, found)
+        return late
+
+    def permit(self, send: Callable[[], _T]) -> _T:
+        """Send a command, unless the loop is late; never after a brake of this thread.
+
+        Raises:
+            Stop: the loop is or was late.
+        """
+        with self._sending:
+            self.round_s()
+            return send()
 
     def check(self) -> None:
         """Brake if the loop is late; what the thread does all the time."""
         last = self._last_s
         if last is None or self._closed.is_set():
             return
-        if self._clock() - last > self.limit_s:
+        if self.clock() - last > self.limit_s:
             self.has_fired = True
+            # behind a command that is on its way, but for one that hangs
+            is_behind = self._sending.acquire(timeout=self.limit_s / 10)
             with suppress(Exception):  # whatever it is, the next check brakes again
                 self._brake()
+            if is_behind:
+                self._sending.release()
 
     def close(self) -> None:
         """End the thread; more than once does no harm."""
@@ -60,30 +103,3 @@ class Watchdog:
     def _watch(self) -> None:
         while not self._closed.wait(self.limit_s / 10):
             self.check()
-
-
-class SleepCheck:
-    """Ends the drive if the computer was suspended, as by its lid.
-
-    Nothing else tells: the monotonic clock, and with it all ages, stand still
-    meanwhile.
-
-    Args:
-        limit_s: of the sleep since it was made.
-    """
-
-    def __init__(self, limit_s: float) -> None:
-        self._limit_s, self._before_s = limit_s, _asleep_s()
-
-    def check(self) -> None:
-        """Raise `Stop` if it slept."""
-        slept = _asleep_s() - self._before_s
-        if slept > self._limit_s:
-            raise Stop(Cause.LOOP_LATE, f"the computer slept for {slept:.1f} s")
-
-
-def _asleep_s() -> float:
-    """Return how long the computer has slept since it started, where Linux tells."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):
-        return 0.0
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
