@@ -28,8 +28,7 @@ from mi_nerfattack.robot.drive import messages
 from mi_nerfattack.robot.drive.safety.judge import Cause, Stop
 from mi_nerfattack.system.extras import load_extra
 
-#: Bytes that are gathered before they are written: half a second of a drive.
-_CHUNK_BYTES = 1 << 17
+_WRITE_EVERY_S = 0.5
 
 
 class DriveLog:
@@ -61,10 +60,10 @@ class DriveLog:
         mcap = load_extra("mcap.writer", "mcap", "the log of a drive")
         self._clock = clock
         self._wall = messages.WallClock(clock(), wall_ns)
-        self._is_open = True
+        self._is_open, self._written_s = True, clock()
         self.counts = dict.fromkeys(messages.TOPICS, 0)
         self._file = GrowingFile(path)
-        writer: Any = mcap.Writer(self._file, chunk_size=_CHUNK_BYTES)
+        writer: Any = mcap.Writer(self._file)
         self._writer, self._channels = writer, {}
         writer.start(profile="", library="mi-nerfattack")
         for topic, (name, schema) in messages.TOPICS.items():
@@ -135,14 +134,18 @@ class DriveLog:
         stamped = {"timestamp": self._wall.stamp(time_s), **message}
         if own:
             stamped["time_s"] = time_s
+        now_s = self._clock()
         try:
             self._writer.add_message(
                 self._channels[topic],
-                log_time=self._wall.nanoseconds(self._clock()),
+                log_time=self._wall.nanoseconds(now_s),
                 data=json.dumps(stamped, allow_nan=False).encode(),
                 publish_time=self._wall.nanoseconds(time_s),
                 sequence=self.counts[topic],
             )
+            if now_s - self._written_s >= _WRITE_EVERY_S:
+                self._written_s = now_s
+                self._writer.flush()
         except InputError as error:
             self._is_open = False
             raise Stop(Cause.LOG_FAILED, str(error)) from error

@@ -61,6 +61,13 @@ def test_a_link_that_is_silent_holds_nothing(pad):
     assert enable.is_held()
     time[0] += 0.51
     assert not enable.is_held()
+    os.write(descriptor, event(7, AXIS, 1))  # the link is back, no finger was seen
+    assert not enable.is_held() and not enable.is_held()
+    os.write(descriptor, event(1, BUTTON, 0))
+    assert enable.is_held()
+    time[0] += 0.51
+    os.write(descriptor, event(7, AXIS, 1))  # the silence was not looked at
+    assert not enable.is_held()
     enable.close()
 
 

@@ -14,7 +14,6 @@ from helpers.driving_stand_ins import SETTINGS, Bench
 
 from mi_nerfattack.io import growing
 from mi_nerfattack.robot.devices import DeviceLostError
-from mi_nerfattack.robot.drive import log as drive_log
 from mi_nerfattack.robot.drive.safety.judge import Cause
 
 HOLD_S = 0.5
@@ -150,7 +149,6 @@ def test_an_enable_held_while_the_computer_was_suspended_is_pressed_again(tmp_pa
 
 
 def test_a_full_disk_ends_the_drive(tmp_path, monkeypatch):
-    monkeypatch.setattr(drive_log, "_CHUNK_BYTES", 4096)
     bench = Bench()
     bench.at(HOLD_S, partial(setattr, bench, "held", True))
 

@@ -18,10 +18,10 @@ from mi_nerfattack.deploy.car import SMALL_CAR
 from mi_nerfattack.deploy.vehicle import planar_body
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.robot.devices import Command, DeviceLostError, Frame
+from mi_nerfattack.robot.devices import Command, DeviceLostError, Frame, TrackedPose
 from mi_nerfattack.robot.drive.pilot import LocalPilot, expert_control
 from mi_nerfattack.robot.drive.safety.fence import Fence, car_corners
-from mi_nerfattack.robot.drive.safety.judge import Stop
+from mi_nerfattack.robot.drive.safety.judge import Ages, Judge, Stop
 from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
 from mi_nerfattack.robot.drive.safety.watchdog import Watchdog, suspended_clock
 from mi_nerfattack.vehicle.expert.choose import expert_for
@@ -69,9 +69,35 @@ def test_the_fence_is_for_the_outline_of_the_car():
     reach = SMALL_CAR.wheelbase + 0.5 * (SMALL_CAR.length - SMALL_CAR.wheelbase)
     for forward, is_held in ((1 - reach - 0.01, True), (1 - reach + 0.01, False)):
         corners = car_corners(SMALL_CAR, planar_body(np.array([forward, 0.0, 0.0])))
-        assert fence.holds(corners) == is_held
+        assert fence.encloses(corners) == is_held
     turned = car_corners(SMALL_CAR, planar_body(np.array([0.0, 0.0, math.pi / 2])))
     np.testing.assert_allclose(turned[:, 1].max(), reach)
+
+
+@pytest.mark.parametrize(
+    "spike",
+    [
+        [(-0.05, 2.0), (0.0, 0.05), (0.05, 2.0)],  # its tip is inside the car
+        [(-0.05, 2.0), (0.0, -1.5), (0.05, 2.0)],  # beyond it
+    ],
+)
+@pytest.mark.parametrize("turn", [0.0, 1.1, -2.5])
+def test_a_fence_does_not_reach_into_the_car(spike, turn):
+    square = [(-2.0, 2.0), (-2.0, -2.0), (2.0, -2.0), (2.0, 2.0)]
+    body = planar_body(np.array([0.3, -0.2, turn]))
+
+    def placed(points) -> np.ndarray:
+        middle = np.array([0.5 * SMALL_CAR.wheelbase, 0.0])
+        return (np.array(points) + middle) @ body[:2, :2].T + body[:2, 3]
+
+    corners = car_corners(SMALL_CAR, body)
+    fence = Fence(placed([*square, *reversed(spike)]))
+    assert fence.holds(corners) and not fence.encloses(corners)
+    assert Fence(placed(square)).encloses(corners)
+    pose = TrackedPose(body, 0.0, 0)
+    judge = Judge(Ages(), fence, SMALL_CAR, 0.8, 0.1)
+    with pytest.raises(Stop, match="outside the fence: the car is at x 0.30 m"):
+        judge.pose(pose, 0.0, StandInTracker(Bench()), "car")
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,8 @@ class JoystickEnable(AbstractEnable):
         path: of the device.
         button: its number, from 0; ``jstest`` shows it.
         clock: of the loop.
-        silence_s: after which without any event the button counts as let go; None
-            where the link cannot break unseen.
+        silence_s: after which without any event the button counts as let go, until it
+            is pressed anew; None where the link cannot break unseen.
 
     Raises:
         InputError: the device cannot be opened.
@@ -47,13 +47,15 @@ class JoystickEnable(AbstractEnable):
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
 
     def is_held(self) -> bool:
-        """Whether the button is down, by all that has come up to now."""
+        """Whether the button is down, by all that has come up to now.
+
+        After a silence it must be pressed anew.
+        """
+        silence_s = self._silence_s
+        if silence_s is not None and self._clock() - self._heard_s > silence_s:
+            self._is_pressed = False
         self._read()
-        if self._silence_s is not None:
-            is_silent = self._clock() - self._heard_s > self._silence_s
-        else:
-            is_silent = False
-        return self._is_pressed and self._descriptor is not None and not is_silent
+        return self._is_pressed and self._descriptor is not None
 
     def close(self) -> None:
         """Let go of the device; from then on nothing is held."""

@@ -36,7 +36,7 @@ class Fence:
         area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
         if abs(area) < 1e-6:
             raise InputError(f"fence: {points.tolist()}; must enclose an area")
-        if _crosses_itself(points):
+        if _cross(points, points):
             raise InputError(
                 f"fence: {points.tolist()}; sides cross, give the corners in turn"
             )
@@ -73,6 +73,14 @@ class Fence:
             crossed = spans & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
         return bool((crossed.sum(1) % 2 == 1).all() and np.isfinite(points).all())
 
+    def encloses(self, outline: np.ndarray) -> bool:
+        """Whether a whole polygon is inside: no corner of the fence reaches into it.
+
+        Args:
+            outline: (n, 2), corners in turn, metres.
+        """
+        return self.holds(outline) and not _cross(self.points, outline)
+
 
 def car_corners(car: Car, body_to_world: np.ndarray) -> np.ndarray:
     """Return the corners (4, 2) of a car's outline on the floor.
@@ -101,16 +109,15 @@ def _points(given: Any) -> np.ndarray:
     return points
 
 
-def _crosses_itself(points: np.ndarray) -> bool:
-    """Whether two sides that are no neighbours cross."""
-    start, end = points, np.roll(points, -1, axis=0)
-    edge = end - start
+def _cross(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether sides of two polygons cross; to touch, as neighbours do, is not to."""
+    apart = _separates(one, other) & _separates(other, one).T
+    return bool(apart.any())
 
-    def side(point: np.ndarray) -> np.ndarray:  # (i, j): of point j left of edge i
-        away = point[None] - start[:, None]
-        return np.sign(
-            edge[:, None, 0] * away[..., 1] - edge[:, None, 1] * away[..., 0]
-        )
 
-    apart = side(start) * side(end) < 0
-    return bool((apart & apart.T).any())
+def _separates(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return (i, j): the line of side i of one parts side j of the other."""
+    along = np.roll(one, -1, axis=0) - one
+    away = other[None] - one[:, None]
+    side = np.sign(along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0])
+    return side * np.roll(side, -1, axis=1) < 0

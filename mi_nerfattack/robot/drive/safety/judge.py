@@ -136,7 +136,7 @@ class Judge:
             )
         x, y = pose.body_to_world[:2, 3]
         corners = car_corners(self.car, pose.body_to_world)
-        if not self.fence.holds(corners):
+        if not self.fence.encloses(corners):
             raise Stop(Cause.OUTSIDE, f"the car is at x {x:.2f} m, y {y:.2f} m")
 
     def motor(
