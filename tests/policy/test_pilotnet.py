@@ -221,7 +221,7 @@ def test_many_shards_need_no_more_descriptors(tmp_path, rng):
     before = len(os.listdir("/proc/self/fd"))
     data = FrameDataset.from_shards(shards)
     assert data.read_frames(np.arange(20)).any() and data.digest
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(os.listdir("/proc/self/fd")) <= before  # others may be collected
 
 
 def test_split_keeps_blocks_together():
