@@ -17,7 +17,7 @@ from mi_nerfattack.robot.devices import AbstractCamera, Clock, DeviceLostError, 
 
 DRIVER = "v4l2"
 _FIRST_S, _SILENT_S = 5.0, 1.0  # longest waits for the first frame, and for another
-_KERNEL_S = 1.0  # oldest age of a frame's time that is taken for one of this clock
+_KERNEL_S = 60.0  # oldest age of the first frame's time that is taken for this clock's
 _REMEDIES = {
     errno.ENOENT: "plug it in; ls /dev/video*",
     errno.EACCES: "add this user to the group video, and log in again",
@@ -30,7 +30,8 @@ class V4lCamera(AbstractCamera):
     """A camera, read by a thread that keeps the newest frame alone.
 
     A frame's time is the kernel's where that is by this computer's monotonic clock, as
-    of UVC cameras, else when it came.
+    of UVC cameras, else when it came; the first frame decides. Frames are prepared when
+    they are asked for, so that the thread keeps up with the device.
 
     Args:
         device: such as /dev/video0.
@@ -55,6 +56,7 @@ class V4lCamera(AbstractCamera):
         self.camera = prepare.camera
         self._device, self._prepare, self._clock = device, prepare, clock
         self._frame: Frame | None = None
+        self._lock, self._unprepared = threading.Lock(), None
         self._error, self._is_closed = "", threading.Event()
         self._container = _opened(device, prepare, fps, driver)
         self._heard_s, self._longest_s = time.monotonic(), _FIRST_S
@@ -70,7 +72,12 @@ class V4lCamera(AbstractCamera):
             )
         if self._error:
             raise DeviceLostError(f"{self._device}: {self._error}")
-        return self._frame
+        with self._lock:
+            if self._unprepared is not None:
+                (found, *about), self._unprepared = self._unprepared, None
+                image = self._prepare.apply(found.to_ndarray(format="rgb24"))
+                self._frame = Frame(image, *about)
+            return self._frame
 
     def close(self) -> None:
         """Stop reading; a thread that the device holds ends with the process."""
@@ -82,23 +89,26 @@ class V4lCamera(AbstractCamera):
         from av.error import FFmpegError
 
         try:
-            index = 0
-            for frame in self._decoded():
+            is_kernels = None
+            for index, frame in enumerate(self._decoded()):
                 if self._is_closed.is_set():
                     break
                 now, came_s = time.monotonic(), self._clock()
-                age_s = now - frame.time if frame.time is not None else 0.0
-                age_s = age_s if 0 <= age_s < _KERNEL_S else 0.0
+                age_s = now - frame.time if frame.time is not None else -1.0
+                if is_kernels is None:
+                    is_kernels = 0 <= age_s < _KERNEL_S
+                age_s = max(0.0, age_s) if is_kernels else 0.0
                 check_size(self._device, frame.width, frame.height, self._prepare)
-                image = self._prepare.apply(frame.to_ndarray(format="rgb24"))
-                self._frame = Frame(image, came_s - age_s, index)
+                with self._lock:
+                    self._unprepared = frame, came_s - age_s, index
                 self._heard_s, self._longest_s = now, _SILENT_S
-                index += 1
             self._error = self._error or "it gives no more images"
         except (FFmpegError, InputError) as error:
             self._error = self._error or f"reading failed ({error}); is it plugged in?"
         finally:
             self._error = self._error or "reading failed"
+            with self._lock:  # it may lie in the device's memory
+                self._unprepared = None
             self._container.close()
 
     def _decoded(self) -> Any:

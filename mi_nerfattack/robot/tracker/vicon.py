@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import sys
 import threading
 import time
+from contextlib import suppress
 
 import numpy as np
 
@@ -21,6 +23,7 @@ from mi_nerfattack.robot.tracker.object_stream import SIZES, Convention, ObjectS
 
 PORT = 51001
 _POLL_S = 0.1
+_STEP_S = 0.05  # the wall clock may be slewed by as much between two datagrams
 _SO_TIMESTAMPNS = 35  # of Linux; the socket module has no name for it
 _TIMESPEC = struct.Struct("@qq")
 
@@ -29,7 +32,8 @@ class ViconTracker(AbstractTracker):
     """Listens to VICON Tracker's UDP object stream in a thread of its own.
 
     A pose's time is that of its datagram's arrival, on Linux as the kernel noted it, so
-    that what waited while this process was busy does not pass for new. Only one
+    that what waited while this process was busy does not pass for new. The kernel's
+    note is by the wall clock: what waited while that was set is left out. Only one
     computer is listened to: the one that sent the first datagram of the stream.
 
     Args:
@@ -59,7 +63,7 @@ class ViconTracker(AbstractTracker):
         self._sender = None if sender is None else _resolved(sender)
         self._others: set[str] = set()
         self._lock, self._is_closed = threading.Lock(), threading.Event()
-        self._error = ""
+        self._error, self._wall = "", _Wall()
         self._socket = _listening(host, port)
         self.address: tuple[str, int] = self._socket.getsockname()
         self._thread = threading.Thread(
@@ -128,19 +132,49 @@ class ViconTracker(AbstractTracker):
                     self._sender = sender
 
     def _read(self) -> tuple[bytes, float, str]:
-        """Wait for a datagram; return it, when it came, and who sent it."""
+        """Wait for a datagram; return it, when it came, and who sent it.
+
+        Raises:
+            TimeoutError: none came, or nobody knows when.
+        """
         if sys.platform != "linux":
             raw, sender = self._socket.recvfrom(2 * SIZES[-1])
             return raw, self._clock(), sender[0]
         space = socket.CMSG_SPACE(_TIMESPEC.size)
         raw, notes, _, sender = self._socket.recvmsg(2 * SIZES[-1], space)
+        wall_s, is_set = self._wall.read()
+        if is_set:
+            self._drop_waiting()
+            raise TimeoutError
         age_s = 0.0
         for level, kind, data in notes:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
                 seconds, nanoseconds = _TIMESPEC.unpack(data[: _TIMESPEC.size])
-                # never negative, should the wall clock be set back meanwhile
-                age_s = max(0.0, time.time() - seconds - 1e-9 * nanoseconds)
+                age_s = max(0.0, wall_s - seconds - 1e-9 * nanoseconds)
         return raw, self._clock() - age_s, sender[0]
+
+    def _drop_waiting(self) -> None:
+        self._socket.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                self._socket.recv(1)
+        self._socket.settimeout(_POLL_S)
+
+
+class _Wall:
+    """The wall clock, which may be set while others count on."""
+
+    def __init__(self) -> None:
+        self._ahead = -math.inf, math.inf
+        self.read()
+
+    def read(self) -> tuple[float, bool]:
+        """Return its time, seconds, and whether it was set since the last reading."""
+        before, wall, after = time.monotonic(), time.time(), time.monotonic()
+        low, high = self._ahead
+        self._ahead = wall - after, wall - before
+        is_set = wall - before < low - _STEP_S or wall - after > high + _STEP_S
+        return wall, is_set
 
 
 def _listening(host: str, port: int) -> socket.socket:

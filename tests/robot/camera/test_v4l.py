@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import queue
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from fractions import Fraction
+from types import SimpleNamespace
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 from av.video.frame import VideoFrame
@@ -99,32 +101,79 @@ def test_only_the_newest_is_kept_and_nothing_waits(pipe, monkeypatch):
         while time.monotonic() < started + 60:
             assert camera.newest()
     pipe.send(3)  # and goes on
-    wait_for(lambda: camera._frame is not None and camera._frame.index == 101)
+    wait_for(lambda: (kept := camera._unprepared) and kept[2] == 101)
     pipe.file.close()
     wait_for(lambda: camera._error)
     with pytest.raises(DeviceLostError, match="no more images"):
         camera.newest()
 
 
-def test_the_kernels_times_are_kept(tmp_path):
-    now, base = time.monotonic(), Fraction(1, 1_000_000)
-    with av.open(str(tmp_path / "device"), "w", format="nut") as container:
-        stream: Any = container.add_stream("rawvideo", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 32, 16, "rgb24"
-        stream.codec_context.time_base = stream.time_base = base
+class Device:
+    """A device of frames that a test makes, with the kernel's times."""
+
+    def __init__(self) -> None:
+        self.frames: queue.Queue[VideoFrame | None] = queue.Queue()
+
+    def send(self, time_s: float) -> None:
         frame = VideoFrame.from_ndarray(np.zeros((16, 32, 3), np.uint8), "rgb24")
-        frame.pts, frame.time_base = round((now - 0.25) / base), base
-        container.mux(stream.encode(frame))
-    # a clock that is 1000 s behind
-    camera = V4lCamera(
-        str(tmp_path / "device"),
-        SMALL,
-        clock=lambda: time.monotonic() - 1000,
-        driver="nut",
-    )
-    wait_for(lambda: camera._error)
-    assert camera._frame is not None
-    assert camera._frame.time_s == pytest.approx(now - 1000.25, abs=0.1)
+        base = Fraction(1, 1_000_000)
+        frame.pts, frame.time_base = round(time_s / base), base
+        self.frames.put(frame)
+
+    def demux(self, video: int) -> Iterator[Any]:
+        assert video == 0
+        for frame in iter(self.frames.get, None):
+            yield SimpleNamespace(decode=lambda frame=frame: [frame])
+
+    def close(self) -> None:
+        """Let go of nothing."""
+
+
+@pytest.fixture
+def device(monkeypatch):
+    found = Device()
+    monkeypatch.setattr(v4l, "_opened", lambda *_: found)
+    monkeypatch.setattr(v4l, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    yield found
+    found.frames.put(None)
+
+
+def seen(camera: V4lCamera, index: int) -> Frame:
+    """Wait for a frame and return it."""
+    wait_for(lambda: (frame := camera.newest()) and frame.index == index)
+    frame = camera.newest()
+    assert frame is not None
+    return frame
+
+
+def test_the_kernels_times_are_kept_however_old(device):
+    camera = V4lCamera("device", SMALL, clock=lambda: 5.0)
+    for index, age_s in enumerate((0.25, 1.5, 100.0, -3.0)):
+        device.send(1000.0 - age_s)
+        assert seen(camera, index).time_s == pytest.approx(5.0 - max(0.0, age_s))
+
+
+def test_times_of_another_clock_are_not_believed(device):
+    camera = V4lCamera("device", SMALL, clock=lambda: 5.0)
+    for index, time_s in enumerate((1.7e9, 999.0)):
+        device.send(time_s)
+        assert seen(camera, index).time_s == 5.0
+
+
+def test_frames_that_nobody_asks_for_cost_nothing(device, monkeypatch):
+    prepared = []
+
+    def apply(image: np.ndarray) -> np.ndarray:
+        prepared.append(image)
+        return image
+
+    monkeypatch.setattr(SMALL, "apply", apply)
+    camera = V4lCamera("device", SMALL)
+    for _ in range(50):
+        device.send(999.9)
+    wait_for(lambda: (kept := camera._unprepared) and kept[2] == 49)
+    assert seen(camera, 49) is camera.newest()
+    assert len(prepared) == 1
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="V4L is Linux's")

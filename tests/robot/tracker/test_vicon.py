@@ -11,6 +11,7 @@ from helpers.waiting import wait_for
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import DeviceLostError
+from mi_nerfattack.robot.tracker import vicon
 from mi_nerfattack.robot.tracker.vicon import ViconTracker
 
 
@@ -48,17 +49,60 @@ def test_a_pose_comes_with_the_time_of_its_arrival(tracker, sender):
     assert "not 'van'" in tracker.explain("van")
 
 
+class Clocks:
+    """This computer's clocks, ahead by what a test says."""
+
+    def __init__(self) -> None:
+        self.ahead_s, self.wall_ahead_s = 0.0, 0.0
+
+    def monotonic(self) -> float:
+        return time.monotonic() + self.ahead_s
+
+    def time(self) -> float:
+        return time.time() + self.ahead_s + self.wall_ahead_s
+
+
+@pytest.fixture
+def clocks(monkeypatch):
+    found = Clocks()
+    monkeypatch.setattr(vicon, "time", found)
+    return found
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel notes no arrival")
-def test_what_waited_is_not_new(tracker, sender):
+def test_what_waited_is_not_new(clocks):
+    tracker = ViconTracker(port=0, clock=clocks.monotonic)
+    sender = Sender(tracker.address)
     with tracker._lock:  # as if the process were busy
         sender.send(car(1))
-        before = time.monotonic()
         sender.send(car(2))
-        after = time.monotonic()
-        time.sleep(0.2)
+        sent_s = clocks.monotonic()
+        clocks.ahead_s = 1000.0
     wait_for(lambda: (pose := tracker.newest("car")) and pose.index == 2)
-    # the wall clock and this one are not read at one moment
-    assert before - 0.02 < tracker.newest("car").time_s < after + 0.02
+    assert tracker.newest("car").time_s == pytest.approx(sent_s, abs=100)
+    sender.close()
+    tracker.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel notes no arrival")
+@pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
+def test_what_waited_while_the_clock_was_set_is_left_out(
+    clocks, tracker, sender, monkeypatch, step_s
+):
+    taken, take = [], tracker._stream.take
+
+    def record(raw: bytes, time_s: float) -> bool:
+        taken.append(raw)
+        return take(raw, time_s)
+
+    monkeypatch.setattr(tracker._stream, "take", record)
+    with tracker._lock:  # as if the process were busy
+        for frame in (1, 2, 3):
+            sender.send(car(frame))
+        clocks.wall_ahead_s = step_s
+    wait_for(lambda: sender.send(car(4)) or car(4) in taken)
+    assert car(2) not in taken
+    assert car(3) not in taken
 
 
 def test_another_computer_is_not_listened_to(tracker, sender):
