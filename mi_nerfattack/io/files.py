@@ -94,9 +94,9 @@ def read_rows(path: str | Path, start: int, rows: np.ndarray, out: np.ndarray) -
                 raise InputError(f"{path}: ends before row {row}; copy it again")
 
 
-def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file of at most 256 MiB; a byte order mark is dropped."""
-    raw = read_bytes(path, MAX_TEXT_BYTES)
+def read_text(path: str | Path, limit: int = MAX_TEXT_BYTES) -> str:
+    """Read a UTF-8 text file of at most `limit` bytes, without a byte order mark."""
+    raw = read_bytes(path, limit)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as err:
@@ -112,8 +112,7 @@ def read_json(path: str | Path) -> Any:
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file of at most 2 MiB; see `parse_toml`."""
-    _check_file(path, MAX_TOML_BYTES)
-    return parse_toml(path, read_text(path))
+    return parse_toml(path, read_text(path, MAX_TOML_BYTES))
 
 
 def read_image(path: str | Path) -> np.ndarray:

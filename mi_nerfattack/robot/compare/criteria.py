@@ -12,6 +12,7 @@ from pydantic import ValidationError, model_validator
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.ranges import NonNegative
 from mi_nerfattack.robot.compare.sequential import SequentialTest
 from mi_nerfattack.scenario.lines import tell
@@ -90,9 +91,9 @@ def read_criteria(path: Path) -> WrittenCriteria:
         InputError: the file cannot be read, is no TOML, or a key is unknown, missing,
             of the wrong type or out of range; with file and line.
     """
-    text, data = files.read_text(path), files.read_toml(path)
+    text = files.read_text(path, files.MAX_TOML_BYTES)
     try:
-        criteria = Criteria.model_validate(data)
+        criteria = Criteria.model_validate(parse_toml(path, text))
     except ValidationError as err:
         raise InputError(tell(path, text, problems(err))) from err
     digest = hashlib.sha256(text.encode()).hexdigest()

@@ -38,6 +38,7 @@ class RecordedDrive:
         first: index of the recording's frame that it begins with.
         coverage: share of the stretch that it gets along, at most 1.
         driven: length of its path over that of the stretch.
+        is_out: whether its centre ends out of the lane.
         remarks: what of the recording is left out.
     """
 
@@ -49,12 +50,13 @@ class RecordedDrive:
     first: int
     coverage: float
     driven: float
+    is_out: bool
     remarks: tuple[str, ...]
 
     @property
     def is_whole(self) -> bool:
-        """Whether it went all the way, or as far beside it."""
-        return max(self.coverage, self.driven) >= WHOLE
+        """Whether it went all the way, or as far and out of the lane."""
+        return self.coverage >= WHOLE or (self.is_out and self.driven >= WHOLE)
 
     @property
     def began_utc(self) -> str:
@@ -100,6 +102,7 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
     _check_gaps(path, states, first, course)
     covered = min(arcs[cut].max(), course.end_m) - begin
     way = float(np.hypot(*np.diff(states[:, :2], axis=0).T).sum())
+    errors = course.route.cross_track_numpy(states)
     drive = Drive(
         REAL,
         course.route.name,
@@ -108,14 +111,15 @@ def read_recorded(path: Path, case: str, run: int, course: Course) -> RecordedDr
         run,
         states,
         course.controls(states, times),
-        course.route.cross_track_numpy(states[1:]),
+        errors[1:],
         times[1:] - times[0],
     )
     content = track.times.tobytes() + track.camera_to_world.tobytes()
     digest = hashlib.sha256(content).hexdigest()
     began = _began(track)
     shares = covered / course.length_m, way / course.length_m
-    return RecordedDrive(path, drive, *began, digest, first, *shares, remarks)
+    is_out = bool(abs(errors[-1]) > course.lane.centre_m)
+    return RecordedDrive(path, drive, *began, digest, first, *shares, is_out, remarks)
 
 
 def _check_frame(path: Path, state: np.ndarray, course: Course) -> None:

@@ -88,6 +88,18 @@ def test_a_drive_that_never_comes_back(tmp_path):
     assert not read_recorded(early, "attack", 0, course).is_whole
 
 
+def test_weaving_in_the_lane_is_no_way_along_it(tmp_path):
+    """It stops early, though its path is as long as the stretch."""
+    course = course_of(LINE)
+    arcs = np.arange(0, 0.85 * LENGTH, 0.1)
+    lateral = 0.8 * np.sin(2 * arcs)
+    states = LINE.pose_at(arcs, lateral, np.arctan(np.gradient(lateral, arcs)))
+    path = write_drive(tmp_path / "weave.mcap", states, 0.02, 1.8e9)
+    recorded = read_recorded(path, "attack", 0, course)
+    assert recorded.driven > 1 and recorded.coverage == pytest.approx(0.85, abs=0.02)
+    assert not recorded.is_whole
+
+
 def test_the_log_of_a_drive(tmp_path):
     """A stand-in of a car, driven by the loop in a circle, drives on its centre."""
     path, bench = tmp_path / "drive.mcap", Bench()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.robot.compare.criteria import read_criteria
 from mi_nerfattack.robot.compare.sequential import SequentialTest, rate_interval
 
@@ -77,6 +78,22 @@ def test_criteria(tmp_path):
         with pytest.raises(InputError) as told:
             read_criteria(path)
         assert message in str(told.value)
+
+
+def test_what_is_hashed_is_what_is_read(tmp_path, monkeypatch):
+    """Though the file is changed meanwhile."""
+    path, read_bytes = tmp_path / "criteria.toml", files.read_bytes
+    path.write_text(TEXT)
+    before = read_criteria(path)
+
+    def read_and_change(path, limit):
+        raw = read_bytes(path, limit)
+        path.write_text(TEXT.replace("1.0", "2.0"))
+        return raw
+
+    monkeypatch.setattr(files, "read_bytes", read_and_change)
+    found = read_criteria(path)
+    assert (found.sha256, found.criteria) == (before.sha256, before.criteria)
 
 
 def test_drives_that_end_early(tmp_path):
