@@ -56,7 +56,8 @@ class V4lCamera(AbstractCamera):
         self.camera = prepare.camera
         self._device, self._prepare, self._clock = device, prepare, clock
         self._frame: Frame | None = None
-        self._lock, self._unprepared = threading.Lock(), None
+        self._lock = threading.Lock()
+        self._unprepared: tuple[Any, float, int] | None = None
         self._error, self._is_closed = "", threading.Event()
         self._container = _opened(device, prepare, fps, driver)
         self._heard_s, self._longest_s = time.monotonic(), _FIRST_S
@@ -74,9 +75,10 @@ class V4lCamera(AbstractCamera):
             raise DeviceLostError(f"{self._device}: {self._error}")
         with self._lock:
             if self._unprepared is not None:
-                (found, *about), self._unprepared = self._unprepared, None
+                found, time_s, index = self._unprepared
+                self._unprepared = None
                 image = self._prepare.apply(found.to_ndarray(format="rgb24"))
-                self._frame = Frame(image, *about)
+                self._frame = Frame(image, time_s, index)
             return self._frame
 
     def close(self) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, closing, contextmanager
 
 import numpy as np
 import pytest
 from helpers.loopback import free_port
+from helpers.waiting import wait_for
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import (
@@ -58,13 +58,6 @@ def frame(index: int, value: int, time_s: float = 0.0) -> Frame:
     return Frame(np.full((4, 6, 3), value, np.uint8), time_s, index)
 
 
-def await_that(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENT_S
-    while not condition():
-        assert time.monotonic() < end, "it never came"
-        time.sleep(0.005)
-
-
 @contextmanager
 def serving(endpoint, key=KEY, gate=None):
     """Serve in a thread; gives the server, its notices and what decides."""
@@ -89,7 +82,7 @@ def serving(endpoint, key=KEY, gate=None):
 
 def await_decision(pilot: RemotePilot, index: int) -> Decision:
     """Wait for what is decided of a frame."""
-    await_that(lambda: (d := pilot.newest()) and d.frame_index == index)
+    wait_for(lambda: (d := pilot.newest()) and d.frame_index == index)
     decision = pilot.newest()
     assert decision is not None
     return decision
@@ -149,8 +142,8 @@ def test_decisions_come_back(monkeypatch):
             with stranger(endpoint) as session:
                 for raw in [*sent, forged, b"", bytes(200)]:
                     session.put(TO_POLICY, raw)
-                await_that(lambda: server.refused >= 3)
-                await_that(lambda: any("without the right key" in n for n in notices))
+                wait_for(lambda: server.refused >= 3)
+                wait_for(lambda: any("without the right key" in n for n in notices))
             pilot.submit(frame(3, 70))
             await_decision(pilot, 3)
             assert made[0].seen == [20, 90, 50, 70] and len(made) == 1
@@ -172,7 +165,7 @@ def test_frames_that_wait_are_replaced(monkeypatch):
         _, _, made = stack.enter_context(serving(endpoint, gate=gate))
         pilot = stack.enter_context(closing(connected(endpoint)))
         pilot.submit(frame(0, 10))
-        await_that(lambda: made[0].seen == [10])
+        wait_for(lambda: made[0].seen == [10])
         for index in range(1, 6):
             pilot.submit(frame(index, 10 * index))
         gate.set()
@@ -209,7 +202,7 @@ def test_a_policy_that_fails_is_told():
                     return True
                 return False
 
-            await_that(fails)
+            wait_for(fails)
             with pytest.raises(DeviceLostError, match="too bright"):
                 pilot.newest()
         with closing(connected(endpoint)) as pilot:  # a new one decides again
@@ -236,7 +229,7 @@ def test_a_link_that_is_lost():
                 return True
             return False
 
-        await_that(is_lost)
+        wait_for(is_lost)
         with pytest.raises(DeviceLostError, match="silent for"):
             pilot.submit(frame(0, 0))
     pilot.close()

@@ -11,6 +11,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 from helpers.loopback import free_port
+from helpers.waiting import wait_for
 
 from mi_nerfattack import cli
 from mi_nerfattack.robot.devices import DeviceLostError, Frame
@@ -42,16 +43,18 @@ def test_a_server_of_its_own(tmp_path):
     assert process.stdout is not None
     assert f"Serving at {listen}, sealed" in process.stdout.readline()
     try:
-        pilot = RemotePilot(Endpoint.parse(listen), key.read_bytes())
+        pilot = RemotePilot(
+            Endpoint.parse(listen), key.read_bytes(), lost_s=20.0, connect_s=60.0
+        )
         with closing(pilot):
             image = np.full((4, 6, 3), 51, np.uint8)
             pilot.submit(Frame(image, time.monotonic(), 7))
-            end = time.monotonic() + 60
-            while (decision := pilot.newest()) is None and time.monotonic() < end:
-                time.sleep(0.01)
+            wait_for(pilot.newest)
+            decision = pilot.newest()
             assert decision is not None and decision.frame_index == 7
             assert decision.control == pytest.approx(2.2, abs=1e-6)
             # stopped, it is missed; and neither frames nor the end wait for it
+            pilot._lost_s = 0.5
             process.send_signal(signal.SIGSTOP)
             large = np.zeros((1000, 1000, 3), np.uint8)
             with pytest.raises(DeviceLostError, match="silent for"):
