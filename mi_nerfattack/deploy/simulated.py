@@ -19,7 +19,12 @@ from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import (
+    Camera,
+    CameraMount,
+    camera_to_body,
+    mount_matrix,
+)
 from mi_nerfattack.render.rays import March
 from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.sensor import Observation
@@ -109,7 +114,7 @@ class SimulatedEnvironment(AbstractSimulation):
         period: float,
     ) -> None:
         super().__init__(name, vehicle, view.camera, period)
-        self.view, self._mount = view, mount_matrix(np.zeros((1, 3)), mount)[0]
+        self.view, self._mount = view, camera_to_body(mount)
 
     def show(self, objects: Sequence[Any]) -> None:
         """Show fields, in the view's way."""

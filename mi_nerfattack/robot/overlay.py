@@ -10,8 +10,8 @@ import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.distortion import jacobian, undistort
-from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths
+from mi_nerfattack.render.camera.distortion import jacobian
+from mi_nerfattack.render.camera.intrinsics import Camera, ray_lengths, ray_slopes
 from mi_nerfattack.robot.attacked import FACES, AttackedBox
 from mi_nerfattack.system.extras import load_extra
 
@@ -45,13 +45,9 @@ class Overlay:
     def __init__(self, box: AttackedBox, camera: Camera, keyed: bool = True) -> None:
         self._cv2 = load_extra("cv2", "markers", "overlay")
         self.box, self.camera, self.keyed = box, camera, keyed
-        columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
-        x, y = np.meshgrid(
-            (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-        )
+        x, y = ray_slopes(camera)
         stretch = np.ones_like(x)
         if camera.is_distorted:
-            x, y = undistort(x, y, *camera.distortion)
             stretch = np.sqrt(jacobian(x, y, *camera.distortion)[3])
         self._x, self._y = x.astype(np.float32), y.astype(np.float32)
         # of each column's x and each row's y

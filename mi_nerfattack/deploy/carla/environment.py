@@ -25,7 +25,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
 from mi_nerfattack.deploy.vehicle import checked_pose, planar_body, require_control
 from mi_nerfattack.deploy.views.paste import Paster
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
 from mi_nerfattack.vehicle.route.route import Route
 
 VEHICLE = "vehicle.tesla.model3"
@@ -77,7 +77,7 @@ class CarlaEnvironment(AbstractEnvironment):
         self.control_unit = driver.control_unit
         self._vehicle, self._axles = vehicle, axles
         self._attributes = dict(attributes or {})
-        self._mount = mount_matrix(np.zeros((1, 3)), mount)[0]
+        self._mount = camera_to_body(mount)
         self._paster = Paster(camera, ())
         self._cameras: CarlaCameras | None = None
         self._actor: Any = None

@@ -44,7 +44,7 @@ from mi_nerfattack.deploy.replay.recording import (
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict_json import parse_json
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
 
 MAX_LOG_BYTES = 1 << 32
 MAX_CHUNK_BYTES = 1 << 30
@@ -150,7 +150,7 @@ def read_vehicle_poses(
     wanted = {name: schemas[name] for name in (topics.camera_pose, topics.vehicle_pose)}
     found, _ = _read_messages(path, wanted)
     _, times, poses = _camera_poses(path, found, topics, mount)
-    return times, poses @ np.linalg.inv(mount_matrix(np.zeros(3), mount)[0])
+    return times, poses @ np.linalg.inv(camera_to_body(mount))
 
 
 def _camera_poses(
@@ -162,7 +162,7 @@ def _camera_poses(
     """Return the topic, times (n,) and poses (n, 4, 4) of the camera, OpenCV axes."""
     name, body_to_camera = topics.camera_pose, np.eye(4)
     if not found[name]:
-        name, body_to_camera = topics.vehicle_pose, mount_matrix(np.zeros(3), mount)[0]
+        name, body_to_camera = topics.vehicle_pose, camera_to_body(mount)
     if not found[name]:
         raise InputError(
             f"{path}: no message on {topics.camera_pose} or {topics.vehicle_pose}; "

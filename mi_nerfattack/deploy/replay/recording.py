@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
 from mi_nerfattack.render.camera.pose import check_rigid
 from mi_nerfattack.vehicle.route.polyline import LARGEST_M
 
@@ -56,7 +56,7 @@ def vehicle_states(track: Track, mount: CameraMount) -> np.ndarray:
         track: poses of its camera.
         mount: of the camera on it.
     """
-    to_body = np.linalg.inv(mount_matrix(np.zeros((1, 3)), mount)[0])
+    to_body = np.linalg.inv(camera_to_body(mount))
     bodies = track.camera_to_world @ to_body
     headings = np.arctan2(bodies[:, 1, 0], bodies[:, 0, 0])
     return np.column_stack([bodies[:, :2, 3], headings])

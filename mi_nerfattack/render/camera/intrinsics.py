@@ -127,16 +127,20 @@ def from_fov(width: int, height: int, fov_x_deg: float) -> Camera:
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
 
+def ray_slopes(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return x / z and y / z of the rays through pixels' centres, (height, width)."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return undistort(x, y, *camera.distortion) if camera.is_distorted else (x, y)
+
+
 def ray_lengths(camera: Camera) -> np.ndarray:
     """Return how far each pixel's ray goes per distance along the optical axis.
 
     Returns:
         (height, width), float64, at least 1, of rays through the pixels' centres.
     """
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    if camera.is_distorted:
-        x, y = undistort(x, y, *camera.distortion)
+    x, y = ray_slopes(camera)
     return np.sqrt(1 + x * x + y * y)
 
 
@@ -243,6 +247,11 @@ def mount_matrix(states: np.ndarray, mount: CameraMount) -> np.ndarray:
     matrix[:, 2, 3] = mount.height_m
     matrix[:, 3, 3] = 1
     return matrix
+
+
+def camera_to_body(mount: CameraMount) -> np.ndarray:
+    """Return the pose (4, 4) of a mounted camera in its vehicle's frame."""
+    return mount_matrix(np.zeros((1, 3)), mount)[0]
 
 
 def pose_arrays(camera_to_world: np.ndarray) -> tuple[Any, tuple[Any, Any, Any]]:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
-
 from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import CameraMount, camera_to_body
 from mi_nerfattack.robot.devices import (
     AbstractCamera,
     Clock,
@@ -49,7 +47,7 @@ class RenderedCamera(AbstractCamera):
             raise InputError(f"period_s: {period_s}; positive and finite, seconds")
         self.camera = view.camera
         self._view, self._pose, self._clock = view, pose, clock
-        self._to_body = mount_matrix(np.zeros((1, 3)), mount)[0]
+        self._to_body = camera_to_body(mount)
         self._start_s, self._period_s, self._seed = clock(), period_s, seed
         self._frame: Frame | None = None
         self._is_closed = False

@@ -18,8 +18,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.distortion import undistort
-from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.intrinsics import Camera, ray_slopes
 from mi_nerfattack.robot.camera.preparation import AbstractPreparation
 from mi_nerfattack.system.extras import load_extra
 
@@ -177,12 +176,7 @@ class LeftEye(AbstractPreparation):
     def _places(self, eye: EyeCalibration) -> tuple[np.ndarray, np.ndarray]:
         """Return the column and the row (h, w) of the reduced picture of each pixel."""
         camera, source = self.camera, eye.pinhole.resized(*self._reduced_px)
-        columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
-        x, y = np.meshgrid(
-            (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-        )
-        if camera.is_distorted:
-            x, y = undistort(x, y, *camera.distortion)
+        x, y = ray_slopes(camera)
         k1, k2, _, _, k3 = eye.distortion
         r2 = np.linspace(0, float((x * x + y * y).max()), 1000)
         if not (1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all():

@@ -11,7 +11,7 @@ from mi_nerfattack.capture.pose_files import read_poses
 from mi_nerfattack.deploy.replay.mcap import read_vehicle_poses
 from mi_nerfattack.deploy.replay.recording import Track
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_matrix
+from mi_nerfattack.render.camera.intrinsics import CameraMount, camera_to_body
 from mi_nerfattack.robot.devices import (
     AbstractTracker,
     Clock,
@@ -71,5 +71,5 @@ def read_body_track(path: Path, mount: CameraMount) -> Track:
     table = read_poses(path, mount)
     if table.times is None:
         raise InputError(f"{path}: no times; add a column time_s, seconds")
-    to_body = np.linalg.inv(mount_matrix(np.zeros((1, 3)), mount)[0])
+    to_body = np.linalg.inv(camera_to_body(mount))
     return Track(str(path), table.times, table.camera_to_world @ to_body)
