@@ -79,6 +79,8 @@ class MotorValues:
         fault: number of a fault, 0 for none.
         fault_name: of it.
         has_timed_out: whether the controller brakes because nobody commands it.
+        is_killed: whether it brakes because its kill switch is pressed; let go, it
+            would obey commands again.
     """
 
     time_s: float
@@ -88,6 +90,7 @@ class MotorValues:
     fault: int = 0
     fault_name: str = "none"
     has_timed_out: bool | None = None
+    is_killed: bool | None = None
 
 
 @dataclass(frozen=True)

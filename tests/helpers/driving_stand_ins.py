@@ -42,6 +42,7 @@ class Bench:
         control: of the policy.
         offset_m: of the car, along x.
         fault: of the motor controller.
+        killed: whether its kill switch is pressed.
         stall_s: that the camera's next answer takes.
         asleep_s: that the computer was suspended, which no device tells.
     """
@@ -52,7 +53,8 @@ class Bench:
         self.broken: dict[str, Exception | KeyboardInterrupt] = {}
         self.silent: dict[str, float] = {}
         self.held, self.control, self.offset_m = False, 0.2, 0.0
-        self.fault, self.stall_s, self.asleep_s = 0, 0.0, 0.0
+        self.fault, self.killed = 0, False
+        self.stall_s, self.asleep_s = 0.0, 0.0
         self.plans: list[tuple[float, Callable[[], None]]] = []
         self.motor = StandInMotor(self)
         limit_s = JUDGE.ages.loop_s
@@ -171,6 +173,7 @@ class StandInMotor(devices.AbstractMotor):
                 fault=bench.fault,
                 fault_name="over temperature" if bench.fault else "none",
                 has_timed_out=bench.now - last > 0.25,
+                is_killed=bench.killed,
             )
         return self._values
 

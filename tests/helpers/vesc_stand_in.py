@@ -3,10 +3,10 @@
     python tests/helpers/vesc_stand_in.py --log car.jsonl --firmware 6.05
 
 prints the name of its port, and writes what it does to the log. It obeys lines on its
-standard input: `unplug` for good, `mute` its answers, `fault N` among its values. It
-knows the protocol from the firmware's description alone: nothing of the package is used
-here. Its time is that of the monotonic clock, but it stands still while this process
-does not run: a busy machine makes no timeout.
+standard input: `unplug` for good, `mute` its answers, `fault N` among its values,
+`kill` as its kill switch does. It knows the protocol from the firmware's description
+alone: nothing of the package is used here. Its time is that of the monotonic clock, but
+it stands still while this process does not run: a busy machine makes no timeout.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Controller:
         self.flaw, self.log, self.car = options.flaw, log, Car()
         self.time = self.alive = 0.0
         self.ticks, self.servo, self.fault = 0, 0.5, 0
-        self.timed_out = self.mute = False
+        self.timed_out = self.mute = self.killed = False
         signature = SIGNATURES.get(self.firmware, 763356168)
         rest = random.Random(5).randbytes(options.config_bytes - 14)
         timeout = struct.pack(
@@ -125,6 +125,11 @@ class Controller:
         )
         self.config = timeout + rest
         self.busy_until = 0.0
+
+    @property
+    def brake_a(self) -> float:
+        """Current that its timeout and its kill switch brake with."""
+        return struct.unpack_from(">f", self.config, 9)[0]
 
     def tell(self, event: str) -> None:
         """Write a line of the log."""
@@ -153,13 +158,13 @@ class Controller:
                 self.tell("")
 
     def _check_timeout(self) -> None:
-        limit, current = struct.unpack_from(">If", self.config, 5)
+        (limit,) = struct.unpack_from(">I", self.config, 5)
         silent = (self.time - self.alive) * 1000 > limit
         if limit == 0 or not silent or self.timed_out or self.flaw == "endless":
             return
         self.timed_out = True
         rolls = self.flaw == "coasting"
-        self.car.mode, self.car.value = "brake", 0.0 if rolls else current
+        self.car.mode, self.car.value = "brake", 0.0 if rolls else self.brake_a
         self.tell("timeout")
 
     def answer(self, payload: bytes) -> bytes | None:
@@ -191,6 +196,8 @@ class Controller:
         if number == 30 or len(rest) != 4:
             return
         value = struct.unpack(">i", rest)[0]
+        if self.killed:
+            return
         modes = {6: ("current", 1e3), 7: ("brake", 1e3), 8: ("rpm", 1.0)}
         mode, scale = modes.get(number, ("current", math.inf))
         self.car.mode, self.car.value = mode, value / scale
@@ -221,7 +228,7 @@ class Controller:
             (">i", int(self.car.speed * ERPM_PER_MS)), (">h", 158), (">i", 1234),
             (">i", 56), (">i", 19000), (">i", 800), (">i", steps), (">i", way),
             (">B", self.fault), (">i", 0), (">B", 9), (">hhh", 301, 302, 303),
-            (">i", 0), (">i", 2000), (">B", int(self.timed_out)),
+            (">i", 0), (">i", 2000), (">B", self.timed_out | self.killed << 1),
         ]  # fmt: skip
         if self.flaw == "dumb":
             del fields[21]
@@ -241,6 +248,9 @@ def obey(controller: Controller, line: str, ends: list[int]) -> None:
         controller.mute = True
     elif word == "fault":
         controller.fault = int(value)
+    elif word == "kill":
+        controller.killed = True
+        controller.car.mode, controller.car.value = "brake", controller.brake_a
 
 
 def run(options: argparse.Namespace) -> None:

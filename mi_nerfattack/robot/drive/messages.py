@@ -103,6 +103,7 @@ TOPICS: dict[str, tuple[str, dict[str, Any]]] = {
             fault=_WHOLE,
             fault_name=_TEXT,
             has_timed_out={"type": ["boolean", "null"]},
+            is_killed={"type": ["boolean", "null"]},
         ),
     ),
     "/ages": (

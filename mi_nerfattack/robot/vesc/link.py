@@ -61,15 +61,16 @@ class Link:
     def send(self, *payloads: bytes) -> None:
         """Send payloads, one right behind the other; from any thread.
 
+        It tries even where nothing can be heard any more: a brake may still arrive.
+
         Raises:
             DeviceLostError: the port is gone, or takes nothing.
         """
         raw = b"".join(map(encode_frame, payloads))
         with self._writing:
-            self._check()
             try:
                 self._serial.write(raw)
-            except (serial.SerialException, OSError) as err:
+            except Exception as err:  # pyserial has no common class of its own
                 raise DeviceLostError(f"{self.port}: {err}; check its cable") from err
 
     def newest(self, kind: Id) -> Answer | None:
@@ -79,7 +80,7 @@ class Link:
             DeviceLostError: the port is gone.
         """
         with self._heard:
-            self._check()
+            self.check()
             return self._newest.get(kind)
 
     def ask(self, question: bytes, within_s: float, tries: int = 1) -> Answer:
@@ -102,7 +103,7 @@ class Link:
                 self._heard.wait_for(
                     lambda: self._lost or kind in self._newest, within_s
                 )
-                self._check()
+                self.check()
                 if kind in self._newest:
                     return self._newest[kind]
         raise DeviceLostError(
@@ -116,7 +117,12 @@ class Link:
         self._thread.join()
         self._serial.close()
 
-    def _check(self) -> None:
+    def check(self) -> None:
+        """Check that answers can be heard.
+
+        Raises:
+            DeviceLostError: the port is gone.
+        """
         if self._lost:
             raise DeviceLostError(self._lost)
 
@@ -130,7 +136,7 @@ class Link:
                     for payload in found:
                         self._newest[payload[0]] = Answer(payload, time.monotonic())
                     self._heard.notify_all()
-        except (serial.SerialException, OSError) as err:
+        except Exception as err:  # termios.error and TypeError, too, of a port gone
             with self._heard:
                 self._lost = f"{self.port}: {err}; check its cable and its battery"
                 self._heard.notify_all()

@@ -77,6 +77,11 @@ class Values:
         """Whether the controller brakes because nobody commands it."""
         return None if self.status is None else bool(self.status & 1)
 
+    @property
+    def is_killed(self) -> bool | None:
+        """Whether its kill switch is pressed."""
+        return None if self.status is None else bool(self.status & 2)
+
 
 # In the order of the answer, which is that of the bits of a mask: how each is written,
 # what it is multiplied with, and its name, where anybody asks for it.

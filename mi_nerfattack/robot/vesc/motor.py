@@ -106,7 +106,7 @@ class VescMotor(AbstractMotor):
 
         Raises:
             InputError: not armed, or not finite.
-            DeviceLostError: it cannot be sent.
+            DeviceLostError: it cannot be sent, or no answer could be heard.
         """
         if not self._is_armed:
             raise InputError("VESC: not armed; call arm() with the wheels lifted")
@@ -117,6 +117,7 @@ class VescMotor(AbstractMotor):
         erpm, servo = self.calibration.encode(command)
         current_a = self.calibration.brake_current_a
         turn = set_rpm(erpm) if erpm else set_current_brake(current_a)
+        self._link.check()
         self._link.send(set_servo_position(servo), turn)
         return self.calibration.decode(erpm, servo)
 
@@ -180,4 +181,5 @@ class VescMotor(AbstractMotor):
             values.fault or 0,
             fault_name(values.fault or 0),
             values.has_timed_out,
+            values.is_killed,
         )

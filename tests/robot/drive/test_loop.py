@@ -55,6 +55,7 @@ FAULTS = {
     Cause.MOTOR_LOST: breaks("motor", DeviceLostError("serial: gone")),
     Cause.PILOT_LOST: breaks("pilot", DeviceLostError("policy: failed")),
     Cause.MOTOR_FAULT: sets(fault=5),
+    Cause.MOTOR_KILLED: sets(killed=True),
     Cause.MOTOR_TIMED_OUT: falls_silent("motor"),
     Cause.LOOP_LATE: sets(stall_s=0.35),
     Cause.EXCEPTION: breaks("camera", ZeroDivisionError("a mistake")),
@@ -191,6 +192,17 @@ def test_nothing_moves_before_the_enable_is_released_and_held(tmp_path):
     bench.at(3.5, partial(setattr, bench, "held", True))
     bench.drive(tmp_path / "drive.mcap", duration_s=1.0)
     assert bench.events[0][1] == "send" and bench.events[0][0] >= bench.start_s + 3.5
+
+
+def test_nothing_moves_while_the_kill_switch_is_pressed(tmp_path):
+    bench = Bench()
+    bench.killed = True
+    bench.at(1.0, partial(setattr, bench, "held", True))
+    bench.at(2.0, partial(setattr, bench, "killed", False))
+    bench.at(3.0, partial(setattr, bench, "held", False))
+    bench.at(4.0, partial(setattr, bench, "held", True))
+    bench.drive(tmp_path / "drive.mcap", duration_s=1.0)
+    assert bench.events[0][1] == "send" and bench.events[0][0] >= bench.start_s + 4.0
 
 
 def test_an_enable_that_is_held_too_early_is_pressed_again(tmp_path):

@@ -5,12 +5,15 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import termios
 import time
 from contextlib import closing
 
 import pytest
+import serial
 from helpers import vesc_host
 from helpers.vesc_stand_in import StandIn
+from helpers.waiting import wait_for
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import Command, DeviceLostError
@@ -70,6 +73,7 @@ def test_a_car_that_nobody_commands_stops(start):
         values = motor.read()
         while values is None or not values.has_timed_out:
             values = motor.read()
+        assert not values.is_killed
         assert values.input_voltage_v == 15.8 and values.fault_name == "none"
 
 
@@ -93,6 +97,10 @@ def test_what_is_sent(start):
         while values is None or not values.fault:
             values = motor.read()
         assert (values.fault, values.fault_name) == (2, "under voltage")
+        car.tell("kill")
+        while not values.is_killed:
+            values = motor.read()
+            assert values is not None
         car.tell("mute")
         with pytest.raises(DeviceLostError, match=r"no answer for 0\.\d\d s"):
             while True:
@@ -114,6 +122,26 @@ def test_a_pulled_plug(start):
         with pytest.raises(DeviceLostError):
             motor.read()
         check_stopped(car)
+
+
+@pytest.mark.parametrize("error", [serial.SerialException, termios.error, TypeError])
+def test_a_brake_is_sent_where_nothing_is_heard(start, monkeypatch, error):
+    car = start()
+    with closing(VescMotor(car.port)) as motor:
+
+        def read(*_):
+            raise error("reads no more")
+
+        def is_lost() -> bool:
+            try:
+                return motor.read() is not None
+            except DeviceLostError as lost:
+                return "reads no more; check its cable" in str(lost)
+
+        monkeypatch.setattr(serial.Serial, "read", read)
+        wait_for(is_lost)
+        motor.brake()
+        car.wait_for_line(event="command 7", mode="brake")
 
 
 @pytest.fixture

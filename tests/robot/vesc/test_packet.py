@@ -171,9 +171,10 @@ WHOLE = messages.Values(
 def test_values_by_length():
     raw = whole_answer()
     assert messages.parse_values(raw) == WHOLE
-    assert WHOLE.has_timed_out
+    assert WHOLE.has_timed_out and WHOLE.is_killed
     older = messages.parse_values(raw[:73])
     assert older.status is None and older.has_timed_out is None and older.fault == 5
+    assert older.is_killed is None
     assert messages.parse_values(raw[:26]) == messages.Values(-12.3, 45.6, -20.5, 0.75)
     assert messages.parse_values(raw[:1]) == messages.Values()
 

@@ -40,6 +40,7 @@ class Cause(Enum):
     MOTOR_LOST = "motor lost"
     PILOT_LOST = "pilot lost"
     MOTOR_FAULT = "motor fault"
+    MOTOR_KILLED = "kill switch"
     MOTOR_TIMED_OUT = "motor controller timed out"
     LOOP_LATE = "loop late"
     LOG_FAILED = "log not written"
@@ -153,6 +154,8 @@ class Judge:
         if values.fault:
             found = f"{values.fault_name} (number {values.fault})"
             raise Stop(Cause.MOTOR_FAULT, found)
+        if values.is_killed:
+            raise Stop(Cause.MOTOR_KILLED, "that of the motor controller is pressed")
         driven = first_command_s is not None
         if (
             driven
