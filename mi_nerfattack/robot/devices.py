@@ -158,8 +158,12 @@ class AbstractMotor(ABC):
     """A motor controller with the steering servo."""
 
     @abstractmethod
-    def arm(self) -> None:
+    def arm(self, check: Callable[[], None] = lambda: None) -> None:
         """Prove that the car brakes by itself when commands stop, and let it move.
+
+        Args:
+            check: called again and again while wheels may turn; what it raises ends
+                this, braked and not armed.
 
         Raises:
             InputError: it is not proven; the message says what to do.

@@ -148,7 +148,7 @@ class StandInMotor(devices.AbstractMotor):
         self._bench, self._commanded_s = bench, -np.inf
         self._values: devices.MotorValues | None = None
 
-    def arm(self) -> None:
+    def arm(self, check: Callable[[], None] = lambda: None) -> None:
         """Nothing is proven here."""
 
     def send(self, command: devices.Command) -> devices.Command:

@@ -31,6 +31,7 @@ CHECK_S = 0.01  # the firmware looks at its timeout so often
 LONGEST_GAP_S = 0.2  # of this process's sleep that counts as time
 MASS_KG, NEWTON_PER_A, FRICTION_MS2 = 4.5, 0.66, 0.15
 ERPM_PER_MS, MOST_MS2 = 4614.0, 3.0  # of the speed controller
+HOLDING_A, STIFF_MS2 = 3.0, 6.0
 LEAST_ERPM = 900  # that it holds; for less it lets go of the motor
 ALIVE_IDS = {5, 6, 7, 8, 9, 10, 30, 84}
 SIGNATURES = {(7, 1): 982638166, (7, 0): 2099347128, (6, 5): 2099347128}
@@ -40,6 +41,7 @@ FLAWS = {
     "deaf": "ignores new configurations without an echo",
     "endless": "says that it has a timeout, and drives on",
     "coasting": "says that it brakes, and rolls",
+    "stiff": "says that it brakes, and its wheels stop by their friction alone",
     "dumb": "has no status byte among its values",
 }
 
@@ -90,6 +92,7 @@ class Car:
     def __init__(self) -> None:
         self.speed = self.distance = self.way = 0.0
         self.mode, self.value = "current", 0.0
+        self.friction_ms2, self.charge, self.counted_s = FRICTION_MS2, 0.0, 0.0
 
     def tick(self) -> None:
         """Move for a tick under what the motor does."""
@@ -97,7 +100,7 @@ class Car:
             wanted = (self.value / ERPM_PER_MS - self.speed) / 0.05
             self.speed += max(-MOST_MS2, min(MOST_MS2, wanted)) * TICK_S
         else:
-            rolling = FRICTION_MS2
+            rolling = self.friction_ms2
             if self.mode == "brake":
                 rolling += abs(self.value) * NEWTON_PER_A / MASS_KG
             elif self.mode == "current":
@@ -106,6 +109,19 @@ class Car:
             self.speed = math.copysign(slower, self.speed)
         self.distance += self.speed * TICK_S
         self.way += abs(self.speed) * TICK_S
+        self.charge += self._current() * TICK_S
+        self.counted_s += TICK_S
+
+    def _current(self) -> float:
+        if self.mode == "brake":
+            return -self.value if self.speed else 0.0
+        return HOLDING_A if self.mode == "rpm" else self.value
+
+    def take_current(self) -> float:
+        """Return the motor's mean current since this was called last."""
+        mean = self.charge / self.counted_s if self.counted_s else self._current()
+        self.charge = self.counted_s = 0.0
+        return mean
 
 
 class Controller:
@@ -115,6 +131,8 @@ class Controller:
         major, minor = options.firmware.split(".")
         self.firmware = int(major), int(minor)
         self.flaw, self.log, self.car = options.flaw, log, Car()
+        if self.flaw == "stiff":
+            self.car.friction_ms2 = STIFF_MS2
         self.time = self.alive = 0.0
         self.ticks, self.servo, self.fault = 0, 0.5, 0
         self.timed_out = self.mute = self.killed = False
@@ -163,7 +181,7 @@ class Controller:
         if limit == 0 or not silent or self.timed_out or self.flaw == "endless":
             return
         self.timed_out = True
-        rolls = self.flaw == "coasting"
+        rolls = self.flaw in ("coasting", "stiff")
         self.car.mode, self.car.value = "brake", 0.0 if rolls else self.brake_a
         self.tell("timeout")
 
@@ -219,7 +237,7 @@ class Controller:
         return bytes([number])
 
     def _values(self, mask: int) -> bytes:
-        current = self.car.value if self.car.mode != "rpm" else 3.0
+        current = self.car.take_current()
         steps = round(self.car.distance * ERPM_PER_MS / 10)
         way = round(self.car.way * ERPM_PER_MS / 10)
         fields = [

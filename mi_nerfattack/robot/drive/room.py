@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -125,7 +126,7 @@ class SimulatedMotor(AbstractMotor):
     def __init__(self, room: SimulatedRoom) -> None:
         self._room, self._values, self._is_armed = room, None, False
 
-    def arm(self) -> None:
+    def arm(self, check: Callable[[], None] = lambda: None) -> None:
         """Let it move; its timeout is that of the simulation."""
         self._is_armed = True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 from mi_nerfattack.errors import InputError
@@ -77,10 +78,14 @@ class VescMotor(AbstractMotor):
             self._link.close()
             raise
 
-    def arm(self) -> None:
+    def arm(self, check: Callable[[], None] = lambda: None) -> None:
         """Set the timeout, prove it by turning the wheels, and let the car move.
 
         The wheels turn at 0.5 m/s for about a second: lift them off the ground.
+
+        Args:
+            check: called before each command and reading while they may turn; what it
+                raises ends this, braked and not armed.
 
         Raises:
             InputError: it is not proven; the message says what to do.
@@ -89,7 +94,7 @@ class VescMotor(AbstractMotor):
         self._is_armed = False
         try:
             set_timeout(self._link, self.firmware, self.calibration, self._confirm)
-            prove_timeout(self._link, self.calibration)
+            prove_timeout(self._link, self.calibration, check)
         finally:
             self.brake()
         self._waits_since, self._way = None, 0

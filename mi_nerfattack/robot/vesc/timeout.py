@@ -37,6 +37,8 @@ PROOF_SPEED_MS, _TURN_S = 0.5, 3.0
 _MARGIN_S, _STOP_S = 0.05, 0.5
 # An answer that is later than this past the limit leaves open when the timeout fired.
 _LATE_S, _TRIES = 0.2, 5
+# A current brakes that is more than this of the one asked for, and of that before.
+_SHARE, _RISE = 0.25, 1.5
 
 #: Answers a question; True is yes.
 Confirm = Callable[[str], bool]
@@ -86,43 +88,58 @@ def set_timeout(
         )
 
 
-def prove_timeout(link: Link, calibration: Calibration) -> None:
+def prove_timeout(
+    link: Link, calibration: Calibration, check: Callable[[], None]
+) -> None:
     """Turn the wheels, fall silent, and see the controller brake them.
 
+    Args:
+        link: to it.
+        calibration: of the car.
+        check: called while the wheels may turn; what it raises ends the proof.
+
     Raises:
-        InputError: the wheels do not turn, or it does not brake in time.
+        InputError: the wheels do not turn, it does not brake in time, or they only
+            roll to a stop.
         DeviceLostError: no answer.
     """
-    limit_s = calibration.timeout_ms / 1000 + _MARGIN_S
+    limit_s, is_braked = calibration.timeout_ms / 1000 + _MARGIN_S, True
     for _ in range(_TRIES):
-        silent, turning = _turn_wheels(link, calibration)
-        late, values = _fall_silent(link, silent, limit_s)
-        if not values.has_timed_out:
+        silent, turning = _turn_wheels(link, calibration, check)
+        late, seen = _fall_silent(link, silent, limit_s, check)
+        if not seen[-1].has_timed_out:
             raise InputError(
                 f"VESC: {1000 * limit_s:.0f} ms after the last command it does not "
                 f"brake, though its timeout reads {calibration.timeout_ms} ms; do not "
                 "drive with it"
             )
-        _see_it_brake(link, turning, values)
-        if late < limit_s + _LATE_S:
+        seen += _see_it_brake(link, turning, seen[-1], check)
+        is_braked = _is_braked(seen, calibration.brake_current_a)
+        if is_braked and late < limit_s + _LATE_S:
             return
+    if not is_braked:
+        raise InputError(
+            "VESC: its timeout fires, but the wheels roll to a stop: it never shows a "
+            f"quarter of {calibration.brake_current_a:g} A; raise brake_current_a, or "
+            "the motor's own limits (VESC Tool: Motor Settings)"
+        )
     raise InputError(
         f"VESC: this computer was too busy, {_TRIES} times, to see when the timeout "
         "fired; end other programs"
     )
 
 
-def _turn_wheels(link: Link, calibration: Calibration) -> tuple[float, int]:
+def _turn_wheels(
+    link: Link, calibration: Calibration, check: Callable[[], None]
+) -> tuple[float, int]:
     """Return when the last command was sent, and how fast the wheels turned by then."""
     erpm = round(PROOF_SPEED_MS * calibration.erpm_per_ms)
     end = time.monotonic() + _TURN_S
     while True:
+        check()
         sent = time.monotonic()
         link.send(set_rpm(erpm))
-        _, values = _values(link)
-        if values.fault:
-            name = fault_name(values.fault)
-            raise InputError(f"VESC: fault {values.fault} ({name}); mend it first")
+        _, values = _watch(link, check)
         turning = values.erpm or 0
         if turning > 0.8 * erpm and not values.has_timed_out:
             return sent, turning
@@ -134,18 +151,25 @@ def _turn_wheels(link: Link, calibration: Calibration) -> tuple[float, int]:
         time.sleep(0.02)
 
 
-def _fall_silent(link: Link, silent: float, limit_s: float) -> tuple[float, Values]:
-    """Return the first values asked for past the limit, and how late they came."""
+def _fall_silent(
+    link: Link, silent: float, limit_s: float, check: Callable[[], None]
+) -> tuple[float, list[Values]]:
+    """Return all values up to the first asked for past the limit, and how late."""
+    seen: list[Values] = []
     while True:
         time.sleep(0.01)
         asked = time.monotonic()
-        heard, values = _values(link)
+        heard, values = _watch(link, check)
+        seen.append(values)
         if asked > silent + limit_s:
-            return heard - silent, values
+            return heard - silent, seen
 
 
-def _see_it_brake(link: Link, turning: int, values: Values) -> None:
-    end = time.monotonic() + _STOP_S
+def _see_it_brake(
+    link: Link, turning: int, values: Values, check: Callable[[], None]
+) -> list[Values]:
+    """Return the values that follow, until the wheels are at half their speed."""
+    end, seen = time.monotonic() + _STOP_S, []
     while abs(values.erpm or 0) > turning / 2:
         if time.monotonic() > end:
             raise InputError(
@@ -153,7 +177,37 @@ def _see_it_brake(link: Link, turning: int, values: Values) -> None:
                 f"{turning} ERPM; raise brake_current_a, or the motor's own limit"
             )
         time.sleep(0.01)
-        _, values = _values(link)
+        _, values = _watch(link, check)
+        seen.append(values)
+    return seen
+
+
+def _is_braked(seen: list[Values], brake_current_a: float) -> bool:
+    """Whether a current brakes: lifted wheels come to rest without one, too.
+
+    Each value is a mean since the one before. Its sign tells nothing: so slowly, even
+    braking takes power.
+    """
+    turning = [_current(values) for values in seen if not values.has_timed_out]
+    braking = [_current(values) for values in seen if values.has_timed_out]
+    held_a = turning[-1] if turning else 0.0
+    return max(braking) > max(_SHARE * brake_current_a, _RISE * held_a)
+
+
+def _current(values: Values) -> float:
+    return abs(values.motor_current_a or 0.0)
+
+
+def _watch(link: Link, check: Callable[[], None]) -> tuple[float, Values]:
+    """Return when values came, and them; refuse what makes them prove nothing."""
+    check()
+    heard, values = _values(link)
+    if values.fault:
+        name = fault_name(values.fault)
+        raise InputError(f"VESC: fault {values.fault} ({name}); mend it first")
+    if values.is_killed:
+        raise InputError("VESC: its kill switch is pressed; let it go, and arm again")
+    return heard, values
 
 
 def _values(link: Link) -> tuple[float, Values]:

@@ -188,6 +188,7 @@ REFUSED = {
     "deaf": (["--flaw", "deaf"], "no answer to SET_APPCONF_NO_STORE"),
     "endless": (["--flaw", "endless"], "300 ms after the last command it does not"),
     "coasting": (["--flaw", "coasting"], "the wheels turn on at"),
+    "stiff": (["--flaw", "stiff"], "never shows a quarter of 20 A; raise"),
     "dumb": (["--flaw", "dumb"], "6.05 on 410 does not say whether its"),
     "declined": (["--firmware", "5.03"], "5.03 on 410 keeps its timeout of 1000 ms"),
     "older": (["--firmware", "3.57"], r"3\.57 .* known of 3\.58 to 7\.x alone"),
@@ -196,7 +197,7 @@ REFUSED = {
 }
 
 
-SLOW = {"deaf": [pytest.mark.slow], "coasting": [pytest.mark.slow]}
+SLOW = {name: [pytest.mark.slow] for name in ("deaf", "coasting", "stiff")}
 
 
 @pytest.mark.parametrize(
@@ -211,6 +212,40 @@ def test_what_is_not_armed(start, name):
         with pytest.raises(InputError, match="not armed"):
             motor.send(Command(1.0, 0.0))
         car.wait_for_line(event="command 7")  # it brakes, as well as it can
+
+
+class LetGoError(Exception):
+    """What a check raises."""
+
+
+@pytest.mark.parametrize("event", ["command 8", "timeout"])
+def test_arming_ends_as_soon_as_its_check_says_so(start, event):
+    car, found = start(), []
+
+    def check() -> None:
+        if any(line["event"] == event for line in car.log()):
+            found.append(event)
+            raise LetGoError
+
+    with closing(VescMotor(car.port)) as motor:
+        with pytest.raises(LetGoError):
+            motor.arm(check)
+        assert len(found) == 1  # asked no more, since nothing moves
+        with pytest.raises(InputError, match="not armed"):
+            motor.send(Command(1.0, 0.0))
+        car.wait_for(event="", mode="brake", speed_ms=0.0, servo=0.53)
+
+
+def test_a_kill_switch_proves_no_timeout(start):
+    car = start()
+
+    def check() -> None:
+        if car.log()[-1]["mode"] == "rpm":
+            car.tell("kill")
+
+    with closing(VescMotor(car.port)) as motor:
+        with pytest.raises(InputError, match="kill switch is pressed; let it go"):
+            motor.arm(check)
 
 
 @pytest.mark.slow
