@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
+    from mi_nerfattack.robot.devices import AbstractEnable
     from mi_nerfattack.robot.vesc.calibration import Calibration
     from mi_nerfattack.robot.vesc.guided import Arc
     from mi_nerfattack.robot.vesc.motor import VescMotor
+
+_FASTEST_MS, _FARTHEST_M = 1.5, 5.0
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,8 @@ class Calibrate:
     """Find the scales of a car's motor and steering servo, and write them to a file.
 
     Three short drives, straight, to the left and to the right, each of which you
-    measure with a tape. It asks before anything moves; Ctrl-C brakes.
+    measure with a tape. It asks before anything moves, and moves only while a button
+    is held; letting it go brakes, as Ctrl-C does.
     """
 
     port: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PORT")]
@@ -30,19 +35,32 @@ class Calibrate:
     """File for the calibration (.toml); one that exists is not written over."""
     calibration: Path | None = None
     """File to begin with; by default the scales of a RACECAR/J."""
-    wheelbase_m: float = 0.25
-    """From the front to the rear axle, metres."""
+    wheelbase_m: float | None = None
+    """From the front to the rear axle, metres: 0.325. Kept in the file."""
     speed_ms: float = 0.5
-    """Speed of the drives."""
+    """Speed of the drives, up to 1.5."""
     distance_m: float = 1.5
-    """Length of each drive, by the calibration that it begins with."""
+    """Length of each drive, up to 5, by the calibration that it begins with."""
     steering_rad: float = 0.2
     """Steering of the drives that turn, by that calibration."""
     baudrate: int = 115_200
     """Of the port, if it is a UART."""
+    enable: str = "/dev/input/js0"
+    """Joystick with the button to hold."""
+    button: int = 5
+    """Its number, from 0."""
+    silence_s: float | None = None
+    """Seconds without any event of the joystick after which the button counts as let
+    go; for wireless ones that send all the time. Never by default."""
 
     def run(self) -> int:
         """Ask, arm, drive, ask, fit and write."""
+        from mi_nerfattack.deploy.car import SMALL_CAR
+        from mi_nerfattack.robot.drive.safety.enable import (
+            JoystickEnable,
+            check_held,
+            wait_for_press,
+        )
         from mi_nerfattack.robot.vesc.calibration import (
             Calibration,
             read_calibration,
@@ -51,29 +69,33 @@ class Calibrate:
         from mi_nerfattack.robot.vesc.guided import fit_arcs
         from mi_nerfattack.robot.vesc.motor import VescMotor
 
-        self._check()
         before = Calibration()
         if self.calibration is not None:
             before = read_calibration(self.calibration)
-        with closing(VescMotor(self.port, before, _confirm, self.baudrate)) as motor:
+        self._check(before)
+        wheelbase_m = self.wheelbase_m or before.wheelbase_m or SMALL_CAR.wheelbase
+        pad = JoystickEnable(self.enable, self.button, time.monotonic, self.silence_s)
+        with (
+            closing(pad),
+            closing(VescMotor(self.port, before, _confirm, self.baudrate)) as motor,
+        ):
             print(f"{self.port}: firmware {motor.firmware}")
-            _ask(
-                "Lift the wheels off the ground: they turn for a second. Enter to go on"
-            )
-            motor.arm()
-            print(
+            _ask("Lift the wheels off the ground: they turn for a second. Enter")
+            wait_for_press(pad, time.sleep, _say)
+            motor.arm(lambda: check_held(pad))
+            _say(
                 f"Armed: without commands it brakes after {before.timeout_ms} ms with "
                 f"{before.brake_current_a:g} A."
             )
             arcs = [
-                self._measure(motor, name, sign * self.steering_rad)
+                self._measure(motor, pad, name, sign * self.steering_rad)
                 for name, sign in (
                     ("straight", 0),
                     ("to the left", 1),
                     ("to the right", -1),
                 )
             ]
-        found, away_rad, spread = fit_arcs(arcs, self.wheelbase_m, before)
+        found, away_rad, spread = fit_arcs(arcs, wheelbase_m, before)
         write_calibration(self.output, found)
         self._tell(before, found)
         print(
@@ -82,39 +104,86 @@ class Calibrate:
         )
         return 0
 
-    def _check(self) -> None:
+    def _check(self, before: Calibration) -> None:
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.io import files
 
-        for name in ("wheelbase_m", "speed_ms", "distance_m", "steering_rad"):
+        slowest = before.erpm_least / before.erpm_per_ms
+        bounds = {
+            "wheelbase_m": (0.0, 5.0),
+            "speed_ms": (slowest, _FASTEST_MS),
+            "distance_m": (0.1, _FARTHEST_M),
+            "steering_rad": (0.0, before.steering_most_rad),
+        }
+        for name, (least, most) in bounds.items():
             value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise InputError(f"--{name.replace('_', '-')}: {value}; more than 0")
+            if value is not None and not least < value <= most:
+                raise InputError(
+                    f"--{name.replace('_', '-')}: {value}; more than {least:.3g}, at "
+                    f"most {most:g}"
+                )
         if self.output.exists():
             raise InputError(f"{self.output}: exists; choose another file")
         files.check_writable(self.output)
 
-    def _measure(self, motor: VescMotor, name: str, steering_rad: float) -> Arc:
-        """Drive once, and ask how far it came."""
+    def _measure(
+        self, motor: VescMotor, pad: AbstractEnable, name: str, steering_rad: float
+    ) -> Arc:
+        """Drive until a drive was not broken off, and ask how far it came."""
         from mi_nerfattack.robot.devices import Command
-        from mi_nerfattack.robot.vesc.guided import Arc, drive_arc
-
-        _ask(
-            f"Drive {name}, about {self.distance_m:g} m at {self.speed_ms:g} m/s. Put "
-            "the car on the floor with twice that free; mark where the middle of its "
-            "rear axle stands, and the line straight ahead. Enter to drive"
+        from mi_nerfattack.robot.drive.safety.enable import (
+            ReleasedError,
+            check_held,
+            wait_for_press,
         )
+        from mi_nerfattack.robot.vesc.guided import drive_arc
+
         command = Command(self.speed_ms, steering_rad)
-        servo, steps = drive_arc(motor, command, self.distance_m)
-        forward_m = _ask_number("How far along that line did the middle come, metres")
-        left_m = _ask_number("How far to its left, metres (right: negative)")
-        arc = Arc(servo, steps, forward_m, left_m)
-        print(f"Servo {servo:.3f}: {steps} steps of the motor, {arc.length_m:.3f} m.")
-        return arc
+        while True:
+            _ask(
+                f"Drive {name}, about {self.distance_m:g} m at {self.speed_ms:g} m/s. "
+                "Put the car on the floor with twice that free; mark where the middle "
+                "of its rear axle stands, and the line straight ahead. Enter"
+            )
+            wait_for_press(pad, time.sleep, _say)
+            try:
+                driven = drive_arc(
+                    motor, command, self.distance_m, lambda: check_held(pad)
+                )
+            except ReleasedError as error:
+                print(f"Braked: {error}. Once more.")
+            else:
+                return _ask_for_arc(*driven)
 
     def _tell(self, before: Calibration, found: Calibration) -> None:
         for name in ("erpm_per_ms", "servo_per_rad", "servo_centre"):
             print(f"{name} = {getattr(found, name)} (was {getattr(before, name)})")
+
+
+def _ask_for_arc(servo: float, steps: int) -> Arc:
+    """Ask where a drive ended, until the answer is confirmed and tells anything."""
+    from mi_nerfattack.errors import InputError
+    from mi_nerfattack.robot.vesc.guided import Arc
+
+    while True:
+        forward_m = _ask_number("How far along that line did the middle come, metres")
+        left_m = _ask_number("How far to its left, metres (right: negative)")
+        arc = Arc(servo, steps, forward_m, left_m)
+        try:
+            arc.check()
+        except InputError as error:
+            print(error)
+            continue
+        print(
+            f"Servo {servo:.3f}, {steps} steps of the motor: {forward_m:g} m ahead, "
+            f"{left_m:g} m to the left, a way of {arc.length_m:.3f} m."
+        )
+        if _ask("Is that right? [Y/n]").lower() not in ("n", "no"):
+            return arc
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
 
 
 def _ask(question: str) -> str:

@@ -12,12 +12,14 @@ from pydantic import Field
 
 from mi_nerfattack.deploy.car import SMALL_CAR, Car
 from mi_nerfattack.deploy.place import bundled_place
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.ranges import Acute, Count, NonNegative, Positive, Seconds, Whole
 from mi_nerfattack.robot.drive.loop import DriveSettings
 from mi_nerfattack.robot.drive.safety.fence import Fence
 from mi_nerfattack.robot.drive.safety.judge import Ages, Judge
 from mi_nerfattack.robot.drive.safety.limits import Limits, Steering
+from mi_nerfattack.robot.vesc.calibration import Calibration, read_calibration
 from mi_nerfattack.scenario.section import Section, read_section
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -150,6 +152,23 @@ class DriveConfig(Section):
             steering=Steering(self.control_unit, self.wheelbase_m),
             duration_s=self.duration_s,
         )
+
+    def read_scales(self) -> Calibration:
+        """Read the motor's calibration.
+
+        Raises:
+            InputError: it cannot be read, or is of a car with another wheelbase.
+        """
+        if self.calibration is None:
+            return Calibration()
+        scales = read_calibration(self.calibration)
+        if scales.wheelbase_m not in (None, self.wheelbase_m):
+            raise InputError(
+                f"{self.calibration}: its steering was measured with a wheelbase of "
+                f"{scales.wheelbase_m:g} m, and wheelbase_m is {self.wheelbase_m:g}; "
+                "give the car's to both"
+            )
+        return scales
 
     def log_path(self, now: datetime) -> Path:
         """Return the file for the log."""

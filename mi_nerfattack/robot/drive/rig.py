@@ -35,7 +35,6 @@ from mi_nerfattack.robot.drive.safety.watchdog import suspended_clock
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
 from mi_nerfattack.robot.tracker.open import open_tracker
-from mi_nerfattack.robot.vesc.calibration import Calibration, read_calibration
 from mi_nerfattack.robot.vesc.motor import VescMotor
 from mi_nerfattack.vehicle.expert.choose import expert_for
 from mi_nerfattack.vehicle.route.route import Route
@@ -112,7 +111,7 @@ def _real(
     confirm: Callable[[str], bool],
 ) -> Rig:
     mount = seeing.mount or bundled_place("room").mount
-    clock = time.monotonic
+    clock, scales = time.monotonic, config.read_scales()
 
     def path(name: str | None) -> Path | None:
         return None if name is None else Path(name)
@@ -130,9 +129,6 @@ def _real(
     stack.callback(enable.close)
     pilot = _pilot(config, route, policy, tracker, clock)
     stack.callback(pilot.close)
-    scales = Calibration()
-    if config.calibration is not None:
-        scales = read_calibration(config.calibration)
     motor = VescMotor(config.port, scales, confirm)
     stack.callback(motor.close)
     devices = Devices(seen, tracker, motor, pilot, enable)

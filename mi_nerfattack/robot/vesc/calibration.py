@@ -31,6 +31,7 @@ class Calibration(Section):
         steering_most_rad: largest steering angle, either way.
         brake_current_a: amperes through the motor to brake with.
         timeout_ms: how long the controller goes on without a command.
+        wheelbase_m: of the car, as its steering was measured; None if it never was.
     """
 
     erpm_per_ms: Annotated[float, Field(ge=100, le=100_000)] = 4614.0
@@ -43,6 +44,7 @@ class Calibration(Section):
     steering_most_rad: Acute = 0.34
     brake_current_a: Annotated[float, Field(ge=1, le=200)] = 20.0
     timeout_ms: Annotated[int, Field(ge=50, le=300)] = 250
+    wheelbase_m: Annotated[float, Field(gt=0, le=5)] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Calibration:
@@ -105,6 +107,7 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    lines = [f"{name} = {value!r}" for name, value in calibration.model_dump().items()]
+    known = calibration.model_dump(exclude_none=True)
+    lines = [f"{name} = {value!r}" for name, value in known.items()]
     head = "# motor controller and steering servo of one car: docs/robot.md"
     files.write_text(path, "\n".join([head, *lines, ""]))

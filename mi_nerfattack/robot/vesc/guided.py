@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,9 +54,24 @@ class Arc:
         """Of that way, 1/m, positive to the left."""
         return 2 * self.left_m / (self.forward_m**2 + self.left_m**2)
 
+    def check(self) -> None:
+        """Check that it tells anything.
+
+        Raises:
+            InputError: it is too short, or the motor did not turn.
+        """
+        if not self.length_m > 0.1 or not self.steps:
+            raise InputError(
+                f"VESC: {self.forward_m:g} m forward and {self.left_m:g} m left in "
+                f"{self.steps} steps of the motor; drive farther"
+            )
+
 
 def drive_arc(
-    motor: VescMotor, command: Command, distance_m: float
+    motor: VescMotor,
+    command: Command,
+    distance_m: float,
+    check: Callable[[], None],
 ) -> tuple[float, int]:
     """Drive until the motor has turned for a distance, and brake to a standstill.
 
@@ -64,20 +79,25 @@ def drive_arc(
         motor: armed; its own calibration says what the command and distance are to it.
         command: held all the way.
         distance_m: metres.
+        check: called before each command; what it raises brakes.
 
     Returns:
         The servo's position, and the steps of the tachometer.
 
     Raises:
-        InputError: it does not get that far, or does not stop.
+        InputError: it does not get that far, does not stop, has a fault, or its kill
+            switch is pressed.
         DeviceLostError: the controller is lost.
     """
     calibration = motor.calibration
     wanted = distance_m * calibration.erpm_per_ms / _ERPM_PER_STEP
-    start, sent = _steps(motor), motor.send(command)
+    start = _steps(motor)
+    check()
     end = time.monotonic() + 3.0 + 2 * distance_m / command.speed_ms
     try:
+        sent = motor.send(command)
         while abs(_steps(motor) - start) < wanted:
+            check()
             if time.monotonic() > end:
                 raise InputError(
                     f"VESC: no {distance_m:g} m at {command.speed_ms:g} m/s by the "
@@ -110,11 +130,7 @@ def fit_arcs(
         InputError: what they tell is not plausible.
     """
     for arc in arcs:
-        if not arc.length_m > 0.1 or not arc.steps:
-            raise InputError(
-                f"VESC: {arc.forward_m:g} m forward and {arc.left_m:g} m left in "
-                f"{arc.steps} steps of the motor; drive farther"
-            )
+        arc.check()
     scales = [_ERPM_PER_STEP * arc.steps / arc.length_m for arc in arcs]
     servo = np.array([arc.servo for arc in arcs])
     steering = np.arctan([wheelbase_m * arc.curvature for arc in arcs])
@@ -130,6 +146,7 @@ def fit_arcs(
         "erpm_per_ms": round(_ERPM_PER_STEP * mean, 1),
         "servo_per_rad": round(float(slope), 4),
         "servo_centre": round(float(foot), 4),
+        "wheelbase_m": wheelbase_m,
     }
     return (
         calibration.changed(found),
@@ -144,6 +161,9 @@ def _steps(motor: VescMotor) -> int:
     while True:
         read = motor.read()
         if read is not None and read.time_s > asked:
+            if read.fault or read.is_killed:
+                found = read.fault_name if read.fault else "its kill switch is pressed"
+                raise InputError(f"VESC: {found}; mend it, and begin again")
             return motor.values.tachometer or 0
         time.sleep(0.01)
 

@@ -12,6 +12,7 @@ import pytest
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.robot.drive.config import read_config
+from mi_nerfattack.robot.vesc.calibration import Calibration, write_calibration
 
 
 def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path):
@@ -50,6 +51,18 @@ def test_files_that_say_something_wrong(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         config = read_config(tmp_path / "drive.toml", {})
         config.settings(config.read_route())
+
+
+def test_a_calibration_of_another_wheelbase_is_refused(tmp_path):
+    path = tmp_path / "car.toml"
+    write_calibration(path, Calibration(timeout_ms=200))
+    assert read_config(None, {"calibration": str(path)}).read_scales().timeout_ms == 200
+    path = tmp_path / "measured.toml"
+    write_calibration(path, Calibration(wheelbase_m=0.25))
+    given = {"calibration": str(path), "wheelbase_m": 0.25}
+    assert read_config(None, given).read_scales().wheelbase_m == 0.25
+    with pytest.raises(InputError, match=r"measured\.toml: .* 0\.25 m, .* is 0\.325;"):
+        read_config(None, {"calibration": str(path)}).read_scales()
 
 
 def test_defaults_fence_the_route_and_take_twice_the_largest_control():

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
-import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.joystick import Pad
 from helpers.vesc_stand_in import StandIn
 from helpers.vicon_sender import Sender, datagrams
 
@@ -26,20 +24,6 @@ from mi_nerfattack.vehicle.route.route import Route
 
 CAMERA = "[camera]\nwidth = 32\nheight = 16\n"
 PORT = 51733
-
-
-class Pad:
-    """A joystick with one button."""
-
-    def __init__(self, path: Path) -> None:
-        os.mkfifo(path)
-        self._end = os.open(path, os.O_RDWR | os.O_NONBLOCK)
-
-    def press(self, is_down: bool) -> None:
-        os.write(self._end, struct.pack("<IhBB", 0, int(is_down), 1, 5))
-
-    def close(self) -> None:
-        os.close(self._end)
 
 
 @contextmanager

@@ -8,7 +8,12 @@ import struct
 import pytest
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.robot.drive.safety.enable import JoystickEnable
+from mi_nerfattack.robot.drive.safety.enable import (
+    JoystickEnable,
+    ReleasedError,
+    check_held,
+    wait_for_press,
+)
 
 BUTTON, AXIS, INITIAL = 1, 2, 0x80
 
@@ -87,6 +92,25 @@ def test_a_device_that_is_gone_holds_nothing(tmp_path):
     finally:
         if enable is not None:
             enable.close()
+
+
+def test_a_button_that_is_held_already_is_let_go_first(pad):
+    path, descriptor, time = pad
+    enable, told, steps = JoystickEnable(path, 4, lambda: time[0]), [], []
+    os.write(descriptor, event(1, BUTTON, 4))
+
+    def sleep(seconds: float) -> None:
+        steps.append(seconds)
+        if len(steps) in (3, 6):
+            os.write(descriptor, event(int(len(steps) == 6), BUTTON, 4))
+
+    wait_for_press(enable, sleep, told.append)
+    assert len(steps) == 6 and len(told) == 1
+    check_held(enable)
+    os.write(descriptor, event(0, BUTTON, 4))
+    with pytest.raises(ReleasedError, match="let go"):
+        check_held(enable)
+    enable.close()
 
 
 def test_a_device_that_is_not_there(tmp_path):

@@ -54,6 +54,7 @@ def test_the_file_keeps_every_value(tmp_path):
         steering_most_rad=0.3,
         brake_current_a=12.5,
         timeout_ms=200,
+        wheelbase_m=0.25,
     )
     write_calibration(path, calibration)
     assert read_calibration(path) == calibration

@@ -6,18 +6,26 @@ import math
 import signal
 import subprocess
 import sys
+from contextlib import closing
+from threading import Timer
 
 import pytest
+from helpers.joystick import Pad
 from helpers.vesc_stand_in import ERPM_PER_MS, StandIn
+from helpers.waiting import wait_for
 
 from mi_nerfattack import cli
+from mi_nerfattack.commands.calibrate import _ask_for_arc
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.robot.devices import AbstractEnable, Command
+from mi_nerfattack.robot.drive.safety import enable
 from mi_nerfattack.robot.vesc.calibration import (
     Calibration,
     read_calibration,
     write_calibration,
 )
-from mi_nerfattack.robot.vesc.guided import Arc, fit_arcs
+from mi_nerfattack.robot.vesc.guided import Arc, drive_arc, fit_arcs
+from mi_nerfattack.robot.vesc.motor import VescMotor
 
 WHEELBASE_M, CENTRE, PER_RAD = 0.3, 0.47, 1.1
 
@@ -44,7 +52,12 @@ def test_arcs_tell_the_scales():
     before = Calibration(timeout_ms=200)
     found, away_rad, spread = fit_arcs(arcs, WHEELBASE_M, before)
     assert found == before.changed(
-        {"erpm_per_ms": 4800.0, "servo_per_rad": PER_RAD, "servo_centre": CENTRE}
+        {
+            "erpm_per_ms": 4800.0,
+            "servo_per_rad": PER_RAD,
+            "servo_centre": CENTRE,
+            "wheelbase_m": WHEELBASE_M,
+        }
     )
     assert away_rad < 1e-9 and spread < 1e-9
     crooked = Arc(arcs[2].servo, arcs[2].steps, *end_of_arc(1.7, 0.31))
@@ -67,14 +80,62 @@ def test_measurements_that_are_not_plausible(arcs, message):
         fit_arcs(arcs, WHEELBASE_M, Calibration())
 
 
-class Person:
-    """Answers the questions as somebody with a tape would."""
+def test_an_arc_is_asked_for_until_it_is_right(monkeypatch, capsys):
+    answers = iter(["0.01", "0", "1.5", "0,1", "n", "1.4", "-0.1", ""])
+    monkeypatch.setattr("builtins.input", lambda prompt: next(answers))
+    assert _ask_for_arc(0.5, 700) == Arc(0.5, 700, 1.4, -0.1)
+    assert "0.01 m forward and 0 m left" in capsys.readouterr().out
+
+
+def test_what_a_check_raises_brakes_a_drive(tmp_path):
+    with StandIn(tmp_path / "log") as car, closing(VescMotor(car.port)) as motor:
+        motor.arm()
+        start_m = car.wait_for(speed_ms=0.0)[-1]["way_m"]
+
+        def check() -> None:
+            if car.log()[-1]["way_m"] > start_m + 0.1:
+                raise enable.ReleasedError("let go")
+
+        with pytest.raises(enable.ReleasedError):
+            drive_arc(motor, Command(0.5, 0.0), 1.5, check)
+        lines = car.wait_for(speed_ms=0.0)
+        assert lines[0]["event"] == "command 7"
+        assert lines[-1]["way_m"] < start_m + 1.4
+        car.tell("kill")
+        with pytest.raises(InputError, match="kill switch is pressed; mend it"):
+            drive_arc(motor, Command(0.5, 0.0), 1.5, lambda: None)
+
+
+class Person(AbstractEnable):
+    """Answers the questions as somebody with a tape would, and holds the button.
+
+    Of the first drive it is let go.
+    """
 
     def __init__(self, car: StandIn) -> None:
         self.car, self.start_m, self.asked = car, 0.0, []
+        self.was_asked, self.lets_go = True, True
+
+    def is_held(self) -> bool:
+        if self.was_asked:
+            self.was_asked = False
+            return False
+        is_driving = "Drive" in self.asked[-1]
+        if (
+            self.lets_go
+            and is_driving
+            and self.car.log()[-1]["way_m"] > (self.start_m + 0.1)
+        ):
+            self.lets_go = False
+            return False
+        return True
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def __call__(self, prompt: str) -> str:
         self.asked.append(prompt)
+        self.was_asked = True
         now = self.car.log()[-1]
         if prompt.startswith("How"):
             driven = [line for line in self.car.log() if line["event"] == "command 8"]
@@ -92,6 +153,7 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
     with StandIn(tmp_path / "log") as car:
         person = Person(car)
         monkeypatch.setattr("builtins.input", person)
+        monkeypatch.setattr(enable, "JoystickEnable", lambda *_: person)
         arguments = ["calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
         arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
         assert cli.main(arguments) == 0
@@ -99,28 +161,40 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
     assert found.erpm_per_ms == pytest.approx(ERPM_PER_MS, rel=0.003)
     assert found.servo_per_rad == pytest.approx(PER_RAD, rel=0.005)
     assert found.servo_centre == pytest.approx(CENTRE, abs=0.002)
-    assert len(person.asked) == 1 + 3 * 3
+    assert found.wheelbase_m == WHEELBASE_M
+    assert len(person.asked) == 1 + 1 + 3 * 4
     shown = capsys.readouterr().out
     assert "Armed: without commands it brakes after 250 ms with 20 A." in shown
+    assert "Braked: the enable button was let go" in shown
     assert f"Written to {output}." in shown and "(was 4000.0)" in shown
 
 
 @pytest.mark.slow
 def test_ctrl_c_brakes(tmp_path):
     output, pipe = tmp_path / "car.toml", subprocess.PIPE
-    with StandIn(tmp_path / "log") as car:
+    with (
+        StandIn(tmp_path / "log") as car,
+        closing(Pad(tmp_path / "js0")) as pad,
+    ):
         command = [sys.executable, "-m", "mi_nerfattack.cli", "calibrate", car.port]
-        with subprocess.Popen(
-            [*command, "-o", str(output)], stdin=pipe, text=True
-        ) as process:
-            process.stdin.write("\n\n")
-            process.stdin.flush()
-            car.wait_for_line(event="memory")
-            while True:  # past the proof, which brakes, and on its way
-                if car.wait_for(mode="rpm")[-1]["way_m"] > 0.6:
-                    break
+        command += ["-o", str(output), "--enable", str(tmp_path / "js0")]
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+            assert process.stdin is not None and process.stdout is not None
+            ending = Timer(120.0, process.kill)
+            ending.start()
+            for awaited in "Release", "Armed", "Release":
+                if awaited == "Release":
+                    pad.press(False)
+                    process.stdin.write("\n")
+                    process.stdin.flush()
+                while awaited not in process.stdout.readline():
+                    assert process.poll() is None
+                pad.press(True)
+            # past the proof, which brakes, and on its way
+            wait_for(lambda: car.wait_for(mode="rpm")[-1]["way_m"] > 0.6)
             process.send_signal(signal.SIGINT)
             assert process.wait(20) == 130
+            ending.cancel()
         assert car.wait_for(speed_ms=0.0)[0]["event"] == "command 7"
     assert not output.exists()
 
@@ -132,8 +206,12 @@ def test_nothing_moves_before_somebody_answers(tmp_path, monkeypatch, capsys):
         raise EOFError
 
     monkeypatch.setattr("builtins.input", answer)
-    with StandIn(tmp_path / "log") as car:
-        assert cli.main(["calibrate", car.port, "-o", str(output)]) == 2
+    pad = str(tmp_path / "js0")
+    with StandIn(tmp_path / "log") as car, closing(Pad(tmp_path / "js0")):
+        command = ["calibrate", car.port, "-o", str(output), "--enable"]
+        assert cli.main([*command, f"{pad}7"]) == 2
+        assert "js07: does not exist" in capsys.readouterr().err
+        assert cli.main([*command, pad]) == 2
         assert "run it in a terminal" in capsys.readouterr().err
         assert "command 8" not in {line["event"] for line in car.log()}
         output.write_text("")
@@ -141,4 +219,7 @@ def test_nothing_moves_before_somebody_answers(tmp_path, monkeypatch, capsys):
         assert "exists; choose another" in capsys.readouterr().err
         wrong = ["calibrate", car.port, "-o", str(tmp_path / "b"), "--speed-ms", "0"]
         assert cli.main(wrong) == 2
-        assert "--speed-ms: 0.0; more than 0" in capsys.readouterr().err
+        assert "--speed-ms: 0.0; more than 0.195, at" in capsys.readouterr().err
+        wrong[-2:] = ["--distance-m", "50"]
+        assert cli.main(wrong) == 2
+        assert "--distance-m: 50.0; more than 0.1, at most 5" in capsys.readouterr().err

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import select
 import signal
 import subprocess
 import sys
 import termios
-import time
+from collections.abc import Callable
 from contextlib import closing
+from typing import Any
 
 import pytest
 import serial
@@ -16,7 +18,7 @@ from helpers.vesc_stand_in import StandIn
 from helpers.waiting import wait_for
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.robot.devices import Command, DeviceLostError
+from mi_nerfattack.robot.devices import Command, DeviceLostError, MotorValues
 from mi_nerfattack.robot.vesc.calibration import Calibration
 from mi_nerfattack.robot.vesc.link import Link
 from mi_nerfattack.robot.vesc.motor import VescMotor
@@ -36,16 +38,32 @@ def start(tmp_path):
         stand_in.close()
 
 
-def drive_to_speed(motor: VescMotor) -> None:
-    """Drive straight on until the car moves at 1 m/s."""
-    deadline = time.monotonic() + 20
-    while time.monotonic() < deadline:
+def drive_to_speed(motor: VescMotor, car: StandIn) -> None:
+    """Drive straight on until a command finds the car at 1 m/s."""
+
+    def commands() -> list[dict[str, Any]]:
+        return [line for line in car.log() if line["event"] == "command 8"]
+
+    def is_fast() -> bool:
+        before = len(commands())
         motor.send(Command(1.0, 0.0))
+        wait_for(lambda: len(commands()) > before)
+        return commands()[-1]["speed_ms"] > 0.97
+
+    wait_for(is_fast)
+
+
+def read_until(motor: VescMotor, found: Callable[[MotorValues], object]) -> MotorValues:
+    """Read until values are as wanted."""
+    seen: list[MotorValues] = []
+
+    def is_found() -> object:
         values = motor.read()
-        if values is not None and (values.speed_ms or 0.0) > 0.97:
-            return
-        time.sleep(0.03)
-    raise TimeoutError
+        seen[:] = [] if values is None else [values]
+        return values is not None and found(values)
+
+    wait_for(is_found)
+    return seen[0]
 
 
 def check_stopped(car: StandIn) -> None:
@@ -68,11 +86,9 @@ def test_a_car_that_nobody_commands_stops(start):
         motor.arm()
         events = [line["event"] for line in car.log()]
         assert events.count("memory") == 1 and "flash" not in events
-        drive_to_speed(motor)
+        drive_to_speed(motor, car)
         check_stopped(car)  # though its values are asked for
-        values = motor.read()
-        while values is None or not values.has_timed_out:
-            values = motor.read()
+        values = read_until(motor, lambda values: values.has_timed_out)
         assert not values.is_killed
         assert values.input_voltage_v == 15.8 and values.fault_name == "none"
 
@@ -93,19 +109,13 @@ def test_what_is_sent(start):
         motor.brake()
         assert car.wait_for(servo=0.53)[-1]["mode"] == "brake"
         car.tell("fault 2")
-        values = motor.read()
-        while values is None or not values.fault:
-            values = motor.read()
+        values = read_until(motor, lambda values: values.fault)
         assert (values.fault, values.fault_name) == (2, "under voltage")
         car.tell("kill")
-        while not values.is_killed:
-            values = motor.read()
-            assert values is not None
+        read_until(motor, lambda values: values.is_killed)
         car.tell("mute")
         with pytest.raises(DeviceLostError, match=r"no answer for 0\.\d\d s"):
-            while True:
-                motor.read()
-                time.sleep(0.02)
+            read_until(motor, lambda values: False)
         with pytest.raises(InputError, match="not armed"):
             motor.send(Command(1.0, 0.0))
 
@@ -114,11 +124,10 @@ def test_a_pulled_plug(start):
     car = start()
     with closing(VescMotor(car.port)) as motor:
         motor.arm()
-        drive_to_speed(motor)
+        drive_to_speed(motor, car)
         car.tell("unplug")
         with pytest.raises(DeviceLostError, match="check its cable"):
-            while True:
-                motor.send(Command(1.0, 0.0))
+            wait_for(lambda: motor.send(Command(1.0, 0.0)) is None)
         with pytest.raises(DeviceLostError):
             motor.read()
         check_stopped(car)
@@ -156,7 +165,9 @@ def host(start):
 
 
 def wait_until_driving(process: subprocess.Popen[str]) -> None:
-    assert process.stdout is not None and process.stdout.readline() == "driving\n"
+    assert process.stdout is not None
+    assert select.select([process.stdout], [], [], 60)[0], "it never drives"
+    assert process.stdout.readline() == "driving\n"
 
 
 def test_a_killed_program(host):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 
 from mi_nerfattack.errors import InputError
@@ -13,6 +14,38 @@ from mi_nerfattack.robot.devices import AbstractEnable, Clock
 
 _EVENT = struct.Struct("=IhBB")  # milliseconds, value, type, number
 _BUTTON, _INITIAL = 0x01, 0x80
+_WAIT_S = 0.02
+
+
+class ReleasedError(InputError):
+    """The button was let go while the car moved."""
+
+
+def wait_for_press(
+    enable: AbstractEnable, sleep: Callable[[float], None], tell: Callable[[str], None]
+) -> None:
+    """Wait until a button was seen released, and then held.
+
+    Args:
+        enable: with the button.
+        sleep: waits for seconds.
+        tell: shows a line to the person who is to hold it.
+    """
+    was_released = not enable.is_held()
+    tell("Release the enable button, if it is held; hold it as long as it may move.")
+    while not (was_released and enable.is_held()):
+        was_released = was_released or not enable.is_held()
+        sleep(_WAIT_S)
+
+
+def check_held(enable: AbstractEnable) -> None:
+    """Check that a button is held.
+
+    Raises:
+        ReleasedError: it is not.
+    """
+    if not enable.is_held():
+        raise ReleasedError("the enable button was let go, or its device is gone")
 
 
 class JoystickEnable(AbstractEnable):
