@@ -141,24 +141,28 @@ class MotionCaptureTracker(AbstractTracker):
         return f"its process ended by itself (exit code {self._process.exitcode})"
 
     def _hear(self) -> None:
-        while True:
-            try:
-                told, content = self._connection.recv()
-            except (EOFError, OSError):
-                self._error = self._error or self._ended()
-                return
-            if told == "error":
-                self._error = self._error or content
-                return
-            taken_s, bodies = content
-            # both processes share time.monotonic, though perhaps not our clock
-            time_s = self._clock() - (time.monotonic() - taken_s)
-            with self._lock:
-                self._frame += 1
-                for name, values in bodies.items():
-                    matrix = _matrix(values)
-                    if matrix is not None:
-                        self._poses.update(name, matrix, time_s, self._frame)
+        try:
+            while not self._error:
+                self._take(*self._connection.recv())
+        except (EOFError, OSError):
+            self._error = self._error or self._ended()
+        except Exception as error:  # a thread has nobody else to tell
+            why = f"reading failed ({type(error).__name__}: {error})"
+            self._error = self._error or why
+
+    def _take(self, told: str, content: Any) -> None:
+        if told == "error":
+            self._error = self._error or content
+            return
+        taken_s, bodies = content
+        # both processes share time.monotonic, though perhaps not our clock
+        time_s = self._clock() - (time.monotonic() - taken_s)
+        with self._lock:
+            self._frame += 1
+            for name, values in bodies.items():
+                matrix = _matrix(values)
+                if matrix is not None:
+                    self._poses.update(name, matrix, time_s, self._frame)
 
 
 def _package() -> Any:

@@ -65,6 +65,14 @@ def stand_in(tmp_path, monkeypatch):
     sys.modules.pop("motioncapture", None)
 
 
+def test_reading_that_fails_is_told(stand_in):
+    tracker = MotionCaptureTracker("vicon", "live", clock=lambda: 1 / 0)
+    wait_for(lambda: tracker._error)
+    with pytest.raises(DeviceLostError, match="live: reading failed .ZeroDivision"):
+        tracker.newest("car")
+    tracker.close()
+
+
 def test_poses_come_with_their_times(stand_in):
     tracker = MotionCaptureTracker("vicon", "live")
     wait_for(lambda: (pose := tracker.newest("car")) and pose.index >= 20)
