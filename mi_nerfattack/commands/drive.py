@@ -53,7 +53,7 @@ class DriveCommand:
     duration_s: float | None = None
     """Seconds after which the drive ends: 600."""
     camera: str | None = None
-    """zed:/dev/video0 (default), v4l:/dev/videoN or video:FILE."""
+    """zed:/dev/video0 (default) or v4l:/dev/videoN; with --on-block video:FILE, too."""
     camera_file: str | None = None
     """TOML file with the [camera] of training, for expert and remote policies; that of
     the policy's own file by default."""
@@ -62,8 +62,10 @@ class DriveCommand:
     zed_mode: str | None = None
     """VGA (default), HD720, HD1080, HD2K."""
     tracker: str | None = None
-    """vicon:0.0.0.0 (default), vicon:HOST:PORT, motioncapture:KIND:HOST or
-    replay:FILE."""
+    """vicon:HOST[:PORT], this computer's address in the tracker's network, or
+    motioncapture:KIND:HOST; with --on-block replay:FILE, too. To be given."""
+    tracker_sender: str | None = None
+    """Address of VICON's computer, by default that of the first that sends."""
     rotation: str | None = None
     """VICON's convention: euler (default) or rotation-vector."""
     body: str | None = None
@@ -101,6 +103,8 @@ class DriveCommand:
     """Of the car: 0.296."""
     log: str | None = None
     """New file for the log (.mcap); runs/drives/TIME.mcap by default."""
+    on_block: bool = False
+    """Let recordings stand for camera and tracker: with the wheels lifted, alone."""
     simulated: bool = False
     """Drive in the rendered room, with none of the devices, as fast as it renders."""
     spp: int | None = None
@@ -123,6 +127,7 @@ class DriveCommand:
         route = config.read_route()
         settings = config.settings(route)
         policy, seeing = self._policy(config)
+        config.check()
         _say(_statement(config, route, settings))
         with open_rig(config, route, policy, seeing, _confirm) as rig:
             if self.check:
@@ -144,7 +149,8 @@ class DriveCommand:
         }
 
     def _policy(self, config: DriveConfig) -> tuple[AbstractPolicy | None, Seeing]:
-        from mi_nerfattack.robot.drive.rig import EXPERT, REMOTE, Seeing
+        from mi_nerfattack.robot.drive.config import EXPERT, REMOTE
+        from mi_nerfattack.robot.drive.rig import Seeing
 
         name = config.policy
         if name is None:
@@ -182,7 +188,8 @@ def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> st
     ]
     if not config.simulated:
         lines += [
-            f"Tracker    {config.tracker}, body {config.body!r}, {config.rotation}",
+            f"Tracker    {config.tracker} from {config.tracker_sender or 'any'}, body "
+            f"{config.body!r}, {config.rotation}",
             f"Motor      {config.port}, {config.calibration or 'as a RACECAR/J'}",
             f"Enable     {config.enable}, button {config.button}",
         ]

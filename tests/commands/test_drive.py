@@ -35,7 +35,18 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
             ["--policy", "remote:127.0.0.1:7447", "--simulated"],
             "--simulated: its time is not that of another computer",
         ),
-        (["--policy", "expert", "--camera", "webcam"], "camera 'webcam': must be zed:"),
+        (["--policy", "expert"], "--tracker: none; give vicon:ADDRESS"),
+        (
+            [
+                "--policy",
+                "expert",
+                "--camera",
+                "webcam",
+                "--tracker",
+                "vicon:127.0.0.1",
+            ],
+            "camera 'webcam': must be zed:",
+        ),
         (["--policy", "expert", "--speed-ms", "nan"], "drive.speed_ms"),
     ],
 )

@@ -34,6 +34,7 @@ _PATHS = (
 )
 _OUT_OF_RANGE = 2.0  # of the largest steering: a control beyond it is nonsense
 PERIOD_S = 0.1
+EXPERT, REMOTE = "expert", "remote:"
 
 
 class DriveConfig(Section):
@@ -50,7 +51,8 @@ class DriveConfig(Section):
         camera: see `robot.camera.open`.
         camera_file: TOML file with the section [camera] of training.
         zed_calibration, zed_mode: of a ZED.
-        tracker: see `robot.tracker.open`.
+        tracker: see `robot.tracker.open`; none by default, for it listens in a network.
+        tracker_sender: address of VICON's computer, the first that sends by default.
         rotation: VICON's convention.
         body: the tracker's name of the car.
         port: of the VESC.
@@ -62,6 +64,7 @@ class DriveConfig(Section):
         max_speed_ms, max_steering_rad, max_acceleration_ms2, max_steering_rate: limits.
         wheelbase_m, length_m, width_m: of the car.
         log: file; of the time of day by default.
+        on_block: recordings may stand for camera and tracker, while wheels are lifted.
         simulated: in the rendered room, with none of the devices.
         spp: samples per pixel of its camera.
     """
@@ -77,7 +80,8 @@ class DriveConfig(Section):
     camera_file: str | None = None
     zed_calibration: str | None = None
     zed_mode: str = "VGA"
-    tracker: str = "vicon:0.0.0.0"
+    tracker: str | None = None
+    tracker_sender: str | None = None
     rotation: Literal["euler", "rotation-vector"] = "euler"
     body: Annotated[str, Field(min_length=1)] = "racecar"
     port: str = "/dev/ttyACM0"
@@ -95,6 +99,7 @@ class DriveConfig(Section):
     length_m: Positive = SMALL_CAR.length
     width_m: Positive = SMALL_CAR.width
     log: str | None = None
+    on_block: bool = False
     simulated: bool = False
     spp: Count = 4
 
@@ -109,6 +114,36 @@ class DriveConfig(Section):
             control_unit="rad",
             max_control=self.max_steering_rad,
         )
+
+    def check(self) -> None:
+        """Refuse what would drive a car by something else than it seems.
+
+        Raises:
+            InputError: no tracker; a recording with a real motor; or an expert whose
+                control would be taken in another unit.
+        """
+        if self.policy == EXPERT and self.control_unit != "rad":
+            raise InputError(
+                f"--control-unit {self.control_unit}: the expert steers in rad; leave "
+                "it out"
+            )
+        if self.simulated:
+            return
+        if self.tracker is None:
+            raise InputError(
+                "--tracker: none; give vicon:ADDRESS, this computer's in the network "
+                "of the tracker (and --tracker-sender), or motioncapture:KIND:HOST"
+            )
+        recorded = [
+            self.camera.startswith("video:"),
+            self.tracker.startswith("replay:"),
+        ]
+        if any(recorded) and not self.on_block:
+            raise InputError(
+                f"--camera {self.camera}, --tracker {self.tracker}: a recording does "
+                "not see where the car is; give --on-block with the wheels lifted, or "
+                "--simulated"
+            )
 
     def read_route(self) -> Route:
         """Read the route, at the speed that is driven."""

@@ -14,7 +14,7 @@ from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.robot.camera.open import ZedOptions, open_camera
 from mi_nerfattack.robot.devices import AbstractPilot, AbstractTracker, Clock
-from mi_nerfattack.robot.drive.config import PERIOD_S, DriveConfig
+from mi_nerfattack.robot.drive.config import PERIOD_S, REMOTE, DriveConfig
 from mi_nerfattack.robot.drive.loop import Devices
 from mi_nerfattack.robot.drive.pilot import (
     Control,
@@ -39,7 +39,6 @@ from mi_nerfattack.robot.vesc.motor import VescMotor
 from mi_nerfattack.vehicle.expert.choose import expert_for
 from mi_nerfattack.vehicle.route.route import Route
 
-EXPERT, REMOTE = "expert", "remote:"
 _LAG_S = 0.1  # of the car's steering, which the expert reckons with
 
 
@@ -123,7 +122,10 @@ def _real(
         zed = None
     seen = open_camera(config.camera, camera, zed, clock=clock)
     stack.callback(seen.close)
-    tracker = open_tracker(config.tracker, mount, config.rotation, clock=clock)
+    assert config.tracker is not None  # see `DriveConfig.check`
+    tracker = open_tracker(
+        config.tracker, mount, config.rotation, config.tracker_sender, clock
+    )
     stack.callback(tracker.close)
     enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
     stack.callback(enable.close)

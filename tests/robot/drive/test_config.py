@@ -65,6 +65,29 @@ def test_a_calibration_of_another_wheelbase_is_refused(tmp_path):
         read_config(None, {"calibration": str(path)}).read_scales()
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "--tracker: none; give vicon:ADDRESS"),
+        ({"tracker": "replay:a.mcap"}, "replay:a.mcap: a recording does not see"),
+        ({"tracker": "vicon:10.0.0.2", "camera": "video:a.mp4"}, "--on-block with"),
+        (
+            {"simulated": True, "policy": "expert", "control_unit": "rad/s"},
+            "--control-unit rad/s: the expert steers in rad",
+        ),
+    ],
+)
+def test_drives_by_something_else_than_it_seems(given, message):
+    with pytest.raises(InputError, match=message):
+        read_config(None, given).check()
+
+
+def test_what_drives_a_car_or_none():
+    read_config(None, {"tracker": "vicon:10.0.0.2"}).check()
+    read_config(None, {"tracker": "replay:a.mcap", "on_block": True}).check()
+    read_config(None, {"policy": "expert", "simulated": True}).check()
+
+
 def test_defaults_fence_the_route_and_take_twice_the_largest_control():
     config = read_config(None, {})
     route = config.read_route()

@@ -64,7 +64,7 @@ def test_it_arms_drives_and_brakes(tmp_path, number):
         command += ["expert", "--speed-ms", "0.5", "--port", vesc.port]
         command += ["--tracker", f"vicon:127.0.0.1:{PORT}", "--enable", "js0"]
         command += ["--camera", "video:seen.mp4", "--camera-file", "camera.toml"]
-        command += ["--log", "drive.mcap"]
+        command += ["--log", "drive.mcap", "--on-block"]
         pipe = subprocess.PIPE
         process = subprocess.Popen(command, stdout=pipe, text=True, cwd=tmp_path)
         assert process.stdout is not None
