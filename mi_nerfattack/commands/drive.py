@@ -221,8 +221,9 @@ def _drive(
     with closing(log), closing(watchdog):
         if not config.simulated:
             watchdog.start()  # the time of the simulated room stands still meanwhile
-            _wait_for_press(rig)
-        devices.motor.arm()
+            _arm(rig)
+        else:
+            devices.motor.arm()
         _say("Armed.")
         loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
         with held_interrupts() as interrupted, _hangups():
@@ -231,6 +232,20 @@ def _drive(
     written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
     _say(f"{path}: {written}")
     return stop, loop
+
+
+def _arm(rig: Rig) -> None:
+    """Wait for the enable, and arm as long as it is held."""
+
+    def held() -> None:
+        if not rig.devices.enable.is_held():
+            raise InputError(
+                "--enable: let go while arming, so braked and not armed; start again "
+                "and hold it until the car is armed"
+            )
+
+    _wait_for_press(rig)
+    rig.devices.motor.arm(held)
 
 
 def _wait_for_press(rig: Rig) -> None:

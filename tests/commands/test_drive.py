@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
+
 import pytest
+from helpers.driving_stand_ins import (
+    Bench,
+    StandInCamera,
+    StandInEnable,
+    StandInMotor,
+    StandInPilot,
+    StandInTracker,
+)
 
 from mi_nerfattack.cli import main
+from mi_nerfattack.commands.drive import _arm
 from mi_nerfattack.deploy.replay.environment import open_recording
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.robot.drive.loop import Devices
+from mi_nerfattack.robot.drive.rig import Rig
 
 SIMULATED = ["drive", "--policy", "expert", "--simulated", "--spp", "1"]
 
@@ -53,3 +68,38 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
 def test_what_cannot_be_driven(options, message, variant, capsys):
     assert main(["drive", *options]) == 2
     assert message in capsys.readouterr().err
+
+
+class Pad(StandInEnable):
+    """Held from its third question on, for so many more."""
+
+    def __init__(self, held: int) -> None:
+        self._answers = [False, False, *[True] * held]
+
+    def is_held(self) -> bool:
+        return bool(self._answers) and self._answers.pop(0)
+
+
+class TurningMotor(StandInMotor):
+    """Turns the wheels for five steps to prove its timeout."""
+
+    turned = 0
+
+    def arm(self, check: Callable[[], None] = lambda: None) -> None:
+        for _ in range(5):
+            check()
+            self.turned += 1
+
+
+@pytest.mark.parametrize(("held", "turned"), [(3, 2), (6, 5)])
+def test_wheels_turn_to_arm_as_long_as_the_enable_is_held(held, turned):
+    bench = Bench()
+    motor, pad = TurningMotor(bench), Pad(held)
+    devices = Devices(
+        StandInCamera(bench), StandInTracker(bench), motor, StandInPilot(bench), pad
+    )
+    rig = Rig(devices, bench.clock, bench.sleep, bench.clock)
+    refused = pytest.raises(InputError, match="let go while arming")
+    with refused if turned < 5 else nullcontext():
+        _arm(rig)
+    assert motor.turned == turned
