@@ -51,22 +51,27 @@ def stamp(document: dict[str, Any], command: Sequence[str]) -> dict[str, Any]:
 def summary_of(sweep: Path) -> dict[str, Any]:
     """Return what a sweep, finished or not, or a copy of its table came to."""
     from mi_nerfattack.experiment.sweep.cell import CELLS
-    from mi_nerfattack.experiment.sweep.summary import SUMMARY, write_summary
+    from mi_nerfattack.experiment.sweep.summary import (
+        SUMMARY,
+        read_attacks,
+        summarise,
+    )
+    from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
 
-    if (sweep / CELLS).is_dir():
-        return write_summary(sweep)
-    return files.read_json(sweep / SUMMARY)
+    if (sweep / SUMMARY).is_file() and not (sweep / CELLS).is_dir():
+        return files.read_json(sweep / SUMMARY)
+    rows = read_table(sweep / RESULTS)
+    return summarise(rows, read_attacks(sweep, rows))
 
 
-def copy_sweep(sweep: Path, output: Path) -> None:
-    """Copy a sweep's table and summary, unless they are there already."""
-    from mi_nerfattack.experiment.sweep.summary import SUMMARY
-    from mi_nerfattack.experiment.sweep.table import MAX_TABLE_BYTES, RESULTS
+def copy_files(names: Sequence[str], folder: Path, output: Path) -> None:
+    """Copy files, such as a sweep's table, unless they are there already."""
+    from mi_nerfattack.experiment.sweep.table import MAX_TABLE_BYTES
 
     files.make_folder(output)
-    if output.resolve() != sweep.resolve():
-        for name in (RESULTS, SUMMARY):
-            raw = files.read_bytes(sweep / name, MAX_TABLE_BYTES)
+    if output.resolve() != folder.resolve():
+        for name in names:
+            raw = files.read_bytes(folder / name, MAX_TABLE_BYTES)
             files.write_bytes(output / name, raw)
 
 

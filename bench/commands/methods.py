@@ -15,8 +15,9 @@ ROOT = Path(__file__).parents[2]
 class BenchMethods:
     """Write the page of sweeps of scenes/tuning.toml and scenes/methods.toml.
 
-    OUTPUT gets README.md, and copies of results.parquet and summary.json of the second,
-    and of the first in OUTPUT/tuning. Unfinished sweeps are shown as far as they are.
+    OUTPUT gets README.md, the second's results.parquet and summary.json, and in
+    OUTPUT/tuning the first's results.parquet. Of unfinished sweeps it shows what is
+    there.
     """
 
     tuning: tyro.conf.Positional[Path]
@@ -30,6 +31,7 @@ class BenchMethods:
         """Read, write and copy."""
         from bench import results
         from bench.methods.page import page
+        from mi_nerfattack.experiment.sweep.summary import SUMMARY
         from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
         from mi_nerfattack.io import files
 
@@ -40,9 +42,10 @@ class BenchMethods:
         words += [] if self.folder is None else ["FOLDER"]
         grid = files.read_toml(ROOT / "scenes" / "tuning.toml")
         text = page(summary, table, tuning, grid, results.stamp({}, words))
-        results.copy_sweep(self.tuning, self.output / "tuning")
+        results.copy_files([RESULTS], self.tuning, self.output / "tuning")
         if self.folder is not None:
-            results.copy_sweep(self.folder, self.output)
+            files.write_json(self.output / SUMMARY, summary)
+            results.copy_files([RESULTS], self.folder, self.output)
         files.write_text(self.output / "README.md", text)
         print(f"{self.output / 'README.md'}: written")
         return 0

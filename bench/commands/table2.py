@@ -41,7 +41,7 @@ class BenchTable2:
             retrained = read_retrained(self.retrained, {row["cell"] for row in rows})
             words.append("--retrained DATA")
         text = page(summary, rows, retrained, results.stamp({}, words))
-        results.copy_sweep(self.folder, self.output)
+        results.copy_files((RESULTS, SUMMARY), self.folder, self.output)
         files.write_text(self.output / "README.md", text)
         print(f"{self.output / 'README.md'}: written")
         return 0

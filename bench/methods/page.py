@@ -58,7 +58,9 @@ def page(
     )
     settings = settings_of(tuning, names, routes)
     header = ["method", "setting", *routes, "geometric mean", ""]
-    parts.append(section("Settings", _TUNING, header, rows(settings, routes)))
+    total = len(names) * len(routes) * len(grid["seeds"])
+    text = f"{_TUNING} {tuning['complete']} of {total} attacks are done."
+    parts.append(section("Settings", text, header, rows(settings, routes)))
     commands = ["mi-nerfattack sweep scenes/tuning.toml -o TUNING"]
     if summary is not None:
         commands.append("mi-nerfattack sweep scenes/methods.toml -o FOLDER")

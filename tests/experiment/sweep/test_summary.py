@@ -139,6 +139,8 @@ def test_flags_of_the_sweep():
     told = [
         attack("right", "gradient", 0, [10, 30], [0.0, -5.0], "not converged: wait"),
         attack("right", "gradient", 1, [10, 30], [0.0, -5.0], "not converged: stay"),
+        # a poorer setting of the gradient is no opponent
+        attack("right", "slow", 1, [10, 30], [0.0, -1.0], attack_method="gradient"),
         attack("right", "blocks", 0, [10, 20, 40], [-1.0, -6.0, -7.0]),
         attack("right", "blocks", 1, [10, 20, 40], [-1.0, -2.0, -7.0]),
         attack(
@@ -155,4 +157,4 @@ def test_flags_of_the_sweep():
     assert (
         noise.startswith("noise larger: ") and "right blocks 100 (m), is 0.2" in noise
     )
-    assert own == ("not converged: in 2 of 5 attacks; in right-gradient-0: wait")
+    assert own == ("not converged: in 2 of 6 attacks; in right-gradient-0: wait")
