@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -163,12 +164,21 @@ class DriveCommand:
         return policy, Seeing(*(PolicyFile.read(file).camera or (None, None)))
 
 
+_UNBRAKED = (
+    "no brake could be sent; the motor controller brakes by its own timeout, and the "
+    "wheels stay as they are"
+)
+
+
 def _say(text: str) -> None:
     print(text, flush=True)
 
 
 def _confirm(question: str) -> bool:
-    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    try:
+        return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError as err:
+        raise InputError(f"{question}: nobody answers; run it in a terminal") from err
 
 
 def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> str:
@@ -228,7 +238,8 @@ def _drive(
         loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
         with held_interrupts() as interrupted, _hangups():
             stop = loop.run(interrupted)
-        _say(f"{stop}: braked, wheels centred")
+        end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
+        _say(f"{stop}: {end}")
     written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
     _say(f"{path}: {written}")
     return stop, loop
@@ -236,27 +247,12 @@ def _drive(
 
 def _arm(rig: Rig) -> None:
     """Wait for the enable, and arm as long as it is held."""
+    from mi_nerfattack.robot.drive.safety.enable import check_held, wait_for_press
 
-    def held() -> None:
-        if not rig.devices.enable.is_held():
-            raise InputError(
-                "--enable: let go while arming, so braked and not armed; start again "
-                "and hold it until the car is armed"
-            )
-
-    _wait_for_press(rig)
-    rig.devices.motor.arm(held)
-
-
-def _wait_for_press(rig: Rig) -> None:
-    """Wait until the enable was seen released, and then held."""
     enable = rig.devices.enable
-    was_released = not enable.is_held()
     _say("Lift the wheels off the floor: they turn for a second.")
-    _say("Release the enable button, if it is held, and hold it to arm.")
-    while not (was_released and enable.is_held()):
-        was_released = was_released or not enable.is_held()
-        rig.sleep(0.02)
+    wait_for_press(enable, rig.sleep, _say)
+    rig.devices.motor.arm(partial(check_held, enable))
 
 
 @contextmanager

@@ -163,8 +163,17 @@ class DriveConfig(Section):
         """Return what the loop is told.
 
         Raises:
-            InputError: the fence cannot be read.
+            InputError: the fence or the calibration cannot be read, or the motor cannot
+                turn as slowly as this.
         """
+        if not self.simulated:
+            scales = self.read_scales()
+            slowest = scales.erpm_least / scales.erpm_per_ms
+            if route.speed_ms < slowest:
+                raise InputError(
+                    f"speed_ms: {route.speed_ms:g}; the motor controller holds "
+                    f"{slowest:.2g} m/s at least (erpm_least of its calibration)"
+                )
         fence = (
             Fence.around(route, self.margin_m)
             if self.fence is None

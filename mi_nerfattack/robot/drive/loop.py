@@ -100,6 +100,7 @@ class DriveLoop:
 
     Attributes:
         measures: of the drive so far.
+        was_braked: whether a brake was sent at its end.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class DriveLoop:
         self._devices, self._settings, self._log = devices, settings, log
         self._watchdog, self._clock, self._sleep = watchdog, clock, sleep
         self._tell = tell
-        self.measures = Measures()
+        self.measures, self.was_braked = Measures(), False
         self._notes: list[Callable[[], None]] = []
         self._due_s = -np.inf  # of the next frame for the pilot
         self._pose_index: int | None = None
@@ -323,6 +324,7 @@ class DriveLoop:
             if now >= due:
                 due, problem = now + _BRAKE_EVERY_S, self._brake()
                 if problem is None:
+                    self.was_braked = True
                     self._notes.append(partial(self._log.brake, now))
                 with suppress(Exception):  # what fails, and why, is told already
                     if problem not in (None, told):

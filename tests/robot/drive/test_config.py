@@ -99,3 +99,12 @@ def test_defaults_fence_the_route_and_take_twice_the_largest_control():
     assert config.log_path(datetime(2026, 5, 4, 3, 2, 1)) == Path(
         "runs/drives/20260504-030201.mcap"
     )
+
+
+def test_a_speed_that_the_motor_does_not_hold_is_refused():
+    given = {"policy": "p.toml", "speed_ms": 0.15}  # 900 / 4614 is 0.195 m/s
+    config = read_config(None, given)
+    with pytest.raises(InputError, match="speed_ms: 0.15; .* holds 0.2 m/s at least"):
+        config.settings(config.read_route())
+    config = read_config(None, given | {"simulated": True})
+    assert config.settings(config.read_route()).speed_ms == 0.15

@@ -73,7 +73,7 @@ def test_it_arms_drives_and_brakes(tmp_path, number):
         told = []
         for line in process.stdout:
             told.append(line.strip())
-            if "hold it to arm" in line or "hold the enable button to drive" in line:
+            if "hold it as long" in line or "hold the enable button to drive" in line:
                 pad.press(True)
             elif "release the enable button" in line or line.startswith("not ready"):
                 pad.press(False)

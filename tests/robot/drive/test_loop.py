@@ -69,6 +69,7 @@ def check_fault(cause: Cause, moment_s: float, path: Path) -> None:
     bench.at(moment_s, lambda: FAULTS[cause](bench))
     stop, loop = bench.drive(path, duration_s=60.0)
     assert stop.cause is cause
+    assert loop.was_braked == (cause is not Cause.MOTOR_LOST)
     moved = [time for time, what, _ in bench.events if what == "send"]
     braked = [time for time, what, _ in bench.events if what == "brake"]
     assert len(moved) >= 3 and moved[-1] < braked[0]
