@@ -238,8 +238,8 @@ def _drive(
         loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
         with held_interrupts() as interrupted, _hangups():
             stop = loop.run(interrupted)
-        end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
-        _say(f"{stop}: {end}")
+            end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
+            _say(f"{stop}: {end}")  # before an interrupt that came meanwhile
     written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
     _say(f"{path}: {written}")
     return stop, loop

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from helpers.joystick import Pad
+from helpers.loopback import free_port
 from helpers.vesc_stand_in import StandIn
 from helpers.vicon_sender import Sender, datagrams
 
@@ -23,14 +24,13 @@ from mi_nerfattack.io.video import write_video
 from mi_nerfattack.vehicle.route.route import Route
 
 CAMERA = "[camera]\nwidth = 32\nheight = 16\n"
-PORT = 51733
 
 
 @contextmanager
-def tracked_car() -> Iterator[None]:
+def tracked_car(port: int) -> Iterator[None]:
     """A car that goes around the square at 0.5 m/s, seen 50 times a second."""
     route = Route.from_file(bundled_place("room").routes, "square")
-    sender, ended = Sender(("127.0.0.1", PORT)), threading.Event()
+    sender, ended = Sender(("127.0.0.1", port)), threading.Event()
 
     def send() -> None:
         start, frame = time.monotonic(), 0
@@ -58,11 +58,11 @@ def test_it_arms_drives_and_brakes(tmp_path, number):
     images = (np.full((16, 32, 3), i % 256, np.uint8) for i in range(6000))
     write_video(tmp_path / "seen.mp4", images, 30)
     files.write_text(tmp_path / "camera.toml", CAMERA)
-    pad = Pad(tmp_path / "js0")
-    with StandIn(tmp_path / "car.jsonl") as vesc, tracked_car():
+    pad, port = Pad(tmp_path / "js0"), free_port()
+    with StandIn(tmp_path / "car.jsonl") as vesc, tracked_car(port):
         command = [sys.executable, "-m", "mi_nerfattack.cli", "drive", "--policy"]
         command += ["expert", "--speed-ms", "0.5", "--port", vesc.port]
-        command += ["--tracker", f"vicon:127.0.0.1:{PORT}", "--enable", "js0"]
+        command += ["--tracker", f"vicon:127.0.0.1:{port}", "--enable", "js0"]
         command += ["--camera", "video:seen.mp4", "--camera-file", "camera.toml"]
         command += ["--log", "drive.mcap", "--on-block"]
         pipe = subprocess.PIPE
