@@ -102,28 +102,32 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     check_table(files.read_json(other / "new-retrain.json"), other)
     record = files.read_json(other / "new.json")
     assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
-    # the new policy is attacked later, and not trained again
-    weights = (other / "new.safetensors").read_bytes()
-    assert retrain(other, near, *frames, *more, "--adaptive") == 0
-    about = files.read_json(other / "new-retrain.json")
-    assert (other / "new.safetensors").read_bytes() == weights
-    check_table(about, other, "adaptive")
-    (cell,) = (other / "data" / "adaptive" / "cells").iterdir()
+    check_adaptive(other, near, *frames, *more)
+    page = other / "page.html"
+    words = ["report", str(other / "new-retrain.json"), "-o", str(page)]
+    assert cli.main(words) == 0
+    assert "Adaptive: the policy before past" in page.read_text()
+
+
+def check_adaptive(folder: Path, run: Path, *arguments) -> None:
+    """The new policy is attacked later, and not trained again."""
+    weights = (folder / "new.safetensors").read_bytes()
+    assert retrain(folder, run, *arguments, "--adaptive") == 0
+    about = files.read_json(folder / "new-retrain.json")
+    assert (folder / "new.safetensors").read_bytes() == weights
+    check_table(about, folder, "adaptive")
+    (cell,) = (folder / "data" / "adaptive" / "cells").iterdir()
     assert (cell / "_complete").exists()
-    (found,), (old,) = read_found([cell]), read_found([near])
-    assert found.scenario.policy.file.file == other / "new.safetensors"
+    (found,), (old,) = read_found([cell]), read_found([run])
+    assert found.scenario.policy.file.file == folder / "new.safetensors"
     same = {"policy": old.scenario.policy}
     assert found.scenario.model_copy(update=same).digest() == old.scenario.digest()
     (anew,) = about["adaptive"]
     assert anew["label"] == cell.name and anew["found_sha256"] == found.digest
     made = cell.stat().st_mtime_ns
-    assert retrain(other, near, *frames, *more, "--adaptive") == 0
+    assert retrain(folder, run, *arguments, "--adaptive") == 0
     assert cell.stat().st_mtime_ns == made
-    assert files.read_json(other / "new-retrain.json") == about
-    page = other / "page.html"
-    words = ["report", str(other / "new-retrain.json"), "-o", str(page)]
-    assert cli.main(words) == 0
-    assert "Adaptive: the policy before past" in page.read_text()
+    assert files.read_json(folder / "new-retrain.json") == about
 
 
 def check_table(about: dict, folder: Path, *more: str) -> None:
