@@ -18,6 +18,7 @@ from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
     from mi_nerfattack.policy.base import AbstractPolicy
+    from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
     from mi_nerfattack.robot.drive.config import DriveConfig
     from mi_nerfattack.robot.drive.loop import DriveLoop, DriveSettings
     from mi_nerfattack.robot.drive.rig import Rig, Seeing
@@ -45,6 +46,8 @@ class DriveCommand:
     """Of the policy: rad, a steering angle (default), or rad/s."""
     key: str | None = None
     """File with the key of a remote policy."""
+    jpeg_quality: int | None = None
+    """Send frames to a remote policy as JPEG, 1 to 95; by default as they are."""
     routes_file: str | None = None
     """Routes, JSON; the bundled room's by default."""
     route: str | None = None
@@ -111,7 +114,8 @@ class DriveCommand:
     spp: int | None = None
     """Samples per pixel of the simulated camera: 4."""
     check: bool = False
-    """Say what would be refused, and drive nothing."""
+    """Ask every device for five seconds, in which the button is to be held and let go;
+    drive nothing."""
     options: Annotated[
         PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
     ] = PolicyOptions()
@@ -131,6 +135,7 @@ class DriveCommand:
         config.check()
         _say(_statement(config, route, settings))
         with open_rig(config, route, policy, seeing, _confirm) as rig:
+            _say(_sight(rig.devices.camera.camera, rig.mount))
             if self.check:
                 return _check(rig, settings)
             stop, loop = _drive(rig, config, settings)
@@ -186,8 +191,10 @@ def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> st
     ages, limits = settings.judge.ages, settings.limits
     corners = " ".join(f"({x:.2f}, {y:.2f})" for x, y in settings.judge.fence.points)
     where = "the simulated room" if config.simulated else config.camera
+    sent = f", frames as JPEG of quality {config.jpeg_quality}"
     lines = [
-        f"Policy     {config.policy}, control in {config.control_unit}",
+        f"Policy     {config.policy}, control in {config.control_unit}"
+        f"{sent if config.jpeg_quality else ''}",
         f"Route      {route.name}, {route.length:.1f} m, at {route.speed_ms:g} m/s",
         f"Fence      {corners}, m",
         f"Limits     {limits.speed_ms:g} m/s, {limits.acceleration_ms2:g} m/s2, "
@@ -204,6 +211,22 @@ def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> st
             f"Enable     {config.enable}, button {config.button}",
         ]
     return "\n".join(lines)
+
+
+def _sight(camera: Camera, mount: CameraMount | None) -> str:
+    """Say what frames show, and from where."""
+    bent = " ".join(f"{value:g}" for value in camera.distortion)
+    where = "not known; --camera-file says it"
+    if mount is not None:
+        where = (
+            f"{mount.forward_m:g} m ahead of the rear axle, {mount.height_m:g} m high, "
+            f"{mount.pitch_deg:g} degrees down"
+        )
+    return (
+        f"Frames     {camera.width} x {camera.height} px, fx {camera.fx:.2f}, fy "
+        f"{camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}, distortion {bent}\n"
+        f"Mount      {where}"
+    )
 
 
 def _drive(
@@ -301,8 +324,10 @@ def _check(rig: Rig, settings: DriveSettings) -> int:
         "motor": motor,
         "policy": decision,
     }
-    found = dict.fromkeys(asks, "")
+    found, held = dict.fromkeys(asks, ""), set()
+    _say("Hold the enable button once within five seconds, and let it go.")
     while rig.clock() < end:
+        held.add(devices.enable.is_held())
         for name, ask in asks.items():
             try:
                 ask()
@@ -310,6 +335,9 @@ def _check(rig: Rig, settings: DriveSettings) -> int:
             except Stop as stop:
                 found[name] = str(stop)
         rig.sleep(settings.poll_s)
+    how = "always" if True in held else "never"
+    ill = f"it was {how} held; is it the right button?"
+    found["enable"] = "" if len(held) == 2 else ill
     for name, problem in found.items():
         _say(f"{name:10} {problem or 'ready'}")
     return 1 if any(found.values()) else 0

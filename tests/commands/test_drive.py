@@ -7,6 +7,7 @@ from contextlib import nullcontext
 
 import pytest
 from helpers.driving_stand_ins import (
+    SETTINGS,
     Bench,
     StandInCamera,
     StandInEnable,
@@ -16,10 +17,13 @@ from helpers.driving_stand_ins import (
 )
 
 from mi_nerfattack.cli import main
-from mi_nerfattack.commands.drive import _arm
+from mi_nerfattack.commands.drive import _arm, _check
 from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.robot.devices import AbstractEnable
+from mi_nerfattack.robot.drive import rig as rigs
+from mi_nerfattack.robot.drive.config import read_config
 from mi_nerfattack.robot.drive.loop import Devices
 from mi_nerfattack.robot.drive.rig import Rig
 
@@ -30,6 +34,7 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
     log = tmp_path / "drive.mcap"
     assert main([*SIMULATED, "--duration-s", "2", "--log", str(log)]) == 0
     told = capsys.readouterr().out
+    assert "Mount      0.3 m ahead" in told and "Frames     " in told
     assert told.index("Fence ") < told.index("Armed.") < told.index("time is up: 2 s")
     assert "cross-track error: largest 0.0" in told and "20 commands" in told
     recording = open_recording(log, None, CameraMount())
@@ -39,6 +44,7 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
     assert main([*SIMULATED, "--check"]) == 0
     told = capsys.readouterr().out
     assert "camera     ready" in told and "Armed" not in told
+    assert "enable     ready" in told
 
 
 @pytest.mark.parametrize(
@@ -91,14 +97,54 @@ class TurningMotor(StandInMotor):
             self.turned += 1
 
 
+def rig_of(bench: Bench, motor: StandInMotor, enable: AbstractEnable) -> Rig:
+    camera, tracker = StandInCamera(bench), StandInTracker(bench)
+    devices = Devices(camera, tracker, motor, StandInPilot(bench), enable)
+    return Rig(devices, bench.clock, bench.sleep, bench.clock)
+
+
+class MuteMotor(StandInMotor):
+    """Tells nothing."""
+
+    def read(self) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("kind", "held", "code", "message"),
+    [
+        (StandInMotor, (False, True), 0, "enable     ready"),
+        (StandInMotor, (False, False), 1, "enable     it was never held"),
+        (StandInMotor, (True, True), 1, "enable     it was always held"),
+        (MuteMotor, (False, True), 1, "motor      motor lost: it has said nothing"),
+    ],
+)
+def test_all_devices_are_asked(kind, held, code, message, capsys):
+    bench = Bench()
+    bench.held = held[0]
+    bench.at(2.0, lambda: setattr(bench, "held", held[1]))
+    rig = rig_of(bench, kind(bench), StandInEnable(bench))
+    assert _check(rig, SETTINGS) == code
+    told = capsys.readouterr().out.splitlines()[1:]
+    assert message in "\n".join(told)
+    assert sum("ready" in line for line in told) == 5 - code and not bench.events
+
+
+def test_frames_go_as_jpeg_where_asked(monkeypatch):
+    made = []
+    monkeypatch.setattr(rigs, "RemotePilot", lambda *given: made.append(given))
+    given = {"policy": "remote:127.0.0.1:7447", "jpeg_quality": 80}
+    config = read_config(None, given)
+    bench = Bench()
+    rigs._pilot(config, config.read_route(), None, StandInTracker(bench), bench.clock)
+    assert made[0][2] == 80
+
+
 @pytest.mark.parametrize(("held", "turned"), [(3, 2), (6, 5)])
 def test_wheels_turn_to_arm_as_long_as_the_enable_is_held(held, turned):
     bench = Bench()
-    motor, pad = TurningMotor(bench), Pad(held)
-    devices = Devices(
-        StandInCamera(bench), StandInTracker(bench), motor, StandInPilot(bench), pad
-    )
-    rig = Rig(devices, bench.clock, bench.sleep, bench.clock)
+    motor = TurningMotor(bench)
+    rig = rig_of(bench, motor, Pad(held))
     refused = pytest.raises(InputError, match="let go")
     with refused if turned < 5 else nullcontext():
         _arm(rig)

@@ -32,6 +32,7 @@ _PATHS = (
     "key",
     "camera_file",
 )
+_RECORDINGS = {"camera": "video:", "tracker": "replay:"}  # before a path
 _OUT_OF_RANGE = 2.0  # of the largest steering: a control beyond it is nonsense
 PERIOD_S = 0.1
 EXPERT, REMOTE = "expert", "remote:"
@@ -45,6 +46,7 @@ class DriveConfig(Section):
             tracked pose; or "remote:HOST:PORT", a policy that `serve-policy` serves.
         control_unit: of the policy: "rad" of a steering angle, or "rad/s".
         key: file of the key that both computers share.
+        jpeg_quality: of frames to a remote policy; None sends them as they are.
         route: name in `routes_file`, which is the bundled room's by default.
         speed_ms: to be kept; the route's by default.
         duration_s: after which the drive ends.
@@ -72,6 +74,7 @@ class DriveConfig(Section):
     policy: str | None = None
     control_unit: Literal["rad", "rad/s"] = "rad"
     key: str | None = None
+    jpeg_quality: Annotated[int, Field(ge=1, le=95)] | None = None
     routes_file: str | None = None
     route: str = "square"
     speed_ms: Positive | None = None
@@ -134,11 +137,11 @@ class DriveConfig(Section):
                 "--tracker: none; give vicon:ADDRESS, this computer's in the network "
                 "of the tracker (and --tracker-sender), or motioncapture:KIND:HOST"
             )
-        recorded = [
-            self.camera.startswith("video:"),
-            self.tracker.startswith("replay:"),
-        ]
-        if any(recorded) and not self.on_block:
+        words = {"camera": self.camera, "tracker": self.tracker}
+        is_recorded = any(
+            words[key].startswith(kind) for key, kind in _RECORDINGS.items()
+        )
+        if is_recorded and not self.on_block:
             raise InputError(
                 f"--camera {self.camera}, --tracker {self.tracker}: a recording does "
                 "not see where the car is; give --on-block with the wheels lifted, or "
@@ -236,6 +239,9 @@ def read_config(path: Path | None, given: Mapping[str, Any]) -> DriveConfig:
         for key in _PATHS:
             if isinstance(value := values.get(key), str):
                 values[key] = str(path.parent / value)
+        for key, kind in _RECORDINGS.items():
+            if isinstance(value := values.get(key), str) and value.startswith(kind):
+                values[key] = f"{kind}{path.parent / value.removeprefix(kind)}"
         policy = values.get("policy")
         if isinstance(policy, str) and (path.parent / policy).is_file():
             values["policy"] = str(path.parent / policy)

@@ -51,12 +51,14 @@ class Rig:
         clock: of them.
         sleep: lets time pass.
         rounds: clock of the loop's rounds, for the watchdog.
+        mount: of the camera; None where nobody says.
     """
 
     devices: Devices
     clock: Clock
     sleep: Callable[[float], None]
     rounds: Clock
+    mount: CameraMount | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def _real(
     motor = VescMotor(config.port, scales, confirm)
     stack.callback(motor.close)
     devices = Devices(seen, tracker, motor, pilot, enable)
-    return Rig(devices, clock, time.sleep, suspended_clock)
+    return Rig(devices, clock, time.sleep, suspended_clock, seeing.mount)
 
 
 def _pilot(
@@ -148,7 +150,7 @@ def _pilot(
     if name.startswith(REMOTE):
         endpoint = Endpoint.parse(name.removeprefix(REMOTE))
         key = read_key(None if config.key is None else Path(config.key), endpoint)
-        return RemotePilot(endpoint, key, clock=clock)
+        return RemotePilot(endpoint, key, config.jpeg_quality, clock)
     return LocalPilot(_control(config, route, policy, tracker), clock)
 
 
@@ -195,4 +197,4 @@ def _simulated(
     motor, enable = SimulatedMotor(room), SimulatedEnable(room)
     stack.callback(motor.close)
     devices = Devices(camera, tracker, motor, pilot, enable)
-    return Rig(devices, room.clock, room.sleep, room.clock)
+    return Rig(devices, room.clock, room.sleep, room.clock, place.mount)

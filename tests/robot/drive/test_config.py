@@ -24,10 +24,15 @@ def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path
     )
     files.write_text(
         folder / "drive.toml",
-        'policy = "policy.toml"\nfence = "fence.toml"\nbutton = 4\nspeed_ms = 0.5\n',
+        'policy = "policy.toml"\nfence = "fence.toml"\nbutton = 4\nspeed_ms = 0.5\n'
+        'camera = "video:seen.mp4"\ntracker = "replay:/logs/a.mcap"\n',
     )
     config = read_config(folder / "drive.toml", {"button": 7, "max_speed_ms": 0.4})
     assert config.policy == str(folder / "policy.toml") and config.button == 7
+    assert config.camera == f"video:{folder / 'seen.mp4'}"
+    assert config.tracker == "replay:/logs/a.mcap"
+    plain = read_config(folder / "drive.toml", {"camera": "video:here.mp4"})
+    assert plain.camera == "video:here.mp4"
     route = config.read_route()
     assert route.name == "square" and route.speed_ms == 0.4  # the limit
     settings = config.settings(route)
@@ -40,6 +45,7 @@ def test_options_come_before_the_file_whose_paths_start_from_its_folder(tmp_path
     [
         ("buton = 4", r"drive.toml.buton: unknown key; allowed: .*button"),
         ("speed_ms = -1.0", r"drive.toml.speed_ms: .*greater than 0"),
+        ("jpeg_quality = 96", r"drive.toml.jpeg_quality: .*less than or equal to 95"),
         ('control_unit = "deg"', r"drive.toml.control_unit: .*'rad'"),
         ("speed_ms = [", "must be valid TOML"),
         ('fence = "gone.toml"', "gone.toml: does not exist"),

@@ -146,11 +146,11 @@ class Judge:
         """Judge what the motor controller says.
 
         Args:
-            values: newest ones.
+            values: newest ones; None where it has said nothing.
             first_command_s: before which it rightly brakes, since nobody commands it.
         """
         if values is None:
-            return
+            raise Stop(Cause.MOTOR_LOST, "it has said nothing")
         if values.fault:
             found = f"{values.fault_name} (number {values.fault})"
             raise Stop(Cause.MOTOR_FAULT, found)
