@@ -14,7 +14,7 @@ import tyro
 if TYPE_CHECKING:
     from mi_nerfattack.robot.devices import AbstractEnable
     from mi_nerfattack.robot.vesc.calibration import Calibration
-    from mi_nerfattack.robot.vesc.guided import Arc
+    from mi_nerfattack.robot.vesc.guided import Arc, Drive
     from mi_nerfattack.robot.vesc.motor import VescMotor
 
 _FASTEST_MS, _FARTHEST_M = 1.5, 5.0
@@ -26,7 +26,8 @@ class Calibrate:
 
     Three short drives, straight, to the left and to the right, each of which you
     measure with a tape. It asks before anything moves, and moves only while a button
-    is held; letting it go brakes, as Ctrl-C does.
+    is held; letting it go brakes, as Ctrl-C does. What was measured is kept beside the
+    output until that is written: the same command goes on there.
     """
 
     port: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PORT")]
@@ -56,24 +57,51 @@ class Calibrate:
     def run(self) -> int:
         """Ask, arm, drive, ask, fit and write."""
         from mi_nerfattack.deploy.car import SMALL_CAR
-        from mi_nerfattack.robot.drive.safety.enable import (
-            JoystickEnable,
-            check_held,
-            wait_for_press,
-        )
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.robot.vesc.calibration import (
             Calibration,
             read_calibration,
             write_calibration,
         )
-        from mi_nerfattack.robot.vesc.guided import fit_arcs
-        from mi_nerfattack.robot.vesc.motor import VescMotor
+        from mi_nerfattack.robot.vesc.guided import DRIVES, fit_arcs, read_arcs
 
         before = Calibration()
         if self.calibration is not None:
             before = read_calibration(self.calibration)
         self._check(before)
         wheelbase_m = self.wheelbase_m or before.wheelbase_m or SMALL_CAR.wheelbase
+        kept = self.output.with_name(f"{self.output.name}.arcs.json")
+        arcs = read_arcs(kept)
+        if arcs:
+            print(f"{kept} has {', '.join(arcs)}; remove it to drive these again.")
+        if arcs.keys() < DRIVES.keys():
+            self._drive(before, arcs, kept)
+        try:
+            found, away_rad, spread = fit_arcs(list(arcs.values()), wheelbase_m, before)
+        except InputError as error:
+            raise InputError(
+                f"{error}; {kept} has what was measured: take out what is wrong, and "
+                "call this again"
+            ) from error
+        write_calibration(self.output, found)
+        kept.unlink()
+        self._tell(before, found)
+        print(
+            f"Lengths agree to {spread:.1%}, steering angles to "
+            f"{math.degrees(away_rad):.1f} degrees. Written to {self.output}."
+        )
+        return 0
+
+    def _drive(self, before: Calibration, arcs: dict[Drive, Arc], kept: Path) -> None:
+        """Arm, and add the drives that are missing; each is kept at once."""
+        from mi_nerfattack.robot.drive.safety.enable import (
+            JoystickEnable,
+            check_held,
+            wait_for_press,
+        )
+        from mi_nerfattack.robot.vesc.guided import DRIVES, write_arcs
+        from mi_nerfattack.robot.vesc.motor import VescMotor
+
         pad = JoystickEnable(self.enable, self.button, time.monotonic, self.silence_s)
         with (
             closing(pad),
@@ -87,22 +115,11 @@ class Calibrate:
                 f"Armed: without commands it brakes after {before.timeout_ms} ms with "
                 f"{before.brake_current_a:g} A."
             )
-            arcs = [
-                self._measure(motor, pad, name, sign * self.steering_rad)
-                for name, sign in (
-                    ("straight", 0),
-                    ("to the left", 1),
-                    ("to the right", -1),
-                )
-            ]
-        found, away_rad, spread = fit_arcs(arcs, wheelbase_m, before)
-        write_calibration(self.output, found)
-        self._tell(before, found)
-        print(
-            f"Lengths agree to {spread:.1%}, steering angles to "
-            f"{math.degrees(away_rad):.1f} degrees. Written to {self.output}."
-        )
-        return 0
+            for name, sign in DRIVES.items():
+                if name not in arcs:
+                    angle = sign * self.steering_rad
+                    arcs[name] = self._measure(motor, pad, name, angle)
+                    write_arcs(kept, arcs)
 
     def _check(self, before: Calibration) -> None:
         from mi_nerfattack.errors import InputError

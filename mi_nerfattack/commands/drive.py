@@ -251,20 +251,26 @@ def _drive(
     log = DriveLog(path, camera, clock, time.time_ns(), about)
     _say(f"Log        {path}")
     watchdog = Watchdog(devices.motor.brake, settings.judge.ages.loop_s, rig.rounds)
+    loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
     with closing(log), closing(watchdog):
-        if not config.simulated:
-            watchdog.start()  # the time of the simulated room stands still meanwhile
-            _arm(rig)
-        else:
-            devices.motor.arm()
-        _say("Armed.")
-        loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
-        with held_interrupts() as interrupted, _hangups():
-            stop = loop.run(interrupted)
-            end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
-            _say(f"{stop}: {end}")  # before an interrupt that came meanwhile
-    written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
-    _say(f"{path}: {written}")
+        try:
+            if not config.simulated:
+                watchdog.start()  # the simulated room's time stands still meanwhile
+                _arm(rig)
+            else:
+                devices.motor.arm()
+            _say("Armed.")
+            with held_interrupts() as interrupted, _hangups():
+                stop = loop.run(interrupted)
+                end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
+                _say(f"{stop}: {end}")  # before an interrupt that came meanwhile
+        finally:
+            if not loop.measures.rows:
+                log.discard()
+                _say(f"{path}: removed, for no command was sent")
+    if loop.measures.rows:
+        written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
+        _say(f"{path}: {written}")
     return stop, loop
 
 

@@ -58,3 +58,11 @@ class GrowingFile:
                 os.fsync(self._descriptor)
         finally:
             os.close(self._descriptor)
+
+    def discard(self) -> None:
+        """Close it and remove it."""
+        try:
+            self.close()
+        finally:
+            with files.reported(self.path):
+                self.path.unlink(missing_ok=True)

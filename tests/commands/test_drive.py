@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 
@@ -17,7 +18,7 @@ from helpers.driving_stand_ins import (
 )
 
 from mi_nerfattack.cli import main
-from mi_nerfattack.commands.drive import _arm, _check
+from mi_nerfattack.commands.drive import _arm, _check, _drive
 from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
@@ -26,6 +27,7 @@ from mi_nerfattack.robot.drive import rig as rigs
 from mi_nerfattack.robot.drive.config import read_config
 from mi_nerfattack.robot.drive.loop import Devices
 from mi_nerfattack.robot.drive.rig import Rig
+from mi_nerfattack.robot.drive.safety.judge import Cause
 
 SIMULATED = ["drive", "--policy", "expert", "--simulated", "--spp", "1"]
 
@@ -128,6 +130,24 @@ def test_all_devices_are_asked(kind, held, code, message, capsys):
     told = capsys.readouterr().out.splitlines()[1:]
     assert message in "\n".join(told)
     assert sum("ready" in line for line in told) == 5 - code and not bench.events
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_a_drive_that_sent_nothing_leaves_no_log(tmp_path, is_simulated, capsys):
+    bench, log = Bench(), tmp_path / "drive.mcap"
+    given = {"policy": "expert", "simulated": is_simulated, "log": str(log)}
+    config = read_config(None, given)
+    if is_simulated:  # Ctrl-C before the button is pressed
+        bench.at(0.5, lambda: signal.raise_signal(signal.SIGINT))
+        rig = rig_of(bench, StandInMotor(bench), StandInEnable(bench))
+        stop, _ = _drive(rig, config, SETTINGS)
+        assert stop.cause is Cause.INTERRUPTED
+    else:  # it is let go while the wheels turn
+        rig = rig_of(bench, TurningMotor(bench), Pad(3))
+        with pytest.raises(InputError, match="let go"):
+            _drive(rig, config, SETTINGS)
+    assert f"{log}: removed, for no command" in capsys.readouterr().out
+    assert not log.exists()
 
 
 def test_frames_go_as_jpeg_where_asked(monkeypatch):

@@ -126,6 +126,15 @@ class DriveLog:
         finally:
             self._file.close()
 
+    def discard(self) -> None:
+        """Remove the file: nothing was driven.
+
+        Raises:
+            InputError: it cannot be removed.
+        """
+        self._is_open = False
+        self._file.discard()
+
     def _add(
         self, topic: str, time_s: float, message: dict[str, Any], own: bool = True
     ) -> None:

@@ -10,20 +10,27 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
 from mi_nerfattack.robot.devices import Command
 from mi_nerfattack.robot.vesc.calibration import Calibration
 from mi_nerfattack.robot.vesc.motor import VescMotor
+from mi_nerfattack.scenario.section import read_section
 
 _PERIOD_S = 0.05
 _STANDING_MS, _STOP_S = 0.02, 5.0
 # Steps of the tachometer: six to an electrical turn, of which ERPM counts a minute's.
 _ERPM_PER_STEP = 60 / 6
+Drive = Literal["straight", "to the left", "to the right"]
+#: Drives of a calibration, and the sign of their steering.
+DRIVES: Mapping[Drive, int] = {"straight": 0, "to the left": 1, "to the right": -1}
 
 
 @dataclass(frozen=True)
@@ -153,6 +160,32 @@ def fit_arcs(
         float(away),
         (max(scales) - min(scales)) / min(scales),
     )
+
+
+def read_arcs(path: Path) -> dict[Drive, Arc]:
+    """Read arcs by their drives; none where there is no file.
+
+    Raises:
+        InputError: it cannot be read, or an arc tells nothing.
+    """
+    if not path.exists():
+        return {}
+    found = read_section(str(path), dict[Drive, Arc], files.read_json(path), "")
+    for name, arc in found.items():
+        try:
+            arc.check()
+        except InputError as error:
+            raise InputError(f"{path}: {name}: {error}") from error
+    return found
+
+
+def write_arcs(path: Path, arcs: Mapping[Drive, Arc]) -> None:
+    """Write arcs.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    files.write_json(path, {name: asdict(arc) for name, arc in arcs.items()})
 
 
 def _steps(motor: VescMotor) -> int:

@@ -24,7 +24,14 @@ from mi_nerfattack.robot.vesc.calibration import (
     read_calibration,
     write_calibration,
 )
-from mi_nerfattack.robot.vesc.guided import Arc, drive_arc, fit_arcs
+from mi_nerfattack.robot.vesc.guided import (
+    DRIVES,
+    Arc,
+    drive_arc,
+    fit_arcs,
+    read_arcs,
+    write_arcs,
+)
 from mi_nerfattack.robot.vesc.motor import VescMotor
 
 WHEELBASE_M, CENTRE, PER_RAD = 0.3, 0.47, 1.1
@@ -85,6 +92,32 @@ def test_an_arc_is_asked_for_until_it_is_right(monkeypatch, capsys):
     monkeypatch.setattr("builtins.input", lambda prompt: next(answers))
     assert _ask_for_arc(0.5, 700) == Arc(0.5, 700, 1.4, -0.1)
     assert "0.01 m forward and 0 m left" in capsys.readouterr().out
+
+
+def test_what_was_measured_is_kept_until_it_is_fitted(tmp_path, capsys):
+    output, kept = tmp_path / "car.toml", tmp_path / "car.toml.arcs.json"
+    arcs = dict(zip(DRIVES, made_arcs(CENTRE, 0.7, 0.25), strict=True))
+    command = ["calibrate", "/dev/none", "-o", str(output), "--enable", "/dev/none"]
+    command += ["--wheelbase-m", str(WHEELBASE_M)]
+    assert read_arcs(kept) == {}
+    write_arcs(kept, {"straight": arcs["straight"]})
+    assert cli.main(command) == 2  # the others are to be driven
+    told = capsys.readouterr()
+    assert f"{kept} has straight; remove it" in told.out
+    assert "/dev/none: does not exist" in told.err
+    write_arcs(kept, dict.fromkeys(DRIVES, arcs["straight"]))
+    assert cli.main(command) == 2
+    assert f"; {kept} has what was measured: take out" in capsys.readouterr().err
+    assert read_arcs(kept) == dict.fromkeys(DRIVES, arcs["straight"])
+    write_arcs(kept, arcs)
+    assert cli.main(command) == 0
+    assert read_calibration(output).servo_per_rad == PER_RAD and not kept.exists()
+    kept.write_text('{"sideways": {}}')
+    with pytest.raises(InputError, match="sideways.*'straight', 'to the left'"):
+        read_arcs(kept)
+    write_arcs(kept, {"straight": Arc(0.5, 0, 1.5, 0.0)})
+    with pytest.raises(InputError, match="arcs.json: straight: .* in 0 steps"):
+        read_arcs(kept)
 
 
 def test_what_a_check_raises_brakes_a_drive(tmp_path):
@@ -166,6 +199,7 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "Armed: without commands it brakes after 250 ms with 20 A." in shown
     assert "Braked: the enable button was let go" in shown
+    assert not (tmp_path / "car.toml.arcs.json").exists()
     assert f"Written to {output}." in shown and "(was 4000.0)" in shown
 
 
