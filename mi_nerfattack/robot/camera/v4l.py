@@ -30,8 +30,10 @@ class V4lCamera(AbstractCamera):
     """A camera, read by a thread that keeps the newest frame alone.
 
     A frame's time is the kernel's where that is by this computer's monotonic clock, as
-    of UVC cameras, else when it came; the first frame decides. Frames are prepared when
-    they are asked for, so that the thread keeps up with the device.
+    of UVC cameras, else when it came. The first frame decides, until one comes from the
+    future: such times are of another clock. Those of one that is behind ours by less
+    than a minute pass for old frames. Frames are prepared when they are asked for, so
+    that the thread keeps up with the device.
 
     Args:
         device: such as /dev/video0.
@@ -98,8 +100,9 @@ class V4lCamera(AbstractCamera):
                 now, came_s = time.monotonic(), self._clock()
                 age_s = now - frame.time if frame.time is not None else -1.0
                 if is_kernels is None:
-                    is_kernels = 0 <= age_s < _KERNEL_S
-                age_s = max(0.0, age_s) if is_kernels else 0.0
+                    is_kernels = age_s < _KERNEL_S
+                is_kernels = is_kernels and age_s >= 0
+                age_s = age_s if is_kernels else 0.0
                 check_size(self._device, frame.width, frame.height, self._prepare)
                 with self._lock:
                     self._unprepared = frame, came_s - age_s, index

@@ -153,11 +153,19 @@ def test_the_kernels_times_are_kept_however_old(device):
         assert seen(camera, index).time_s == pytest.approx(5.0 - max(0.0, age_s))
 
 
-def test_times_of_another_clock_are_not_believed(device):
+@pytest.mark.parametrize("times_s", [(1.7e9, 999.0), (1000.001, 999.9), (900.0, 999.9)])
+def test_times_of_another_clock_are_not_believed(device, times_s):
     camera = V4lCamera("device", SMALL, clock=lambda: 5.0)
-    for index, time_s in enumerate((1.7e9, 999.0)):
+    for index, time_s in enumerate(times_s):
         device.send(time_s)
         assert seen(camera, index).time_s == 5.0
+
+
+def test_times_that_run_ahead_are_not_believed_any_more(device):
+    camera = V4lCamera("device", SMALL, clock=lambda: 5.0)
+    for index, (age_s, time_s) in enumerate(((0.25, 4.75), (-0.001, 5.0), (0.25, 5.0))):
+        device.send(1000.0 - age_s)
+        assert seen(camera, index).time_s == pytest.approx(time_s)
 
 
 def test_frames_that_nobody_asks_for_cost_nothing(device, monkeypatch):
