@@ -22,6 +22,7 @@ from mi_nerfattack.commands.drive import DriveCommand
 from mi_nerfattack.commands.evaluate import Evaluate
 from mi_nerfattack.commands.export import Export
 from mi_nerfattack.commands.fit import Fit
+from mi_nerfattack.commands.monitor import Monitor
 from mi_nerfattack.commands.overlay import OverlayCommand
 from mi_nerfattack.commands.refine import Refine
 from mi_nerfattack.commands.render import Render
@@ -61,6 +62,7 @@ COMMANDS: dict[str, type[Command]] = {
     "refine": Refine,
     "retrain": Retrain,
     "overlay": OverlayCommand,
+    "monitor": Monitor,
     "drive": DriveCommand,
     "serve-policy": ServePolicy,
     "compare-drives": CompareDrives,

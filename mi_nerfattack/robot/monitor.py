@@ -98,22 +98,36 @@ def screen_image(
                 f"the screen {wide:.1f} x {high:.1f} mm; give at most {edge:.1f} "
                 "mm, of the box's longest edge, or a larger monitor (--diagonal-in)"
             )
-    if not all(0 <= level <= 255 for level in background):
-        raise InputError(f"--background: {background}; three levels from 0 to 255")
+    check_levels(background)
     width, height = (
         max(1, round(edge * density))
         for edge, density in zip(size_mm, screen.px_per_mm, strict=True)
     )
-    shown = _resized(face, width, height)
-    if screen.gamma is not None:
-        linear = srgb_to_linear_numpy(np.arange(256) / 255)
-        table = np.round(255 * linear ** (1 / screen.gamma)).astype(np.uint8)
-        shown = table[shown]
+    shown = levels_sent(_resized(face, width, height), screen.gamma)
     image = np.empty((screen.height_px, screen.width_px, 3), np.uint8)
     image[:] = background
     top, left = (screen.height_px - height) // 2, (screen.width_px - width) // 2
     image[top : top + height, left : left + width] = shown
     return image
+
+
+def check_levels(background: tuple[int, int, int]) -> None:
+    """Raise InputError unless a background is of levels from 0 to 255."""
+    if not all(0 <= level <= 255 for level in background):
+        raise InputError(f"--background: {background}; three levels from 0 to 255")
+
+
+def levels_sent(image: np.ndarray, gamma: float | None) -> np.ndarray:
+    """Return what a picture, uint8 sRGB, is sent as to a monitor.
+
+    Args:
+        image: of any shape.
+        gamma: exponent of the monitor's curve; None for that of sRGB.
+    """
+    if gamma is None:
+        return image
+    linear = srgb_to_linear_numpy(np.arange(256) / 255)
+    return np.round(255 * linear ** (1 / gamma)).astype(np.uint8)[image]
 
 
 def screen_page(image: np.ndarray, title: str) -> str:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import boxes
+from helpers.loopback import free_port
 from helpers.posed_folders import write_transforms
 from scipy.spatial.transform import Rotation
 
@@ -112,6 +113,34 @@ def test_refused(run, tmp_path, capsys):
         assert (code, shown) == (2, ""), error
         assert message in error and error.count("\n") == 1, error
         assert not list(tmp_path.iterdir())
+
+
+def test_a_monitor_follows_recorded_poses(run, tmp_path, capsys):
+    """The page is served until the recording ends; options are checked before."""
+    poses = tmp_path / "poses.csv"
+    rows = ["time_s,x_m,y_m,heading_rad", "0,4,3,0", "0.3,4.1,3,0"]
+    poses.write_text("\n".join(rows) + "\n")
+    told = ["--tracker", f"replay:{poses}", "--listen"]
+
+    def monitor(*arguments) -> tuple[int, str, str]:
+        code = cli.main(["monitor", str(run), *map(str, arguments)])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    address = f"127.0.0.1:{free_port()}"
+    code, out, err = monitor(*told, address, "--face", "left")
+    assert code == 2 and "the recording is over" in err
+    assert f"http://{address}/: open it on the monitor, F for full screen" in out
+    for arguments, message in (
+        (("--listen", "nobody at home"), "is no place to listen"),
+        (("--pixels", "9"), "two numbers"),
+        (("--background", 0, 0, 256), "--background"),
+        (("--face", "left", "--screen", 1, 2, 3, 90), "leave out --face"),
+        (("--screen", 1, 2, "nan", 90), "must be finite"),
+    ):
+        code, out, err = monitor(*told[:2], *arguments)
+        assert (code, out) == (2, ""), err
+        assert message in err and "Traceback" not in err
 
 
 def test_overlay_of_recordings(run, tmp_path, capsys):

@@ -77,8 +77,6 @@ class BoxOptions:
 
     def _checked(self) -> Screen:
         """Refuse wrong names and numbers before anything is read."""
-        from mi_nerfattack.robot.monitor import Screen
-
         for needed, names in _NEEDED.items():
             if getattr(self, needed) is None and (option := given(self, names)):
                 raise InputError(f"{option}: needs --{needed}")
@@ -86,9 +84,7 @@ class BoxOptions:
             raise InputError(f"--print: {self.print}; give FILE.pdf")
         if self.monitor is not None and self.monitor.suffix.lower() not in _SHOWN:
             raise InputError(f"--monitor: {self.monitor}; give FILE.png or FILE.html")
-        across, down = _pair("--aspect", self.aspect, ":")
-        width, height = map(round, _pair("--pixels", self.pixels, "x"))
-        return Screen(width, height, self.diagonal_in, across / down, self.gamma)
+        return make_screen(self.aspect, self.pixels, self.diagonal_in, self.gamma)
 
     def _print(
         self, path: Path, box: AttackedBox, on_page: Callable[[int, int], None]
@@ -134,6 +130,21 @@ _NEEDED = {
     "print": ("paper", "dpi"),
     "monitor": ("face", "diagonal_in", "aspect", "pixels", "background", "gamma"),
 }
+
+
+def make_screen(
+    aspect: str, pixels: str, diagonal_in: float, gamma: float | None
+) -> Screen:
+    """Return the monitor that options describe.
+
+    Raises:
+        InputError: one is out of range, or no two numbers.
+    """
+    from mi_nerfattack.robot.monitor import Screen
+
+    across, down = _pair("--aspect", aspect, ":")
+    width, height = map(round, _pair("--pixels", pixels, "x"))
+    return Screen(width, height, diagonal_in, across / down, gamma)
 
 
 def _pair(name: str, text: str, mark: str) -> tuple[float, float]:

@@ -1,0 +1,241 @@
+"""Where faces belong on a monitor, against an overlay; the server; the page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.request
+from contextlib import closing
+
+import numpy as np
+import pytest
+from helpers.boxes import made_box
+from scipy.ndimage import binary_opening
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.io import files
+from mi_nerfattack.render.camera.intrinsics import Camera
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.robot.attacked import FACES
+from mi_nerfattack.robot.devices import AbstractTracker, DeviceLostError, TrackedPose
+from mi_nerfattack.robot.follow import (
+    FollowServer,
+    StandingScreen,
+    follow_page,
+    seen_faces,
+)
+from mi_nerfattack.robot.monitor import Screen
+from mi_nerfattack.robot.overlay import Overlay
+from mi_nerfattack.robot.remote.sealed import Endpoint
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+TURNED = Rotation.from_euler("z", 25, degrees=True).as_matrix()
+BOX = made_box(pose=Pose(TURNED, np.array([2.0, 1.0, 0.4]), 0.25))
+SCREEN = Screen(640, 360)  # 598 x 336 mm
+EYES = [[1.4, -0.9, 0.6], [2.6, -0.4, 0.9], [3.0, 0.2, 0.3]]
+
+
+class Told(AbstractTracker):
+    """Has the pose that a test gives it."""
+
+    def __init__(self) -> None:
+        self.pose: TrackedPose | None = None
+        self.is_over = False
+
+    def at(self, eye, heading: float = 0.0) -> None:
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_euler("z", heading).as_matrix()
+        matrix[:3, 3] = eye
+        index = 0 if self.pose is None else self.pose.index + 1
+        self.pose = TrackedPose(matrix, time.monotonic(), index)
+
+    def newest(self, body: str) -> TrackedPose | None:
+        if self.is_over:
+            raise DeviceLostError("tracker: is over")
+        return self.pose
+
+    def close(self) -> None:
+        pass
+
+
+def virtual_camera(standing: StandingScreen, eye: np.ndarray):
+    """Return the pinhole whose image plane is the monitor, and its pose."""
+    into = np.cross(standing.right, standing.down)
+    away = (standing.middle - eye) @ into
+    foot = eye + away * into - standing.middle
+    density = 1e3 * np.array(standing.screen.px_per_mm)
+    middle = np.array([standing.screen.width_px, standing.screen.height_px]) / 2
+    spot = middle + density * [foot @ standing.right, foot @ standing.down]
+    pose = np.eye(4)
+    pose[:3] = np.stack([standing.right, standing.down, into, eye], axis=1)
+    size = standing.screen.width_px, standing.screen.height_px
+    return Camera(*size, *(away * density), *spot), pose
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("where", ["face", "upright"])
+def test_points_of_faces_lie_behind_their_pixels(eye, where):
+    """On the line from the eye; faces that the eye does not see are left out."""
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    if where == "upright":
+        heading = np.deg2rad(-80.0)
+        standing = StandingScreen.upright(SCREEN, np.array([2.1, 0.8, 0.5]), heading)
+        facing = np.cross(standing.down, standing.right)
+        np.testing.assert_allclose(facing[:2], [np.cos(heading), np.sin(heading)])
+    eye = np.array(eye)
+    found = seen_faces(standing, BOX, eye)
+    camera, pose = virtual_camera(standing, eye)
+    assert found
+    for face in FACES:
+        corner, across, down = BOX.plane(face)
+        outward = np.cross(down, across)
+        assert (face in found) == ((eye - corner) @ outward > 0)
+    for face, matrix in found.items():
+        corner, across, down = BOX.plane(face)
+        for u, v in ((0.0, 0.0), (1.0, 0.0), (0.3, 0.9)):
+            x, y, z = (corner + u * across + v * down - eye) @ pose[:3, :3]
+            wanted = camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
+            column = matrix @ [u, v, 1]
+            assert column[2] > 0
+            assert column[:2] / column[2] == pytest.approx(wanted, abs=1e-6)
+
+
+def test_on_its_own_face_a_picture_stands_still():
+    """Whoever looks from wherever: the face lies in the monitor's plane."""
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    wide, high = 250 * np.array(SCREEN.px_per_mm)
+    for eye in np.array(EYES)[:2]:
+        matrix = seen_faces(standing, BOX, eye)["front"]
+        spots = matrix @ np.array([[0, 0, 1], [1, 1, 1]]).T
+        spots = (spots[:2] / spots[2]).T
+        left, top = 320 - wide / 2, 180 - high / 2
+        np.testing.assert_allclose(spots[0], [left, top], atol=1e-6)
+        np.testing.assert_allclose(spots[1], [left + wide, top + high], atol=1e-6)
+    behind = standing.middle - np.cross(standing.down, standing.right)
+    assert seen_faces(standing, BOX, behind) == {}
+
+
+@pytest.fixture
+def served():
+    """A server, its tracker, and what it says."""
+    tracker, said = Told(), []
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    page = follow_page(standing, BOX, (9, 8, 7))
+    camera = np.array([0.1, 0.0, 0.2])
+    here = Endpoint("127.0.0.1", 0)
+    server = FollowServer(
+        here, page, standing, BOX, tracker, "car", camera, said.append
+    )
+    errors = []
+
+    def run() -> None:
+        try:
+            server.run()
+        except DeviceLostError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    with closing(server):
+        yield server, tracker, said, errors
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def wait_for(condition) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_each_new_pose_is_an_event(served):
+    server, tracker, said, errors = served
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    wait_for(lambda: said)
+    assert said == [
+        "Lost: nothing new of 'car' comes from the tracker; the picture stands still"
+    ]
+    with urllib.request.urlopen(server.address, timeout=20) as answer:
+        page = answer.read().decode()
+    assert "#090807" in page and page.count("data:image/png") == 6
+    with urllib.request.urlopen(server.address + "eye", timeout=20) as events:
+        for eye, heading in zip(EYES, (0.0, np.pi / 2, 0.0), strict=True):
+            tracker.at(eye, heading)
+            line = b""
+            while not line.startswith(b"data: "):
+                line = events.readline()
+            told = json.loads(line[6:])
+            turned = [-0.0, 0.1, 0.2] if heading else [0.1, 0.0, 0.2]
+            wanted = seen_faces(standing, BOX, np.array(eye) + turned)
+            assert list(told) == list(wanted)
+            for face, matrix in wanted.items():
+                np.testing.assert_allclose(
+                    np.reshape(told[face], (3, 3)), matrix, atol=1e-9
+                )
+    wait_for(lambda: len(said) == 2)
+    assert said[1] == "car is seen again"
+    with pytest.raises(urllib.error.HTTPError):
+        urllib.request.urlopen(server.address + "other", timeout=20)
+    tracker.is_over = True
+    wait_for(lambda: errors)
+
+
+def test_a_port_that_is_taken_is_one_message(served):
+    server, tracker, _, _ = served
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    port = int(server.address.rstrip("/").rpartition(":")[2])
+    with pytest.raises(InputError, match="cannot listen there .* give another"):
+        FollowServer(
+            Endpoint("127.0.0.1", port),
+            "",
+            standing,
+            BOX,
+            tracker,
+            "car",
+            np.zeros(3),
+            print,
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium to show a page")
+def test_a_browser_shows_what_the_camera_would_see(tmp_path):
+    """Pixel by pixel, but for edges, as the overlay by the monitor's own camera."""
+    rng, tracker = np.random.default_rng(0), Told()
+    tiles = {face: rng.integers(30, 255, (8, 8, 3)) for face in FACES}
+    block = np.ones((32, 32, 1))
+    images = {
+        face: np.kron(tile, block).astype(np.uint8) for face, tile in tiles.items()
+    }
+    box = made_box(images, pose=BOX.pose)
+    standing = StandingScreen.on_face(SCREEN, box, "front")
+    page, here = follow_page(standing, box), Endpoint("127.0.0.1", 0)
+    server = FollowServer(here, page, standing, box, tracker, "car", np.zeros(3), print)
+    assert CHROMIUM is not None
+    with closing(server):
+        threading.Thread(target=server.run, daemon=True).start()
+        for number, eye in enumerate(EYES):
+            tracker.at(eye)
+            shot = tmp_path / f"{number}.png"
+            still = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+            still += [f"--user-data-dir={tmp_path / 'profile'}", "--timeout=3000"]
+            still += ["--window-size=640,360", f"--screenshot={shot}", server.address]
+            subprocess.run(
+                [CHROMIUM, *still], capture_output=True, timeout=120, check=True
+            )
+            camera, pose = virtual_camera(standing, np.array(eye))
+            overlay = Overlay(box, camera, keyed=False)
+            wanted = overlay.apply(np.zeros((360, 640, 3), np.uint8), pose)
+            shown = files.read_image(shot)[..., :3]
+            far = np.abs(shown.astype(int) - wanted).max(2) > 60
+            covered = wanted.any(2)
+            assert covered.mean() > 0.3
+            # tiles are some 25 pixels wide, and all differ
+            assert far.sum() < 0.02 * covered.sum()
+            assert not binary_opening(far, np.ones((3, 3))).any()
