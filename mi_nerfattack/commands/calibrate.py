@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.terminal import ask, confirm, say
+
 if TYPE_CHECKING:
     from mi_nerfattack.robot.devices import AbstractEnable
     from mi_nerfattack.robot.vesc.calibration import Calibration
@@ -105,13 +107,13 @@ class Calibrate:
         pad = JoystickEnable(self.enable, self.button, time.monotonic, self.silence_s)
         with (
             closing(pad),
-            closing(VescMotor(self.port, before, _confirm, self.baudrate)) as motor,
+            closing(VescMotor(self.port, before, confirm, self.baudrate)) as motor,
         ):
             print(f"{self.port}: firmware {motor.firmware}")
-            _ask("Lift the wheels off the ground: they turn for a second. Enter")
-            wait_for_press(pad, time.sleep, _say)
+            ask("Lift the wheels off the ground: they turn for a second. Enter")
+            wait_for_press(pad, time.sleep, say)
             motor.arm(lambda: check_held(pad))
-            _say(
+            say(
                 f"Armed: without commands it brakes after {before.timeout_ms} ms with "
                 f"{before.brake_current_a:g} A."
             )
@@ -157,12 +159,12 @@ class Calibrate:
 
         command = Command(self.speed_ms, steering_rad)
         while True:
-            _ask(
+            ask(
                 f"Drive {name}, about {self.distance_m:g} m at {self.speed_ms:g} m/s. "
                 "Put the car on the floor with twice that free; mark where the middle "
                 "of its rear axle stands, and the line straight ahead. Enter"
             )
-            wait_for_press(pad, time.sleep, _say)
+            wait_for_press(pad, time.sleep, say)
             try:
                 driven = drive_arc(
                     motor, command, self.distance_m, lambda: check_held(pad)
@@ -195,32 +197,13 @@ def _ask_for_arc(servo: float, steps: int) -> Arc:
             f"Servo {servo:.3f}, {steps} steps of the motor: {forward_m:g} m ahead, "
             f"{left_m:g} m to the left, a way of {arc.length_m:.3f} m."
         )
-        if _ask("Is that right? [Y/n]").lower() not in ("n", "no"):
+        if ask("Is that right? [Y/n]").lower() not in ("n", "no"):
             return arc
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
-
-
-def _ask(question: str) -> str:
-    from mi_nerfattack.errors import InputError
-
-    try:
-        return input(f"{question}: ").strip()
-    except EOFError as err:
-        raise InputError(
-            "calibrate: nobody answers its questions; run it in a terminal"
-        ) from err
-
-
-def _confirm(question: str) -> bool:
-    return _ask(f"{question} [y/N]").lower() in ("y", "yes")
 
 
 def _ask_number(question: str) -> float:
     while True:
-        given = _ask(question)
+        given = ask(question)
         try:
             if math.isfinite(value := float(given.replace(",", "."))):
                 return value

@@ -14,14 +14,14 @@ import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
+from mi_nerfattack.commands.shared.terminal import confirm, say
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
-    from mi_nerfattack.policy.base import AbstractPolicy
     from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
     from mi_nerfattack.robot.drive.config import DriveConfig
     from mi_nerfattack.robot.drive.loop import DriveLoop, DriveSettings
-    from mi_nerfattack.robot.drive.rig import Rig, Seeing
+    from mi_nerfattack.robot.drive.rig import Rig, Trained
     from mi_nerfattack.robot.drive.safety.judge import Stop
     from mi_nerfattack.vehicle.route.route import Route
 
@@ -131,17 +131,17 @@ class DriveCommand:
         variant.ensure()
         route = config.read_route()
         settings = config.settings(route)
-        policy, seeing = self._policy(config)
+        trained = self._trained(config)
         config.check()
-        _say(_statement(config, route, settings))
-        with open_rig(config, route, policy, seeing, _confirm) as rig:
-            _say(_sight(rig.devices.camera.camera, rig.mount))
+        say(_statement(config, route, settings))
+        with open_rig(config, route, trained, confirm) as rig:
+            say(_sight(rig.devices.camera.camera, rig.mount))
             if self.check:
                 return _check(rig, settings)
             stop, loop = _drive(rig, config, settings)
         figures = loop.measures.figures(route)
         if figures is not None:
-            _say(_summary(dataclasses.asdict(figures)))
+            say(_summary(dataclasses.asdict(figures)))
         return _code(stop)
 
     def _given(self) -> dict[str, Any]:
@@ -154,9 +154,9 @@ class DriveCommand:
             if name not in own and value is not None and value is not False
         }
 
-    def _policy(self, config: DriveConfig) -> tuple[AbstractPolicy | None, Seeing]:
+    def _trained(self, config: DriveConfig) -> Trained:
         from mi_nerfattack.robot.drive.config import EXPERT, REMOTE
-        from mi_nerfattack.robot.drive.rig import Seeing
+        from mi_nerfattack.robot.drive.rig import Trained
 
         name = config.policy
         if name is None:
@@ -166,24 +166,13 @@ class DriveCommand:
         is_here = name != EXPERT and not name.startswith(REMOTE)
         policy = self.options.section(name).build() if is_here else None
         file = config.camera_file or (name if is_here else None)
-        return policy, Seeing(*(PolicyFile.read(file).camera or (None, None)))
+        return Trained(policy, *(PolicyFile.read(file).camera or (None, None)))
 
 
 _UNBRAKED = (
     "no brake could be sent; the motor controller brakes by its own timeout, and the "
     "wheels stay as they are"
 )
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
-
-
-def _confirm(question: str) -> bool:
-    try:
-        return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
-    except EOFError as err:
-        raise InputError(f"{question}: nobody answers; run it in a terminal") from err
 
 
 def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> str:
@@ -249,9 +238,9 @@ def _drive(
     devices, clock = rig.devices, rig.clock
     camera = devices.camera.camera
     log = DriveLog(path, camera, clock, time.time_ns(), about)
-    _say(f"Log        {path}")
+    say(f"Log        {path}")
     watchdog = Watchdog(devices.motor.brake, settings.judge.ages.loop_s, rig.rounds)
-    loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, _say)
+    loop = DriveLoop(devices, settings, log, watchdog, clock, rig.sleep, say)
     with closing(log), closing(watchdog):
         try:
             if not config.simulated:
@@ -259,18 +248,18 @@ def _drive(
                 _arm(rig)
             else:
                 devices.motor.arm()
-            _say("Armed.")
+            say("Armed.")
             with held_interrupts() as interrupted, _hangups():
                 stop = loop.run(interrupted)
                 end = "braked, wheels centred" if loop.was_braked else _UNBRAKED
-                _say(f"{stop}: {end}")  # before an interrupt that came meanwhile
+                say(f"{stop}: {end}")  # before an interrupt that came meanwhile
         finally:
             if not loop.measures.rows:
                 log.discard()
-                _say(f"{path}: removed, for no command was sent")
+                say(f"{path}: removed, for no command was sent")
     if loop.measures.rows:
         written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
-        _say(f"{path}: {written}")
+        say(f"{path}: {written}")
     return stop, loop
 
 
@@ -279,8 +268,8 @@ def _arm(rig: Rig) -> None:
     from mi_nerfattack.robot.drive.safety.enable import check_held, wait_for_press
 
     enable = rig.devices.enable
-    _say("Lift the wheels off the floor: they turn for a second.")
-    wait_for_press(enable, rig.sleep, _say)
+    say("Lift the wheels off the floor: they turn for a second.")
+    wait_for_press(enable, rig.sleep, say)
     rig.devices.motor.arm(partial(check_held, enable))
 
 
@@ -331,7 +320,7 @@ def _check(rig: Rig, settings: DriveSettings) -> int:
         "policy": decision,
     }
     found, held = dict.fromkeys(asks, ""), set()
-    _say("Hold the enable button once within five seconds, and let it go.")
+    say("Hold the enable button once within five seconds, and let it go.")
     while rig.clock() < end:
         held.add(devices.enable.is_held())
         for name, ask in asks.items():
@@ -345,7 +334,7 @@ def _check(rig: Rig, settings: DriveSettings) -> int:
     ill = f"it was {how} held; is it the right button?"
     found["enable"] = "" if len(held) == 2 else ill
     for name, problem in found.items():
-        _say(f"{name:10} {problem or 'ready'}")
+        say(f"{name:10} {problem or 'ready'}")
     return 1 if any(found.values()) else 0
 
 

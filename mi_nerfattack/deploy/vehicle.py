@@ -62,6 +62,12 @@ def planar_body(state: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def planar_state(body_to_world: np.ndarray) -> np.ndarray:
+    """Return x, y (metres) and heading (radians), (..., 3), of poses (..., 4, 4)."""
+    heading = np.arctan2(body_to_world[..., 1, :1], body_to_world[..., 0, :1])
+    return np.concatenate([body_to_world[..., :2, 3], heading], -1)
+
+
 def checked_pose(pose: Any) -> np.ndarray:
     """Copy a vehicle's pose x, y (metres), theta (radians) to (3,) float64.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_nerfattack.deploy.vehicle import planar_state
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
 from mi_nerfattack.render.camera.pose import check_rigid
@@ -57,9 +58,7 @@ def vehicle_states(track: Track, mount: CameraMount) -> np.ndarray:
         mount: of the camera on it.
     """
     to_body = np.linalg.inv(camera_to_body(mount))
-    bodies = track.camera_to_world @ to_body
-    headings = np.arctan2(bodies[:, 1, 0], bodies[:, 0, 0])
-    return np.column_stack([bodies[:, :2, 3], headings])
+    return planar_state(track.camera_to_world @ to_body)
 
 
 def check_times(where: str, times: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -170,8 +171,7 @@ class DriveConfig(Section):
                 turn as slowly as this.
         """
         if not self.simulated:
-            scales = self.read_scales()
-            slowest = scales.erpm_least / scales.erpm_per_ms
+            slowest = self.scales.erpm_least / self.scales.erpm_per_ms
             if route.speed_ms < slowest:
                 raise InputError(
                     f"speed_ms: {route.speed_ms:g}; the motor controller holds "
@@ -200,8 +200,9 @@ class DriveConfig(Section):
             duration_s=self.duration_s,
         )
 
-    def read_scales(self) -> Calibration:
-        """Read the motor's calibration.
+    @cached_property
+    def scales(self) -> Calibration:
+        """The motor's calibration, read once.
 
         Raises:
             InputError: it cannot be read, or is of a car with another wheelbase.

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mi_nerfattack.deploy.vehicle import planar_state
 from mi_nerfattack.robot.devices import Decision, TrackedPose
-from mi_nerfattack.robot.drive.pilot import planar_state
 from mi_nerfattack.vehicle.route.route import Route
 
 

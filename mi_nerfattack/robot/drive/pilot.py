@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mi_nerfattack.deploy.driving import policy_image
+from mi_nerfattack.deploy.vehicle import planar_state
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.robot.devices import (
     AbstractPilot,
@@ -128,9 +129,3 @@ def expert_control(
         return float(expert.control(planar_state(pose.body_to_world))[0])
 
     return control
-
-
-def planar_state(body_to_world: np.ndarray) -> np.ndarray:
-    """Return x, y (metres) and heading (radians) of a pose (4, 4)."""
-    (x, y), ahead = body_to_world[:2, 3], body_to_world[:2, 0]
-    return np.array([x, y, math.atan2(ahead[1], ahead[0])])

@@ -62,14 +62,16 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Seeing:
-    """What a policy was trained with; None where nobody says.
+class Trained:
+    """A policy, and what it was trained with; None where nobody says.
 
     Args:
+        policy: that decides here; None of the expert and of a remote one.
         camera: its intrinsics.
         mount: its place on the car.
     """
 
+    policy: AbstractPolicy | None = None
     camera: Camera | None = None
     mount: CameraMount | None = None
 
@@ -78,8 +80,7 @@ class Seeing:
 def open_rig(
     config: DriveConfig,
     route: Route,
-    policy: AbstractPolicy | None,
-    seeing: Seeing,
+    trained: Trained,
     confirm: Callable[[str], bool],
 ) -> Iterator[Rig]:
     """Open the devices one after the other, and close all at the end.
@@ -89,8 +90,7 @@ def open_rig(
     Args:
         config: what to open.
         route: that is driven.
-        policy: that decides here; None of the expert and of a remote one.
-        seeing: as the policy does.
+        trained: what decides.
         confirm: asked before the flash memory of an old motor controller is written.
 
     Raises:
@@ -98,26 +98,27 @@ def open_rig(
         DeviceLostError: it does not answer.
         SetupError: a package is not installed.
     """
-    opened = _simulated if config.simulated else _real
     with ExitStack() as stack:
-        yield opened(stack, config, route, policy, seeing, confirm)
+        if config.simulated:
+            yield _simulated(stack, config, route, trained)
+        else:
+            yield _real(stack, config, route, trained, confirm)
 
 
 def _real(
     stack: ExitStack,
     config: DriveConfig,
     route: Route,
-    policy: AbstractPolicy | None,
-    seeing: Seeing,
+    trained: Trained,
     confirm: Callable[[str], bool],
 ) -> Rig:
-    mount = seeing.mount or bundled_place("room").mount
-    clock, scales = time.monotonic, config.read_scales()
+    mount = trained.mount or bundled_place("room").mount
+    clock, scales = time.monotonic, config.scales
 
     def path(name: str | None) -> Path | None:
         return None if name is None else Path(name)
 
-    camera = seeing.camera
+    camera = trained.camera
     size = None if camera is None else (camera.width, camera.height)
     zed = ZedOptions(path(config.zed_calibration), config.zed_mode, size)
     if not config.camera.startswith("zed:"):
@@ -131,12 +132,12 @@ def _real(
     stack.callback(tracker.close)
     enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
     stack.callback(enable.close)
-    pilot = _pilot(config, route, policy, tracker, clock)
+    pilot = _pilot(config, route, trained.policy, tracker, clock)
     stack.callback(pilot.close)
     motor = VescMotor(config.port, scales, confirm)
     stack.callback(motor.close)
     devices = Devices(seen, tracker, motor, pilot, enable)
-    return Rig(devices, clock, time.sleep, suspended_clock, seeing.mount)
+    return Rig(devices, clock, time.sleep, suspended_clock, trained.mount)
 
 
 def _pilot(
@@ -171,14 +172,8 @@ def _control(
 
 
 def _simulated(
-    stack: ExitStack,
-    config: DriveConfig,
-    route: Route,
-    policy: AbstractPolicy | None,
-    seeing: Seeing,
-    confirm: Callable[[str], bool],
+    stack: ExitStack, config: DriveConfig, route: Route, trained: Trained
 ) -> Rig:
-    del confirm  # its motor controller has no memory
     if (config.policy or "").startswith(REMOTE):
         raise InputError(
             "--simulated: its time is not that of another computer; give a policy that "
@@ -187,13 +182,14 @@ def _simulated(
     place = bundled_place("room")
     place = replace(
         place,
-        camera=seeing.camera or place.camera,
-        mount=seeing.mount or place.mount,
+        camera=trained.camera or place.camera,
+        mount=trained.mount or place.mount,
     )
     room = SimulatedRoom(config.car, route.pose_at(0.0))
     tracker, camera = SimulatedTracker(room), simulated_camera(room, place, config.spp)
     stack.callback(camera.close)
-    pilot = SimulatedPilot(_control(config, route, policy, tracker), room)
+    control = _control(config, route, trained.policy, tracker)
+    pilot = SimulatedPilot(control, room)
     motor, enable = SimulatedMotor(room), SimulatedEnable(room)
     stack.callback(motor.close)
     devices = Devices(camera, tracker, motor, pilot, enable)

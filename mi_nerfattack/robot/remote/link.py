@@ -19,7 +19,7 @@ MAX_BYTES = 1 << 26
 _CLOSE_S = 1.0  # zenoh waits for 10 s where the other side has stopped
 
 
-class Link:
+class ZenohLink:
     """A connection on which bytes go both ways.
 
     The car waits until what it sends is on its way, and so knows when the network is

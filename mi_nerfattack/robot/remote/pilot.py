@@ -17,7 +17,7 @@ from mi_nerfattack.robot.devices import (
 )
 from mi_nerfattack.robot.remote import frames
 from mi_nerfattack.robot.remote.frames import SentDecision
-from mi_nerfattack.robot.remote.link import Link
+from mi_nerfattack.robot.remote.link import ZenohLink
 from mi_nerfattack.robot.remote.offset import ClockOffset, Offset
 from mi_nerfattack.robot.remote.sealed import (
     NO_SESSION,
@@ -98,7 +98,7 @@ class RemotePilot(AbstractPilot):
         self._on_way_s: float | None = None
         self._decision: Decision | None = None
         self.delays: Delays | None = None
-        self._link = Link(endpoint, False, self._receive, connect_s)
+        self._link = ZenohLink(endpoint, False, self._receive, connect_s)
         self._thread = threading.Thread(target=self._work, daemon=True)
         try:
             self._connect(connect_s)

@@ -16,7 +16,7 @@ from mi_nerfattack.errors import is_interrupt
 from mi_nerfattack.robot.devices import Clock
 from mi_nerfattack.robot.remote import frames
 from mi_nerfattack.robot.remote.frames import SentDecision, SentFrame
-from mi_nerfattack.robot.remote.link import Link
+from mi_nerfattack.robot.remote.link import ZenohLink
 from mi_nerfattack.robot.remote.sealed import (
     Endpoint,
     Kind,
@@ -88,7 +88,7 @@ class PolicyServer:
         self._hello: bytes | None = None
         self.ages_s: deque[float] = deque(maxlen=_KEPT)
         self.refused = 0
-        self._link = Link(endpoint, True, self._receive)
+        self._link = ZenohLink(endpoint, True, self._receive)
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
         """Serve until told otherwise; decisions are made by the calling thread."""

@@ -26,7 +26,7 @@ class Answer(NamedTuple):
     time_s: float
 
 
-class Link:
+class SerialLink:
     """A serial port with a VESC at its other end.
 
     Its thread listens and never sends: a command comes from whoever calls `send`, and

@@ -15,7 +15,7 @@ from mi_nerfattack.robot.devices import (
     MotorValues,
 )
 from mi_nerfattack.robot.vesc.calibration import Calibration
-from mi_nerfattack.robot.vesc.link import BAUDRATE, Link
+from mi_nerfattack.robot.vesc.link import BAUDRATE, SerialLink
 from mi_nerfattack.robot.vesc.messages import (
     VALUES_QUESTION,
     Id,
@@ -70,7 +70,7 @@ class VescMotor(AbstractMotor):
         self._waits_since: float | None = None  # the first question with no answer
         self._way = 0
         self.values = Values()
-        self._link = Link(port, baudrate)
+        self._link = SerialLink(port, baudrate)
         try:
             version = self._link.ask(bytes([Id.FW_VERSION]), _VERSION_S, tries=2)
             self.firmware = parse_firmware(version.payload)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.vesc.calibration import Calibration
-from mi_nerfattack.robot.vesc.link import Link
+from mi_nerfattack.robot.vesc.link import SerialLink
 from mi_nerfattack.robot.vesc.messages import (
     VALUES_QUESTION,
     Firmware,
@@ -45,7 +45,7 @@ Confirm = Callable[[str], bool]
 
 
 def set_timeout(
-    link: Link, firmware: Firmware, calibration: Calibration, confirm: Confirm
+    link: SerialLink, firmware: Firmware, calibration: Calibration, confirm: Confirm
 ) -> None:
     """Give the controller the calibration's timeout and brake current.
 
@@ -89,7 +89,7 @@ def set_timeout(
 
 
 def prove_timeout(
-    link: Link, calibration: Calibration, check: Callable[[], None]
+    link: SerialLink, calibration: Calibration, check: Callable[[], None]
 ) -> None:
     """Turn the wheels, fall silent, and see the controller brake them.
 
@@ -130,7 +130,7 @@ def prove_timeout(
 
 
 def _turn_wheels(
-    link: Link, calibration: Calibration, check: Callable[[], None]
+    link: SerialLink, calibration: Calibration, check: Callable[[], None]
 ) -> tuple[float, int]:
     """Return when the last command was sent, and how fast the wheels turned by then."""
     erpm = round(PROOF_SPEED_MS * calibration.erpm_per_ms)
@@ -152,7 +152,7 @@ def _turn_wheels(
 
 
 def _fall_silent(
-    link: Link, silent: float, limit_s: float, check: Callable[[], None]
+    link: SerialLink, silent: float, limit_s: float, check: Callable[[], None]
 ) -> tuple[float, list[Values]]:
     """Return all values up to the first asked for past the limit, and how late."""
     seen: list[Values] = []
@@ -166,7 +166,7 @@ def _fall_silent(
 
 
 def _see_it_brake(
-    link: Link, turning: int, values: Values, check: Callable[[], None]
+    link: SerialLink, turning: int, values: Values, check: Callable[[], None]
 ) -> list[Values]:
     """Return the values that follow, until the wheels are at half their speed."""
     end, seen = time.monotonic() + _STOP_S, []
@@ -198,7 +198,7 @@ def _current(values: Values) -> float:
     return abs(values.motor_current_a or 0.0)
 
 
-def _watch(link: Link, check: Callable[[], None]) -> tuple[float, Values]:
+def _watch(link: SerialLink, check: Callable[[], None]) -> tuple[float, Values]:
     """Return when values came, and them; refuse what makes them prove nothing."""
     check()
     heard, values = _values(link)
@@ -210,12 +210,12 @@ def _watch(link: Link, check: Callable[[], None]) -> tuple[float, Values]:
     return heard, values
 
 
-def _values(link: Link) -> tuple[float, Values]:
+def _values(link: SerialLink) -> tuple[float, Values]:
     answer = link.ask(VALUES_QUESTION, _ANSWER_S)
     return answer.time_s, parse_values(answer.payload)
 
 
-def _configuration(link: Link, firmware: Firmware) -> bytes:
+def _configuration(link: SerialLink, firmware: Firmware) -> bytes:
     """Return the answer to GET_APPCONF, of a firmware whose layout is known."""
     raw = link.ask(bytes([Id.GET_APPCONF]), _ANSWER_S, tries=3).payload
     least, below = _KNOWN

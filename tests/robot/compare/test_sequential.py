@@ -104,20 +104,17 @@ def test_drives_that_end_early(tmp_path):
         path.write_text(text)
         return read_criteria(path).criteria.judge(figures, whole)
 
-    for seconds, whole, outcome in (
-        (1.0, True, True),
-        (0.9, True, False),
-        (1.0, False, True),
-        (0.9, False, None),
+    for word, seconds, whole, outcome in (
+        ("at_least", 1.0, True, True),
+        ("at_least", 0.9, True, False),
+        ("at_least", 1.0, False, True),
+        ("at_least", 0.9, False, None),
+        ("at_most", 1.0, True, True),
+        ("at_most", 1.1, True, False),
+        ("at_most", 1.0, False, None),
+        ("at_most", 1.1, False, False),
     ):
-        assert judge(TEXT, whole, wheel_out_s=seconds) is outcome
-    text = TEXT.replace("at_least", "at_most")
-    for seconds, whole, outcome in (
-        (1.0, True, True),
-        (1.1, True, False),
-        (1.0, False, None),
-        (1.1, False, False),
-    ):
+        text = TEXT.replace("at_least", word)
         assert judge(text, whole, wheel_out_s=seconds) is outcome
     text = TEXT.replace("wheel_out_s", "cross_track_mean_m")
     assert judge(text, True, cross_track_mean_m=2.0) is True

@@ -62,13 +62,13 @@ def test_files_that_say_something_wrong(tmp_path, text, message):
 def test_a_calibration_of_another_wheelbase_is_refused(tmp_path):
     path = tmp_path / "car.toml"
     write_calibration(path, Calibration(timeout_ms=200))
-    assert read_config(None, {"calibration": str(path)}).read_scales().timeout_ms == 200
+    assert read_config(None, {"calibration": str(path)}).scales.timeout_ms == 200
     path = tmp_path / "measured.toml"
     write_calibration(path, Calibration(wheelbase_m=0.25))
     given = {"calibration": str(path), "wheelbase_m": 0.25}
-    assert read_config(None, given).read_scales().wheelbase_m == 0.25
+    assert read_config(None, given).scales.wheelbase_m == 0.25
     with pytest.raises(InputError, match=r"measured\.toml: .* 0\.25 m, .* is 0\.325;"):
-        read_config(None, {"calibration": str(path)}).read_scales()
+        assert read_config(None, {"calibration": str(path)}).scales
 
 
 @pytest.mark.parametrize(

@@ -186,38 +186,45 @@ def test_a_drive_is_logged_whole(tmp_path):
     assert {"speed_ms", "has_timed_out"} < set(messages(path, "/motor")[0])
 
 
-def test_nothing_moves_before_the_enable_is_released_and_held(tmp_path):
-    bench = Bench()
-    bench.held = True  # from the beginning, as by a stuck button
-    bench.at(3.0, partial(setattr, bench, "held", False))
-    bench.at(3.5, partial(setattr, bench, "held", True))
-    bench.drive(tmp_path / "drive.mcap", duration_s=1.0)
-    assert bench.events[0][1] == "send" and bench.events[0][0] >= bench.start_s + 3.5
-
-
-def test_nothing_moves_while_the_kill_switch_is_pressed(tmp_path):
-    bench = Bench()
-    bench.killed = True
-    bench.at(1.0, partial(setattr, bench, "held", True))
-    bench.at(2.0, partial(setattr, bench, "killed", False))
-    bench.at(3.0, partial(setattr, bench, "held", False))
-    bench.at(4.0, partial(setattr, bench, "held", True))
-    bench.drive(tmp_path / "drive.mcap", duration_s=1.0)
-    assert bench.events[0][1] == "send" and bench.events[0][0] >= bench.start_s + 4.0
-
-
-def test_an_enable_that_is_held_too_early_is_pressed_again(tmp_path):
-    bench = Bench()
-    bench.offset_m = 5.0  # the car stands outside
-    bench.at(1.0, partial(setattr, bench, "held", True))
-    bench.at(2.0, partial(setattr, bench, "offset_m", 0.0))
-    bench.at(3.0, partial(setattr, bench, "held", False))
-    bench.at(4.0, partial(setattr, bench, "held", True))
-    path = tmp_path / "drive.mcap"
+@pytest.mark.parametrize(
+    ("at_first", "changes", "message"),
+    [
+        # as by a stuck button
+        ({"held": True}, [(3.0, "held", False), (3.5, "held", True)], None),
+        (
+            {"killed": True},
+            [
+                (1.0, "held", True),
+                (2.0, "killed", False),
+                (3.0, "held", False),
+                (4.0, "held", True),
+            ],
+            "kill switch",
+        ),
+        (
+            {"offset_m": 5.0},
+            [
+                (1.0, "held", True),
+                (2.0, "offset_m", 0.0),
+                (3.0, "held", False),
+                (4.0, "held", True),
+            ],
+            "outside the fence: the car is at x",
+        ),
+    ],
+)
+def test_nothing_moves_before_the_enable_is_pressed_anew(
+    tmp_path, at_first, changes, message
+):
+    bench, path = Bench(), tmp_path / "drive.mcap"
+    vars(bench).update(at_first)
+    for time_s, name, value in changes:
+        bench.at(time_s, partial(setattr, bench, name, value))
     bench.drive(path, duration_s=1.0)
-    assert bench.events[0][0] >= bench.start_s + 4.0
+    assert bench.events[0][1] == "send"
+    assert bench.events[0][0] >= bench.start_s + changes[-1][0]
     told = [item["message"] for item in messages(path, "/safety")]
-    assert any("outside the fence: the car is at x" in text for text in told)
+    assert message is None or any(message in text for text in told)
     assert "ready: release the enable button, then hold it" in told
 
 

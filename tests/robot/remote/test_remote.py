@@ -18,7 +18,7 @@ from mi_nerfattack.robot.devices import (
     DeviceLostError,
     Frame,
 )
-from mi_nerfattack.robot.remote.link import TO_POLICY, Link
+from mi_nerfattack.robot.remote.link import TO_POLICY, ZenohLink
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, Kind, Message, Sealer, draw_id
 from mi_nerfattack.robot.remote.server import PolicyServer
@@ -113,9 +113,9 @@ def stranger(endpoint):
 def test_decisions_come_back(monkeypatch):
     """Of the frames that were sent, with their times, and clocks set right by one."""
     sent: list[bytes] = []
-    send = Link.send
+    send = ZenohLink.send
     monkeypatch.setattr(
-        Link, "send", lambda link, raw: (sent.append(raw), send(link, raw))[1]
+        ZenohLink, "send", lambda link, raw: (sent.append(raw), send(link, raw))[1]
     )
     endpoint = free_endpoint()
     with serving(endpoint) as (server, notices, made):
@@ -217,7 +217,7 @@ def test_a_link_that_is_lost():
         connected(endpoint, connect_s=0.2)
     with serving(endpoint):
         with pytest.raises(InputError, match=f"--listen {endpoint}: .*in use"):
-            Link(endpoint, True, lambda raw: None)
+            ZenohLink(endpoint, True, lambda raw: None)
         pilot = connected(endpoint, lost_s=0.5)
     with closing(pilot):
 

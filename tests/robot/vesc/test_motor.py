@@ -20,7 +20,7 @@ from helpers.waiting import wait_for
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import Command, DeviceLostError, MotorValues
 from mi_nerfattack.robot.vesc.calibration import Calibration
-from mi_nerfattack.robot.vesc.link import Link
+from mi_nerfattack.robot.vesc.link import SerialLink
 from mi_nerfattack.robot.vesc.motor import VescMotor
 
 
@@ -282,7 +282,10 @@ def test_ports_that_are_none(start, tmp_path):
     car = start("--firmware", "3.39")
     with pytest.raises(InputError, match=r"firmware 3\.39"):
         VescMotor(car.port)
-    with closing(Link(car.port)), pytest.raises(InputError, match="other programs"):
+    with (
+        closing(SerialLink(car.port)),
+        pytest.raises(InputError, match="other programs"),
+    ):
         VescMotor(car.port)
     car.tell("mute")
 

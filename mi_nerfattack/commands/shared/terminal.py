@@ -1,0 +1,27 @@
+"""Talking with whoever sits at the terminal."""
+
+from __future__ import annotations
+
+from mi_nerfattack.errors import InputError
+
+
+def say(text: str) -> None:
+    """Show a line at once, through a pipe, too."""
+    print(text, flush=True)
+
+
+def ask(question: str) -> str:
+    """Return the answer to a question, without spaces around it.
+
+    Raises:
+        InputError: nobody can answer.
+    """
+    try:
+        return input(f"{question}: ").strip()
+    except EOFError as err:
+        raise InputError(f"{question}: nobody answers; run it in a terminal") from err
+
+
+def confirm(question: str) -> bool:
+    """Ask whether something may be done; no, unless it is said."""
+    return ask(f"{question} [y/N]").lower() in ("y", "yes")
