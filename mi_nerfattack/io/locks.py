@@ -27,12 +27,13 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         folder: must exist.
 
     Raises:
-        InputError: another process works in the folder.
+        InputError: another process works in the folder, or it may not be read.
     """
     if fcntl is None:
         yield
         return
-    descriptor = os.open(folder, os.O_RDONLY)
+    with files.reported(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -48,10 +49,15 @@ def exclusive(folder: str | Path) -> Iterator[None]:
 
 
 def wait_for(folder: str | Path) -> None:
-    """Wait until no process works in a folder, which may be missing."""
+    """Wait until no process works in a folder, which may be missing.
+
+    Raises:
+        InputError: it may not be read.
+    """
     if fcntl is None or not os.path.isdir(folder):
         return
-    descriptor = os.open(folder, os.O_RDONLY)
+    with files.reported(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # as of `exclusive`
             fcntl.flock(descriptor, fcntl.LOCK_EX)

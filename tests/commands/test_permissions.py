@@ -1,0 +1,54 @@
+"""Every verb in a folder that an ordinary user may not write to.
+
+What it would read is missing, too, where that is possible: the output is looked at
+before anything that takes long.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.modes import obeyed_modes
+
+from mi_nerfattack.cli import main
+
+SCENES = Path(__file__).parents[2] / "scenes"
+ROOM = SCENES / "room"
+VERBS = {
+    "capture": ["capture", ROOM / "scene.xml", "--routes", ROOM / "routes.json", "-o"],
+    "photographs": ["capture", SCENES, "-o"],
+    "fit": ["fit", "absent", "-o"],
+    "bake": ["bake", "absent", "--routes", "absent", "-o"],
+    "asset": ["asset", "absent", "-o"],
+    "render": ["render", "absent", "-o"],
+    "train": ["train", "--data", "absent", "-o"],
+    "evaluate": ["evaluate", "--output"],
+    "page": ["evaluate", "--page"],
+    "attack": ["attack", SCENES / "demo.toml", "-o"],
+    "demo": ["demo", "-o"],
+    "retrain": ["retrain", "absent", "--data", "absent", "-o"],
+    "export": ["export", SCENES / "cube/field.safetensors", "-o"],
+    "report": ["report", "absent", "-o"],
+    "overlay": ["overlay", "absent", "absent", "-o"],
+    "check": ["check", SCENES / "demo.toml", "-o"],
+    "calibrate": ["calibrate", "/dev/absent", "-o"],
+    "drive": ["drive", "--policy", "expert", "--simulated", "--log"],
+}
+ENDINGS = {"render": "exr", "report": "html", "check": "png", "drive": "mcap"}
+FIELDS = ("fit", "bake", "asset", "train", "retrain", "export")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_folder_without_permission_is_told_first(verb, tmp_path, variant, capsys):
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    folder.chmod(0o555)
+    ending = "safetensors" if verb in FIELDS else ENDINGS.get(verb)
+    output = folder / ("out" if ending is None else f"out.{ending}")
+    with obeyed_modes():
+        assert main([*map(str, VERBS[verb]), str(output)]) == 2
+    error = capsys.readouterr().err
+    assert f"{folder}/" in error and "permission denied; check the owner" in error
+    folder.chmod(0o755)
+    assert not list(folder.iterdir())
