@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 a command's own negative answer, 2 usage or input,
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
 import os
@@ -18,6 +19,7 @@ import tyro
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
 from mi_nerfattack.commands import COMMANDS, Command
+from mi_nerfattack.commands.shared.result import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 
 PROG = "mi-nerfattack"
@@ -102,11 +104,19 @@ def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str)
         code = stop.code or 0
         return code if isinstance(code, int) else EXIT_INPUT
     try:
-        return command.run()
+        return _tell(command)
     except SystemExit as stop:
         if not isinstance(stop.__context__, BrokenPipeError):
             raise
         raise stop.__context__ from None  # rich ends the process by itself
+
+
+def _tell(command: Command) -> int:
+    """Run a command, print the figures that it returns, and return the exit code."""
+    as_json = getattr(command, "json", False)
+    with stdout_to_stderr() if as_json else contextlib.nullcontext():
+        result = command.run()
+    return result if isinstance(result, int) else result.tell(as_json)
 
 
 def _check_name(arguments: list[str], commands: Mapping[str, type[Command]]) -> None:

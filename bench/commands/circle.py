@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchCircle:
@@ -24,10 +26,8 @@ class BenchCircle:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Drive, print and draw."""
-        import json
-
         from mi_nerfattack.io import files
 
         files.check_writable(self.output)
@@ -38,12 +38,9 @@ class BenchCircle:
             circles = circle.run(bars.counter("circles"))
         circle.write_figure(self.output, circles)
         document = circle.to_document(circles)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print(document)
-            print(f"figure written to {self.output}", file=sys.stderr)
-        return int(not circle.within_limit(circles))
+        print(f"figure written to {self.output}", file=sys.stderr)
+        code = int(not circle.within_limit(circles))
+        return Result(document, lambda: _print(document), code)
 
 
 def _print(document: dict[str, Any]) -> None:

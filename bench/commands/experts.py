@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchExperts:
@@ -18,10 +20,8 @@ class BenchExperts:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Drive and print."""
-        import json
-
         from mi_nerfattack import variant
 
         variant.ensure()
@@ -31,11 +31,8 @@ class BenchExperts:
         with StageBars() as bars:
             results = experts.run(bars.counter("drives"))
         document = experts.to_document(results)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print(document)
-        return int(not experts.within_limit(results))
+        code = int(not experts.within_limit(results))
+        return Result(document, lambda: _print(document), code)
 
 
 def _print(document: dict[str, Any]) -> None:

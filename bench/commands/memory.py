@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchMemory:
@@ -30,10 +32,8 @@ class BenchMemory:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, write and print."""
-        import json
-
         from bench.attack import memory
         from bench.commands.speed import measure, read_sizes
         from mi_nerfattack.io import files
@@ -42,12 +42,9 @@ class BenchMemory:
         settings = memory.Settings(size, self.poses, self.horizons)
         files.check_writable(self.output)
         document = measure(memory.run, settings, self.output, self._command())
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print(document)
         print(f"written to {self.output}", file=sys.stderr)
-        return int(max(document["change"].values()) > memory.WANTED)
+        code = int(max(document["change"].values()) > memory.WANTED)
+        return Result(document, lambda: _print(document), code)
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "memory", "--size", self.size]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
 class BenchPoses:
     """Estimate the poses of a posed folder's photographs alone, and compare.
 
-    Both are brought together by a similarity of the cameras' places. Prints one line of
-    JSON: photographs placed, and medians of rotation and position, the latter as a
-    share of the greatest distance between two cameras. Exit code 1 unless 96 % are
-    placed, within 1 degree and 1 %.
+    Both are brought together by a similarity of the cameras' places. Prints photographs
+    placed, and medians of rotation and position, the latter as a share of the greatest
+    distance between two cameras. Exit code 1 unless 96 % are placed, within 1 degree
+    and 1 %.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -29,8 +30,10 @@ class BenchPoses:
     """Look for features at most at this size, pixels."""
     seed: int = 0
     """Of the random choices."""
+    json: bool = False
+    """Print one line of JSON in place of lines."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Estimate, compare and print."""
         import tempfile
 
@@ -70,9 +73,14 @@ class BenchPoses:
             "position_share": float(np.median(shares)),
             "reprojection_error_px": result.error_px,
         }
-        print(json.dumps(found))
         good = found["rotation_deg"] <= 1 and found["position_share"] <= 0.01
-        return int(not (good and len(placed) >= 0.96 * len(names)))
+        good = good and len(placed) >= 0.96 * len(names)
+
+        def show() -> None:
+            for name, value in found.items():
+                print(f"{name}: {value:.5g}")
+
+        return Result(found, show, int(not good))
 
 
 def pose_errors(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

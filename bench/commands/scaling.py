@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchScaling:
@@ -34,10 +36,8 @@ class BenchScaling:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, write and print."""
-        import json
-
         from bench.attack import scaling
         from bench.commands.speed import measure, read_sizes
         from mi_nerfattack.errors import InputError
@@ -50,12 +50,8 @@ class BenchScaling:
         settings = scaling.Settings(*parts, self.repeats)
         files.check_writable(self.output)
         document = measure(scaling.run, settings, self.output, self._command())
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print(document, settings.axes())
         print(f"written to {self.output}", file=sys.stderr)
-        return 0
+        return Result(document, lambda: _print(document, settings.axes()))
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "scaling", "--sizes", *self.sizes]

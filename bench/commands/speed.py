@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchRender:
@@ -32,10 +34,8 @@ class BenchRender:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, print and write."""
-        import json
-
         from bench.render import run as render
 
         sizes = read_sizes(self.sizes)
@@ -46,11 +46,7 @@ class BenchRender:
             settings = render.Settings(sizes, sizes[-1], repeats=self.repeats)
         document = measure(render.run, settings)
         document = _publish("render", document, self._command(), self.output)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print(document)
-        return 0
+        return Result(document, lambda: _print(document))
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "render", "--sizes", *self.sizes]
@@ -72,10 +68,8 @@ class BenchComposite:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Render, print and draw."""
-        import json
-
         from mi_nerfattack import variant
         from mi_nerfattack.io import files
 
@@ -88,12 +82,9 @@ class BenchComposite:
         with StageBars() as bars:
             results, pictures = composite.run(size, bars.counter("heights"))
         composite.write_figure(self.output, results, pictures)
-        if self.json:
-            print(json.dumps(composite.to_document(results, size), allow_nan=False))
-        else:
-            _print_composite(results)
-            print(f"figure written to {self.output}", file=sys.stderr)
-        return 0
+        print(f"figure written to {self.output}", file=sys.stderr)
+        document = composite.to_document(results, size)
+        return Result(document, lambda: _print_composite(results))
 
 
 @dataclass(frozen=True)
@@ -110,10 +101,8 @@ class BenchSteps:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """March, measure and print."""
-        import json
-
         from mi_nerfattack import variant
 
         (size,) = read_sizes((self.size,))
@@ -124,11 +113,7 @@ class BenchSteps:
 
         with StageBars() as bars:
             rows = steps.run(size, self.repeats, bars.counter("rows"))
-        if self.json:
-            print(json.dumps(steps.to_document(rows, size), allow_nan=False))
-        else:
-            _print_steps(rows)
-        return 0
+        return Result(steps.to_document(rows, size), lambda: _print_steps(rows))
 
 
 @dataclass(frozen=True)
@@ -154,10 +139,9 @@ class BenchFit:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, print and write."""
         import dataclasses
-        import json
 
         from bench.fit import run as fit
 
@@ -170,11 +154,7 @@ class BenchFit:
         )
         document = measure(fit.run, settings)
         document = _publish("fit", document, self._command(), self.output)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print_fit(document)
-        return 0
+        return Result(document, lambda: _print_fit(document))
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "fit", "--repeats", str(self.repeats)]
@@ -208,10 +188,8 @@ class BenchAttack:
     json: bool = False
     """Print one line of JSON in place of the tables."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, print and write."""
-        import json
-
         from bench.attack import run as attack
 
         sizes = read_sizes(self.sizes)
@@ -221,11 +199,7 @@ class BenchAttack:
             settings = attack.Settings.quick(sizes, self.parts, self.repeats)
         document = measure(attack.run, settings)
         document = _publish("attack", document, self._command(), self.output)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            _print_attack(document)
-        return 0
+        return Result(document, lambda: _print_attack(document))
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "attack", "--sizes", *self.sizes]

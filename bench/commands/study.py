@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 if TYPE_CHECKING:
     from bench.study import rows
 
@@ -34,8 +36,10 @@ class BenchStudy:
     beside it (.png)."""
     table: bool = False
     """Add no row; print what there is."""
+    json: bool = False
+    """End with one line of JSON, the rows, in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Make the rows that are missing."""
         from rich.console import Console
 
@@ -56,10 +60,10 @@ class BenchStudy:
                 raise InputError(f"{self.output}: no rows; leave out --table")
         else:
             found = self._fill(study.keys(), study.attack_row)
-        Console(width=400).print(study.table(found))
         if self.study == "distribution":
             distribution.draw(self.output.with_suffix(".png"), found)
-        return 0
+        table = study.table(found)
+        return Result({"rows": found}, lambda: Console(width=400).print(table))
 
     def _fill(self, keys: list[rows.Row], work: Callable[[rows.Key], rows.Row]) -> Any:
         import torch

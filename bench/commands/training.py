@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class BenchCollect:
@@ -32,10 +34,8 @@ class BenchCollect:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Measure, print and write."""
-        import json
-
         from mi_nerfattack import variant
 
         variant.ensure()
@@ -57,14 +57,14 @@ class BenchCollect:
         if self.output is not None:
             path = results.write(self.output, "collect", document)
             print(f"written to {path}", file=sys.stderr)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
+        enough = self.quick or document["ratio"] >= collect.WANTED
+
+        def tell() -> None:
             for count, rate in document["median"].items():
                 print(f"{count} workers: {rate:.2f} frames/s")
             print(f"ratio: {document['ratio']:.2f} (wanted {collect.WANTED})")
-        enough = self.quick or document["ratio"] >= collect.WANTED
-        return 0 if enough or self.workers != 2 else 1
+
+        return Result(document, tell, 0 if enough or self.workers != 2 else 1)
 
     def _command(self) -> list[str]:
         command = ["python", "-m", "bench", "collect"]
@@ -92,8 +92,10 @@ class BenchDagger:
     """Processes that collect and drive; one a core by default."""
     quick: bool = False
     """Take the smallest sizes: to see that it works, not for figures."""
+    json: bool = False
+    """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Collect, train, drive and draw."""
         from dataclasses import replace
 
@@ -124,9 +126,8 @@ class BenchDagger:
         document = results.stamp(document, command)
         dagger.write_figure(self.output, document)
         files.write_json(self.output.with_suffix(".json"), document)
-        _print(document)
         print(f"figure written to {self.output}", file=sys.stderr)
-        return 0
+        return Result(document, lambda: _print(document))
 
 
 def _print(document: dict[str, Any]) -> None:

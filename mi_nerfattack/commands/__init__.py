@@ -1,7 +1,8 @@
 """The sub-commands of ``mi-nerfattack``, one file each.
 
 A command is a frozen dataclass: its fields are the arguments, their docstrings the
-help, and ``run()`` does the work and returns the exit code. These modules are all
+help, and ``run()`` does the work and returns the exit code or, where it prints
+figures, these, as a ``Result``; then it takes ``json``. These modules are all
 imported for ``--help``; import anything slow (torch, our own parts) inside run().
 """
 
@@ -30,6 +31,7 @@ from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
 from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.serve_policy import ServePolicy
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.commands.transfer import Transfer
@@ -38,8 +40,8 @@ from mi_nerfattack.commands.transfer import Transfer
 class Command(Protocol):
     """What the command line calls after it has parsed the arguments."""
 
-    def run(self) -> int:
-        """Do the work and return the exit code."""
+    def run(self) -> int | Result:
+        """Do the work and return the exit code, or the figures with it."""
         ...
 
 

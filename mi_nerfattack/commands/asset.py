@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mi_nerfattack.commands.shared.progress import StageBars
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.capture.object_views import ObjectViews
@@ -76,7 +77,7 @@ class Asset:
     json: bool = False
     """End with one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Render or read the views, fit, score and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import (
@@ -107,16 +108,14 @@ class Asset:
             "source_unit": found.images.unit,
             "seed": str(self.seed),
         }
-        finish(
+        return finish(
             result,
             found.images,
             self.output,
             provenance,
-            self.json,
             checkpoint,
             found.depth,
         )
-        return 0
 
     def _options(self, has_depth: bool) -> FitOptions:
         from mi_nerfattack.fit.options import FitOptions

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class Attack:
@@ -43,7 +45,7 @@ class Attack:
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Run the job and print the table."""
         from mi_nerfattack.commands.shared.run_scenario import run_scenario
         from mi_nerfattack.errors import InputError
@@ -60,7 +62,6 @@ class Attack:
             self.scenario,
             self.output,
             self.resume,
-            self.json,
             force=self.force,
             anyway=self.anyway,
             frames=self.frames if self.pictures else None,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Bake:
     json: bool = False
     """End with one line of JSON."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Bake, score and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import report_folder
@@ -93,11 +94,8 @@ class Bake:
         }
         title = f"Bake of {self.field.name}"
         page = write_bake_report(report_folder(self.output), views, facts, title)
-        if self.json:
-            print(json.dumps(finite(facts | bake_summary(views))))
-        else:
-            print(f"{bake_verdict(views)}\nWrote {self.output} and {page}.")
-        return 0
+        told = f"{bake_verdict(views)}\nWrote {self.output} and {page}."
+        return Result(finite(facts | bake_summary(views)), lambda: print(told))
 
     def _check(self) -> None:
         """Refuse what would fail after the bake."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.shared.terminal import ask, confirm, say
 
 if TYPE_CHECKING:
@@ -55,8 +56,10 @@ class Calibrate:
     silence_s: float | None = None
     """Seconds without any event of the joystick after which the button counts as let
     go; for wireless ones that send all the time. Never by default."""
+    json: bool = False
+    """End with one line of JSON: the scales, and how well the drives agree."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Ask, arm, drive, ask, fit and write."""
         from mi_nerfattack.deploy.car import SMALL_CAR
         from mi_nerfattack.errors import InputError
@@ -87,12 +90,23 @@ class Calibrate:
             ) from error
         write_calibration(self.output, found)
         kept.unlink()
-        self._tell(before, found)
-        print(
-            f"Lengths agree to {spread:.1%}, steering angles to "
-            f"{math.degrees(away_rad):.1f} degrees. Written to {self.output}."
-        )
-        return 0
+        document = {
+            "output": str(self.output),
+            "calibration": found.model_dump(mode="json"),
+            "before": before.model_dump(mode="json"),
+            "length_spread": float(spread),
+            "steering_away_rad": float(away_rad),
+        }
+
+        def show() -> None:
+            for name in ("erpm_per_ms", "servo_per_rad", "servo_centre"):
+                print(f"{name} = {getattr(found, name)} (was {getattr(before, name)})")
+            print(
+                f"Lengths agree to {spread:.1%}, steering angles to "
+                f"{math.degrees(away_rad):.1f} degrees. Written to {self.output}."
+            )
+
+        return Result(document, show)
 
     def _drive(self, before: Calibration, arcs: dict[Drive, Arc], kept: Path) -> None:
         """Arm, and add the drives that are missing; each is kept at once."""
@@ -173,10 +187,6 @@ class Calibrate:
                 print(f"Braked: {error}. Once more.")
             else:
                 return _ask_for_arc(*driven)
-
-    def _tell(self, before: Calibration, found: Calibration) -> None:
-        for name in ("erpm_per_ms", "servo_per_rad", "servo_centre"):
-            print(f"{name} = {getattr(found, name)} (was {getattr(before, name)})")
 
 
 def _ask_for_arc(servo: float, steps: int) -> Arc:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from mi_nerfattack.commands.shared.options import check_empty, given
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.errors import InputError
 
 _SHOWN = 10  # photographs to take again; capture.json lists all
@@ -174,10 +176,16 @@ class PhotographArguments:
             return None
         return Markers(self.marker_m, self.marker_family, self.markers_flat)
 
-    def tell(self, result: PoseEstimate) -> None:
-        """Print what was found, and draw the cameras."""
+    def document(self, result: PoseEstimate) -> dict[str, Any]:
+        """Return what `capture.json` holds, and who stood farthest apart."""
+        from mi_nerfattack.capture.photographs.quality import quality_table
+
+        table = quality_table(result.found, result.qualities, asdict(result.scale))
+        return table | {"farthest": result.farthest, "distance": result.distance}
+
+    def tell(self, result: PoseEstimate, picture: Path) -> None:
+        """Print what was found."""
         from mi_nerfattack.capture.photographs.quality import FEW_PLACED, retake
-        from mi_nerfattack.report.plots.fit import write_cameras_above
 
         total = len(result.placed) + len(result.left_out)
         print(
@@ -194,10 +202,7 @@ class PhotographArguments:
             print(f"Take again: {name}, {why}")
         if len(again) > _SHOWN:
             print(f"and {len(again) - _SHOWN} more")
-        picture, table = (
-            result.path.with_name(name) for name in ("cameras.png", "capture.json")
-        )
-        write_cameras_above(picture, result.found, set(again))
+        table = picture.with_name("capture.json")
         print(f"{picture}: the cameras from above; {table}: what each photograph gave")
         scale = result.scale
         if scale.spread is not None:
@@ -241,6 +246,8 @@ class Capture:
     points."""
     seed: int = 0
     """Of all random numbers."""
+    json: bool = False
+    """End with one line of JSON in place of the sentences."""
     scene: Annotated[SceneArguments, tyro.conf.OmitArgPrefixes] = field(
         default_factory=SceneArguments
     )
@@ -248,7 +255,7 @@ class Capture:
         default_factory=PhotographArguments
     )
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Render or estimate, and write."""
         from mi_nerfattack.commands.shared.progress import StageBars
 
@@ -263,16 +270,37 @@ class Capture:
         with StageBars() as bars:
             if is_scene:
                 path = self.scene.write(self.source, self.output, self.seed, bars)
-                told = None
+                document, show = self._views(path)
             else:
-                told = self.photographs.write(self.source, self.output, self.seed, bars)
-                path = told.path
-        if told is not None:
-            self.photographs.tell(told)
-        else:
-            print(f"Wrote {self.scene.views} views to {path.parent}")
-        print("Fit a field to them, in 15 minutes; hours give a sharper one, see fit:")
-        folder = shlex.quote(str(path.parent))
-        quick = "--network small --budget-minutes 15"
-        print(f"  mi-nerfattack fit {folder} -o FIELD.safetensors {quick}")
-        return 0
+                found = self.photographs.write(
+                    self.source, self.output, self.seed, bars
+                )
+                path = found.path
+                document, show = self._photographs(found)
+
+        def tell() -> None:
+            show()
+            folder = shlex.quote(str(path.parent))
+            print(
+                "Fit a field to them, in 15 minutes; hours give a sharper one, see "
+                f"fit:\n  mi-nerfattack fit {folder} -o FIELD.safetensors --network "
+                "small --budget-minutes 15"
+            )
+
+        return Result({"transforms": str(path), **document}, tell)
+
+    def _views(self, path: Path) -> tuple[dict[str, Any], Callable[[], None]]:
+        count = self.scene.views
+        return {"views": count}, lambda: print(f"Wrote {count} views to {path.parent}")
+
+    def _photographs(
+        self, found: PoseEstimate
+    ) -> tuple[dict[str, Any], Callable[[], None]]:
+        """Draw the cameras; return what was found, and what prints it."""
+        from mi_nerfattack.capture.photographs.quality import retake
+        from mi_nerfattack.report.plots.fit import write_cameras_above
+
+        picture = found.path.with_name("cameras.png")
+        write_cameras_above(picture, found.found, set(retake(found.qualities)))
+        options = self.photographs
+        return options.document(found), lambda: options.tell(found, picture)

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class Check:
@@ -28,9 +30,8 @@ class Check:
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Check, draw and tell."""
-        import json
         import shlex
 
         from mi_nerfattack import variant
@@ -60,11 +61,8 @@ class Check:
             drawn = picture if check.picture(picture) else None
             show("drawing", 1, 1, "")
             check.price()
-        if self.json:
-            document = {**check.document(), "picture": drawn and str(drawn)}
-            print(json.dumps(document, allow_nan=False))
-        else:
-            name = shlex.quote(str(self.scenario))
-            for line in checks.sentences(check, name, drawn):
-                print(line)
-        return 1 if check.refused else 0
+        document = {**check.document(), "picture": drawn and str(drawn)}
+        told = checks.sentences(check, shlex.quote(str(self.scenario)), drawn)
+        return Result(
+            document, lambda: print(*told, sep="\n"), int(bool(check.refused))
+        )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.transfer.found import FoundAttack
@@ -47,7 +48,7 @@ class CompareDrives:
     json: bool = False
     """Print metrics.json in place of sentences."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, align, judge, print and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.io import files, locks
@@ -77,11 +78,8 @@ class CompareDrives:
             files.write_json(self.output / METRICS, compared.document)
             files.write_text(self.output / "summary.txt", "\n".join([*told, ""]))
             self._draw(found, course, compared)
-        if self.json:
-            print(json.dumps(compared.document, allow_nan=False))
-        else:
-            print(*told, f"Written: {self.output.resolve()}", sep="\n")
-        return 0
+        told.append(f"Written: {self.output.resolve()}")
+        return Result(compared.document, lambda: print(*told, sep="\n"))
 
     def _draw(self, found: FoundAttack, course: Course, compared: Compared) -> None:
         """Write the pictures, once there is a real drive."""

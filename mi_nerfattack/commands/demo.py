@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mi_nerfattack.commands.asset import Asset
+from mi_nerfattack.commands.shared.result import Result
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,10 @@ class Demo:
     """Finest level of the grid that is fitted to a mesh."""
     anyway: bool = False
     """Attack although the object would prove nothing; see attack."""
+    json: bool = False
+    """End with one line of JSON, the content of metrics.json, in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Run the bundled scenario."""
         from mi_nerfattack.commands.shared.run_scenario import run_scenario
         from mi_nerfattack.scenes import bundled
@@ -41,7 +44,6 @@ class Demo:
         return run_scenario(
             bundled("demo.toml"),
             output,
-            False,
             False,
             lambda: self._object_field(output),
             anyway=self.anyway,
@@ -58,5 +60,5 @@ class Demo:
             height_m=self.height_m,
             resolution=self.resolution,
             resume=True,  # of a demo that was interrupted
-        ).run()
+        ).run().show()
         return field

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class Doctor:
@@ -13,15 +15,15 @@ class Doctor:
     """
 
     json: bool = False
-    """Print JSON in place of the table."""
+    """Print one line of JSON in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Print the findings."""
         from mi_nerfattack.system import doctor
 
         findings = doctor.examine()
-        if self.json:
-            print(doctor.to_json(findings))
-        else:
-            doctor.print_table(findings)
-        return 0 if doctor.can_run(findings) else 1
+        return Result(
+            doctor.document(findings),
+            lambda: doctor.print_table(findings),
+            0 if doctor.can_run(findings) else 1,
+        )

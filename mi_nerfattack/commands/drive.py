@@ -14,6 +14,7 @@ import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.shared.terminal import confirm, say
 from mi_nerfattack.errors import InputError
 
@@ -116,12 +117,15 @@ class DriveCommand:
     check: bool = False
     """Ask every device for five seconds, in which the button is to be held and let go;
     drive nothing."""
+    json: bool = False
+    """End with one line of JSON: how the drive ended, its log and its figures, or what
+    --check found."""
     options: Annotated[
         PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
     ] = PolicyOptions()
     """How the policy is called."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, open, state, arm, drive and sum up."""
         from mi_nerfattack import variant
         from mi_nerfattack.robot.drive.config import read_config
@@ -138,15 +142,29 @@ class DriveCommand:
             say(_sight(rig.devices.camera.camera, rig.mount))
             if self.check:
                 return _check(rig, settings)
-            stop, loop = _drive(rig, config, settings)
-        figures = loop.measures.figures(route)
-        if figures is not None:
-            say(_summary(dataclasses.asdict(figures)))
-        return _code(stop)
+            stop, loop, written = _drive(rig, config, settings)
+        found = loop.measures.figures(route)
+        figures = None if found is None else dataclasses.asdict(found)
+        document = {
+            "end": stop.cause.value,
+            "message": stop.message,
+            "braked": loop.was_braked,
+            **written,
+            "figures": figures,
+        }
+
+        def show() -> None:
+            if figures is not None:
+                say(_summary(figures))
+
+        if (error := _raised(stop)) is not None:
+            show()
+            raise error
+        return Result(document, show, 0 if stop.cause.is_planned else 1)
 
     def _given(self) -> dict[str, Any]:
         """Return the options of the drive that are on the command line."""
-        own = ("config", "check", "options")
+        own = ("config", "check", "json", "options")
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {
             name: value
@@ -220,8 +238,8 @@ def _sight(camera: Camera, mount: CameraMount | None) -> str:
 
 def _drive(
     rig: Rig, config: DriveConfig, settings: DriveSettings
-) -> tuple[Stop, DriveLoop]:
-    """Arm, and run the loop with its log and its watchdog."""
+) -> tuple[Stop, DriveLoop, dict[str, Any]]:
+    """Arm, and run the loop with its watchdog and its log; returns what that holds."""
     import time
     from contextlib import closing
     from datetime import datetime
@@ -257,10 +275,12 @@ def _drive(
             if not loop.measures.rows:
                 log.discard()
                 say(f"{path}: removed, for no command was sent")
+    about_log = {"log": None, "messages": {}}
     if loop.measures.rows:
+        about_log = {"log": str(path), "messages": dict(log.counts)}
         written = ", ".join(f"{n} {topic}" for topic, n in log.counts.items())
         say(f"{path}: {written}")
-    return stop, loop
+    return stop, loop, about_log
 
 
 def _arm(rig: Rig) -> None:
@@ -289,7 +309,7 @@ def _hangups() -> Iterator[None]:
         signal.signal(number, before)
 
 
-def _check(rig: Rig, settings: DriveSettings) -> int:
+def _check(rig: Rig, settings: DriveSettings) -> Result:
     """Ask every device for five seconds, and say what speaks against driving."""
     from mi_nerfattack.robot.drive.safety.judge import Cause, Stop, asked
 
@@ -333,9 +353,13 @@ def _check(rig: Rig, settings: DriveSettings) -> int:
     how = "always" if True in held else "never"
     ill = f"it was {how} held; is it the right button?"
     found["enable"] = "" if len(held) == 2 else ill
-    for name, problem in found.items():
-        say(f"{name:10} {problem or 'ready'}")
-    return 1 if any(found.values()) else 0
+    told = [f"{name:10} {problem or 'ready'}" for name, problem in found.items()]
+    document = {name: problem or None for name, problem in found.items()}
+    return Result(
+        {"refused": document},
+        lambda: print(*told, sep="\n"),
+        1 if any(found.values()) else 0,
+    )
 
 
 def _summary(values: dict[str, float]) -> str:
@@ -352,12 +376,10 @@ def _summary(values: dict[str, float]) -> str:
     )
 
 
-def _code(stop: Stop) -> int:
-    """Return the exit code; a mistake of ours and Ctrl-C are raised as ever."""
+def _raised(stop: Stop) -> BaseException | None:
+    """Return what is raised as ever: a mistake of ours, and Ctrl-C."""
     from mi_nerfattack.robot.drive.safety.judge import Cause
 
     if stop.cause is Cause.INTERRUPTED:
-        raise KeyboardInterrupt
-    if stop.cause is Cause.EXCEPTION and stop.__cause__ is not None:
-        raise stop.__cause__
-    return 0 if stop.cause.is_planned else 1
+        return KeyboardInterrupt()
+    return stop.__cause__ if stop.cause is Cause.EXCEPTION else None

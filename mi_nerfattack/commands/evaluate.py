@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from mi_nerfattack.commands.shared.evaluate_options import (
     parse_scales,
 )
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -90,7 +90,7 @@ class Evaluate:
     json: bool = False
     """Print the card as JSON, and nothing else."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Drive, summarise, print and write."""
         from rich.console import Console
 
@@ -119,11 +119,7 @@ class Evaluate:
             files.write_json(self.output, found.card)
         if self.page is not None:
             self._write_page(self.page, work, record, found, time.monotonic() - start)
-        if self.json:
-            print(json.dumps(found.card, allow_nan=False))
-        else:
-            Console().print(card_table(found.card))
-        return 0
+        return Result(found.card, lambda: Console().print(card_table(found.card)))
 
     def _write_page(
         self,

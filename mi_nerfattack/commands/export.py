@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mi_nerfattack.commands.shared.box_options import BoxOptions
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.fields.grid import GridField
@@ -44,9 +45,11 @@ class Export:
     """Of --mesh: turn about the vertical."""
     pixels_per_m: float | None = None
     """Of the pictures; 256 pixels along the longest edge by default."""
+    json: bool = False
+    """End with one line of JSON in place of the sentences."""
     box: Annotated[BoxOptions, tyro.conf.arg(name="")] = BoxOptions()
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, sample the surface or look at the sides, and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
@@ -77,7 +80,7 @@ class Export:
             return self._write_field(grid, output)
         return self._write_mesh(grid, output)
 
-    def _write_box(self) -> int:
+    def _write_box(self) -> Result:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
@@ -93,22 +96,30 @@ class Export:
                 raise InputError(f"--{name}: is for -o, not for --print and --monitor")
         variant.ensure()
         with StageBars() as bars:
-            told = self.box.write(self.field, bars.counter("printing", "page "))
-        print("\n".join(told))
-        return 0
+            found = self.box.write(self.field, bars.counter("printing", "page "))
+        document = {kind: figures for kind, (figures, _) in found.items()}
+        told = [sentence for _, sentence in found.values()]
+        return Result(document, lambda: print(*told, sep="\n"))
 
-    def _write_field(self, grid: GridField, output: Path) -> int:
+    def _write_field(self, grid: GridField, output: Path) -> Result:
         from mi_nerfattack.fields.io import save_field
 
         before = self.field.stat().st_size
         save_field(output, grid)
-        print(
-            f"Wrote {output}: {grid.held_vertices().sum()} of {grid.n_vertices} "
-            f"vertices, {output.stat().st_size} bytes; {self.field} had {before}"
+        document = {
+            "output": str(output),
+            "held_vertices": int(grid.held_vertices().sum()),
+            "vertices": grid.n_vertices,
+            "bytes": output.stat().st_size,
+            "bytes_before": before,
+        }
+        told = (
+            f"Wrote {output}: {document['held_vertices']} of {grid.n_vertices} "
+            f"vertices, {document['bytes']} bytes; {self.field} had {before}"
         )
-        return 0
+        return Result(document, lambda: print(told))
 
-    def _write_mesh(self, grid: GridField, output: Path) -> int:
+    def _write_mesh(self, grid: GridField, output: Path) -> Result:
         from mi_nerfattack.capture.mesh.gltf_writer import write_glb
         from mi_nerfattack.capture.mesh.surface import field_surface, painted_mesh
         from mi_nerfattack.capture.object_views import Placement
@@ -119,13 +130,11 @@ class Export:
             placement = Placement(self.height_m, self.longest_m, self.up, self.turn_deg)
             mesh = painted_mesh(grid, placement.mesh(self.mesh))
         write_glb(output, mesh)
-        print(
-            f"Wrote {output}: {len(mesh.faces)} triangles, "
-            f"{len(mesh.vertices)} vertices"
-        )
-        return 0
+        counts = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
+        told = "Wrote {}: {} triangles, {} vertices".format(output, *counts.values())
+        return Result({"output": str(output), **counts}, lambda: print(told))
 
-    def _write_faces(self, grid: GridField, output: Path) -> int:
+    def _write_faces(self, grid: GridField, output: Path) -> Result:
         from mi_nerfattack.capture.mesh.cube_faces import render_faces, write_faces
         from mi_nerfattack.errors import InputError
 
@@ -133,12 +142,14 @@ class Export:
             raise InputError(f"{output}: is a file; give a folder's name")
         faces = render_faces(grid, self.pixels_per_m)
         write_faces(output, faces)
-        edges = " x ".join(f"{edge:.3f}" for edge in faces.upper - faces.lower)
-        print(
+        size_m = (faces.upper - faces.lower).tolist()
+        edges = " x ".join(f"{edge:.3f}" for edge in size_m)
+        told = (
             f"Wrote {output}: 6 pictures of a box of {edges} m, "
             f"{faces.pixels_per_m:.0f} pixels a metre"
         )
-        return 0
+        figures = {"size_m": size_m, "pixels_per_m": float(faces.pixels_per_m)}
+        return Result({"output": str(output), **figures}, lambda: print(told))
 
     def _refuse_unused(self, output: Path, is_mesh: bool) -> None:
         """Raise InputError for an option that the kind of output has no use for."""

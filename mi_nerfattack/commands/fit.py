@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mi_nerfattack.commands.shared.compare_report import CompareArguments
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.capture.posed_images import PosedImages
@@ -117,7 +118,7 @@ class Fit:
             **{name: str(getattr(self, name)) for name in (*names, "spread", "no_sky")},
         }
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.inputs import find_bounds, read_depth
@@ -141,8 +142,7 @@ class Fit:
                     f"--output: {self.output}; {self.folder} is a field already, which "
                     "is only compared (--compare), leave --output out"
                 )
-            compare_file(self.folder, self.against, self.json)
-            return 0
+            return compare_file(self.folder, self.against)
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
         check_output(self.output)
@@ -165,14 +165,12 @@ class Fit:
                 resume=self.resume,
             )
         provenance = self._provenance(images)
-        finish(
+        return finish(
             result,
             images,
             self.output,
             provenance,
-            self.json,
             checkpoint,
             depth,
             self.against,
         )
-        return 0

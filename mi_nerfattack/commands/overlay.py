@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mi_nerfattack.commands.shared.options import check_empty
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,8 +39,10 @@ class OverlayCommand:
     paste: bool = False
     """Show it by its pose alone, with no green target; what the recording's depth, if
     it has any, says is nearer stays before it."""
+    json: bool = False
+    """End with one line of JSON in place of the sentence."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, project and write."""
         from contextlib import closing
 
@@ -75,8 +78,9 @@ class OverlayCommand:
                 files.make_folder(self.output)
                 for index, frame in enumerate(frames):
                     files.write_image(self.output / f"{index:05d}.png", frame)
-        print(f"Wrote {self.output}: {len(times)} frames with {box.name}")
-        return 0
+        told = f"Wrote {self.output}: {len(times)} frames with {box.name}"
+        figures = {"frames": len(times), "object": box.name}
+        return Result({"output": str(self.output), **figures}, lambda: print(told))
 
     def _check_output(self) -> bool:
         """Refuse what would replace anything recorded; return whether it is a video."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,7 +55,7 @@ class Refine:
     json: bool = False
     """Print refine.json in place of the summary."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Check, search, drive, print and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
@@ -68,12 +69,8 @@ class Refine:
         workers = chosen_workers(self.workers, alone)
         with StageBars() as bars:
             document = refine(task, self.output, workers, bars.counter)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            print("\n".join(_summary(document)))
-            print(f"Written: {self.output.resolve()}")
-        return 0
+        told = [*_summary(document), f"Written: {self.output.resolve()}"]
+        return Result(document, lambda: print(*told, sep="\n"))
 
     def _task(self) -> Refinement:
         """Check everything that can be checked before the first drive."""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -55,8 +57,10 @@ class Render:
     """Frames per second of .mp4 and of --route."""
     skip_existing: bool = False
     """Continue: keep the frames that are there, after checking what they show."""
+    json: bool = False
+    """End with one line of JSON in place of the sentences."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Render and write."""
         from mi_nerfattack import variant
         from mi_nerfattack.render.pathtrace.frames import FrameRenderer
@@ -132,22 +136,34 @@ class Render:
         route = Route.from_file(resolve(self.routes, Path()), self.route)
         return route_path(route, CameraMount(*self.mount), self.fps)
 
-    def _run_frame(self, renderer: FrameRenderer) -> int:
+    def _run_frame(self, renderer: FrameRenderer) -> Result:
         from mi_nerfattack.render.pathtrace.frames import write_frame
 
         start = time.monotonic()
         frame = renderer.render(seed=self.seed)
         write_frame(self.output, frame, self.precision)
-        width, height = renderer.size_px
-        print(
-            f"Wrote {self.output}: {width} x {height} px, {frame.metadata['spp']} "
-            f"samples per pixel, {time.monotonic() - start:.1f} s"
-        )
-        if self.output.suffix.lower() == ".exr":
-            print(f"  channels {' '.join(frame.channels)}")
-        return 0
+        (width, height), spp = renderer.size_px, frame.metadata["spp"]
+        seconds = time.monotonic() - start
+        channels = frame.channels if self.output.suffix.lower() == ".exr" else ()
+        document = {
+            "output": str(self.output),
+            "size_px": [width, height],
+            "spp": int(spp),
+            "seconds": seconds,
+            "channels": [*channels],
+        }
 
-    def _run_path(self, shot: Shot) -> int:
+        def show() -> None:
+            print(
+                f"Wrote {self.output}: {width} x {height} px, {spp} samples per "
+                f"pixel, {seconds:.1f} s"
+            )
+            if channels:
+                print(f"  channels {' '.join(channels)}")
+
+        return Result(document, show)
+
+    def _run_path(self, shot: Shot) -> Result:
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.render.pathtrace.sequence import (
             render_folder,
@@ -178,11 +194,13 @@ class Render:
                         "command with --skip-existing continues"
                     )
                 raise
-        print(f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px")
-        if size != shot.renderer.size_px:
-            width, height = shot.renderer.size_px
-            print(
+        width, height = shot.renderer.size_px
+        told = [f"Wrote {self.output}: {count} frames, {size[0]} x {size[1]} px"]
+        if size != (width, height):
+            told.append(
                 f"  the frames have {width} x {height} px; the last column or row is "
                 "repeated, since H.264 (yuv420p) needs even sizes"
             )
-        return 0
+        figures = {"frames": count, "size_px": [*size]}
+        document = {"output": str(self.output), **figures}
+        return Result(document, lambda: print(*told, sep="\n"))

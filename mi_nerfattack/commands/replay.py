@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Replay:
     json: bool = False
     """Print JSON in place of sentences."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, repeat, compare and tell."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.cells import (
@@ -76,11 +77,8 @@ class Replay:
             sweep = do_cells(wanted.cells, output, self.cores, workers)
             errors = {wanted.cells[i].id: told for i, told in sweep.errors.items()}
             found = compare_rows(wanted, read_table(sweep.table), errors)
-        if self.json:
-            print(json.dumps(found, allow_nan=False))
-        else:
-            print(*sentences(found), sep="\n")
-        return int(bool(errors) or self._is_exceeded(found))
+        code = int(bool(errors) or self._is_exceeded(found))
+        return Result(found, lambda: print(*sentences(found), sep="\n"), code)
 
     def _place(self, wanted: Collection[str]) -> AbstractContextManager[str | Path]:
         """Return the folder of the repetition, which may be for a while."""

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 
 @dataclass(frozen=True)
 class Report:
@@ -28,8 +30,10 @@ class Report:
     """HTML file to write."""
     title: str | None = None
     """Of the page; made of names of what it shows by default."""
+    json: bool = False
+    """End with one line of JSON in place of the sentence."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Read, render the objects and write."""
         from tempfile import TemporaryDirectory
 
@@ -51,6 +55,6 @@ class Report:
 
             parts = read_folders(self.folders, Path(scratch), say)
             write_page(self.output, parts, Path(scratch), self.title)
-        size = self.output.stat().st_size / 1e6
-        print(f"Written: {self.output.resolve()} ({size:.1f} MB)")
-        return 0
+        path, size = self.output.resolve(), self.output.stat().st_size
+        told = f"Written: {path} ({size / 1e6:.1f} MB)"
+        return Result({"output": str(path), "bytes": size}, lambda: print(told))

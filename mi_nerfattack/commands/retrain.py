@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -78,8 +79,11 @@ class Retrain:
     """Processes that collect and drive; one a core by default, 1 works in this one."""
     seed: int = 0
     """Of all random numbers."""
+    json: bool = False
+    """End with one line of JSON in place of the tables: the content of
+    NAME-retrain.json, and the policy's card."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Check, collect, train, drive and write."""
         from rich.console import Console
 
@@ -134,9 +138,12 @@ class Retrain:
         document = _describe(policy, groups, anew, others)
         document["table"] = table_rows(before, after)
         files.write_json(about, document)
-        Console().print(card_table(result.card), retrain_table(document))
-        print(f"{self.output}: written; program, record and table are beside it")
-        return 0
+
+        def show() -> None:
+            Console().print(card_table(result.card), retrain_table(document))
+            print(f"{self.output}: written; program, record and table are beside it")
+
+        return Result({**document, "environments": result.card}, show)
 
     def _adapt(
         self,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.robot.remote.server import Control
@@ -33,14 +34,16 @@ class ServePolicy:
     size: tuple[int, int] | None = None
     """Width and height of the car's frames: tries the policy on a black one first, so
     that the first decision is as quick as the others."""
+    json: bool = False
+    """End with one line of JSON: decisions, and how old their frames were."""
     options: Annotated[
         PolicyOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="policy")
     ] = PolicyOptions()
     """How the policy is called."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Load, listen, and serve."""
-        from contextlib import closing
+        from contextlib import closing, suppress
 
         import numpy as np
 
@@ -70,8 +73,7 @@ class ServePolicy:
         with closing(PolicyServer(endpoint, key, make_control, say)) as server:
             sealed = "sealed by the key" if key else "on this computer alone"
             say(f"Serving at {endpoint}, {sealed}; Ctrl-C ends")
-            try:
+            with suppress(KeyboardInterrupt):
                 server.run()
-            except KeyboardInterrupt:
-                say(f"Ended: {server.summary()}")
-        return 0
+            told = f"Ended: {server.summary()}"
+        return Result(server.figures(), lambda: say(told))

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mi_nerfattack.commands.shared.result import Result
+
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
     from mi_nerfattack.system.workers import AbstractWorkers
@@ -53,7 +55,7 @@ class Sweep:
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Check the grid, or do its cells."""
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.options import check_positive
@@ -90,9 +92,7 @@ class Sweep:
         jobs = self.output.resolve() / "slurm", self.submitit, *each, self.minutes
         return SlurmJobs(*jobs, self._count())
 
-    def _check(self, cells: list[Cell]) -> int:
-        import json
-
+    def _check(self, cells: list[Cell]) -> Result:
         from mi_nerfattack.backend.threads import one_thread
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.sweep.forecast import Forecast, sentences
@@ -105,15 +105,11 @@ class Sweep:
             forecast = Forecast(cells, self.output.resolve(), show)
             forecast.run(self.drives)
         document = forecast.document()
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
-            print(*sentences(document, self._count()), sep="\n")
-        return int(any(document["refused"].values()))
+        told = sentences(document, self._count())
+        code = int(any(document["refused"].values()))
+        return Result(document, lambda: print(*told, sep="\n"), code)
 
-    def _run(self, cells: list[Cell], workers: AbstractWorkers) -> int:
-        import json
-
+    def _run(self, cells: list[Cell], workers: AbstractWorkers) -> Result:
         from rich.console import Console
 
         from mi_nerfattack.commands.shared.cells import do_cells
@@ -122,18 +118,23 @@ class Sweep:
 
         sweep = do_cells(cells, self.output, self.cores, workers)
         document = write_summary(sweep.work.folder)
-        if self.json:
-            failed = {cells[i].id: error for i, error in sweep.errors.items()}
-            found = {"cells": len(cells), "complete": len(sweep.complete)}
-            found |= {"failed": failed, "flags": document["flags"]}
-            print(json.dumps({**found, "table": str(sweep.table)}))
-        else:
+        failed = {cells[i].id: error for i, error in sorted(sweep.errors.items())}
+        found = {
+            "cells": len(cells),
+            "complete": len(sweep.complete),
+            "failed": failed,
+            "flags": document["flags"],
+            "table": str(sweep.table),
+        }
+
+        def show() -> None:
             console = Console()
             for flag in document["flags"]:
                 line = f"flag: {flag}"
                 console.print(line, style="bold", highlight=False, markup=False)
             console.print(sweep_table(document))
             print(f"{len(sweep.complete)} of {len(cells)} cells: {sweep.table}")
-            for index, error in sorted(sweep.errors.items()):
-                print(f"failed: {cells[index].id}: {error.splitlines()[-1]}")
-        return int(bool(sweep.errors))
+            for cell, error in failed.items():
+                print(f"failed: {cell}: {error.splitlines()[-1]}")
+
+        return Result(found, show, int(bool(failed)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import parse_scales
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -97,8 +98,11 @@ class Train:
     """Processes that collect; one a core by default."""
     seed: int = 0
     """Of all random numbers."""
+    json: bool = False
+    """End with one line of JSON, the record that lies beside the policy, in place of
+    the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Collect, train, validate and write."""
         from rich.console import Console
 
@@ -136,13 +140,16 @@ class Train:
             )
         command = command_line("train", self)
         record = training_record(settings, sites, self.data, result, command)
-        write_trained(self.output, result.module, record)
+        document = write_trained(self.output, result.module, record)
         picture = self.output.with_name(f"{self.output.stem}-place.png")
         self._draw(picture, place, routes)
-        Console().print(card_table(result.card))
-        print(f"{self.output}: written; program and validation are beside it")
-        print(f"{picture}: where it was trained, from above")
-        return 0
+
+        def show() -> None:
+            Console().print(card_table(result.card))
+            print(f"{self.output}: written; program and validation are beside it")
+            print(f"{picture}: where it was trained, from above")
+
+        return Result(document, show)
 
     def _draw(self, picture: Path, place: Place, routes: list[Route]) -> None:
         from mi_nerfattack.fields import load_field

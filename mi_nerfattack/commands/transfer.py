@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.transfer.work import TransferWork
@@ -74,7 +75,7 @@ class Transfer:
     json: bool = False
     """Print transfer.json in place of the table."""
 
-    def run(self) -> int:
+    def run(self) -> Result:
         """Drive, summarise, print and write."""
         from rich.console import Console
 
@@ -97,16 +98,16 @@ class Transfer:
             bars.say(f"{len(work.rows)} rows, {count} drives, kept in {work.folder}")
             progress = bars.counter("driving", "step ")
             document = run_transfer(work, self.output, workers, progress)
-        if self.json:
-            print(json.dumps(document, allow_nan=False))
-        else:
+
+        def show() -> None:
             console = Console()
             console.print(transfer_table(document))
             if document["surrogates"]:
                 condition = quality_condition(document)
                 console.print(quality_table(document, condition))
             console.print(f"Written: {self.output.resolve()}", soft_wrap=True)
-        return 0
+
+        return Result(document, show)
 
     def _work(self) -> TransferWork:
         """Check everything that can be checked before the first drive."""

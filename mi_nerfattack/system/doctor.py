@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import InvalidRequirement, Requirement
 
@@ -64,14 +65,13 @@ def can_run(findings: Sequence[Finding]) -> bool:
     return all(finding.state != "missing" for finding in findings)
 
 
-def to_json(findings: Sequence[Finding]) -> str:
-    """Format the findings as JSON."""
-    content = {
+def document(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return the findings as JSON holds them."""
+    return {
         "schema": 1,
         "can_run": can_run(findings),
         "findings": [asdict(finding) for finding in findings],
     }
-    return json.dumps(content, indent=2)
 
 
 def print_table(findings: Sequence[Finding]) -> None:

@@ -86,8 +86,10 @@ def training_record(
     )
 
 
-def write_trained(path: Path, module: PilotNet, record: TrainingRecord) -> None:
-    """Write a policy, and beside it its program and its record.
+def write_trained(
+    path: Path, module: PilotNet, record: TrainingRecord
+) -> dict[str, Any]:
+    """Write a policy, and beside it its program and its record; return the latter.
 
     Args:
         path: of the weights (.safetensors).
@@ -98,6 +100,7 @@ def write_trained(path: Path, module: PilotNet, record: TrainingRecord) -> None:
     export_program(module, path.with_suffix(SUFFIX))
     document = record.model_dump(mode="json", by_alias=True)
     files.write_json(path.with_suffix(".json"), document)
+    return document
 
 
 def read_record(path: Path) -> TrainingRecord | None:

@@ -48,7 +48,7 @@ def test_a_corner_is_placed_as_it_was(tmp_path, capsys):
     poses = corner_poses()
     images = np.stack([corner_photograph(pose) for pose in poses])
     write_transforms(tmp_path, images, CAMERA, poses)
-    bench.main(["poses", str(tmp_path)])
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    bench.main(["poses", str(tmp_path), "--json"])
+    found = json.loads(capsys.readouterr().out)
     assert found["photographs"] == found["placed"] == len(poses)
     assert found["rotation_deg"] < 1.5 and found["position_share"] < 0.03

@@ -205,7 +205,7 @@ class TestCommand:
         source = str(tmp_path / "box.obj")
         with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*\n  fit: "):
             Asset(source, out, resume=True, **settings | {"turn_deg": 1.0}).run()
-        assert Asset(source, out, resume=True, **settings).run() == 0
+        assert Asset(source, out, resume=True, **settings).run().tell(False) == 0
         assert out.is_file() and not kept.exists()
         assert "30 steps" in capsys.readouterr().out
 
@@ -219,7 +219,7 @@ class TestCommand:
         command = Asset(
             str(tmp_path / "views"), out, longest_m=1.0, steps=10, json=True
         )
-        assert command.run() == 0
+        assert command.run().tell(True) == 0
         scores = json.loads(capsys.readouterr().out.splitlines()[-1])
         assert scores["steps"] == 10 and len(scores["per_view"]) == 2
         field = load_grid(out)

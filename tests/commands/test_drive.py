@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -47,6 +48,18 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
     told = capsys.readouterr().out
     assert "camera     ready" in told and "Armed" not in told
     assert "enable     ready" in told
+
+
+def test_a_drive_as_json(tmp_path, variant, capsys):
+    log = str(tmp_path / "drive.mcap")
+    assert main([*SIMULATED, "--duration-s", "0.5", "--log", log, "--json"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert (told["end"], told["braked"], told["log"]) == ("time is up", True, log)
+    assert told["figures"]["commands"] == 5 and "Armed." in err
+    assert main([*SIMULATED, "--check", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["refused"]
+    assert told == dict.fromkeys(("camera", "tracker", "motor", "policy", "enable"))
 
 
 @pytest.mark.parametrize(

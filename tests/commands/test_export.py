@@ -237,10 +237,11 @@ class TestCommand:
         bounds = load_mesh(glb).bounds
         wanted = [[-0.5, -0.4, 0.2], [0.5, 0.4, 1.4]]
         np.testing.assert_allclose(bounds, wanted, atol=0.05)
-        code, out, _ = self.call(
-            capsys, tmp_path / "a.safetensors", "-o", tmp_path / "b"
-        )
+        words = tmp_path / "a.safetensors", "-o", tmp_path / "b"
+        code, out, _ = self.call(capsys, *words)
         assert code == 0 and "2.000 x 1.600 x 1.600 m" in out
+        code, out, _ = self.call(capsys, *words, "--json")
+        assert code == 0 and json.loads(out)["size_m"] == pytest.approx([2, 1.6, 1.6])
         names = {f"{name}.png" for name in meshes.CUBE_FACES} | {"faces.json"}
         assert {path.name for path in (tmp_path / "b").iterdir()} == names
 
@@ -249,6 +250,9 @@ class TestCommand:
         save_field(first, solid_field(block))
         code, out, _ = self.call(capsys, first, "-o", second)
         assert code == 0 and "64000 of 64000 vertices" in out
+        told = json.loads(self.call(capsys, first, "-o", second, "--json")[1])
+        assert told["held_vertices"] == told["vertices"] == 64000
+        assert told["bytes"] == told["bytes_before"] == first.stat().st_size
         assert second.read_bytes() == first.read_bytes()
 
     def test_refused(self, tmp_path, capsys):

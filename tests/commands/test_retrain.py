@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -87,7 +88,10 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     written = [path.stat().st_mtime_ns for path in shards]
     weights = (tmp_path / "new.safetensors").read_bytes()
     # the same command takes up what is there; other runs are other frames
-    assert retrain(tmp_path, run, blocked, *frames) == 0
+    capsys.readouterr()
+    assert retrain(tmp_path, run, blocked, *frames, "--json") == 0
+    told, err = capsys.readouterr()
+    assert json.loads(told).items() >= about.items() and "blocked: left out" in err
     assert [path.stat().st_mtime_ns for path in shards] == written
     assert (tmp_path / "new.safetensors").read_bytes() == weights
     near = changed(run, tmp_path / "near", ("-13.0, 3.4", "-12.0, 3.4"))
@@ -104,8 +108,11 @@ def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
     assert record["data"] == {"round_0/surrogate": 64, "earlier/surrogate": 64}
     check_adaptive(other, near, *frames, *more)
     page = other / "page.html"
-    words = ["report", str(other / "new-retrain.json"), "-o", str(page)]
+    words = ["report", str(other / "new-retrain.json"), "-o", str(page), "--json"]
+    capsys.readouterr()
     assert cli.main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"output": str(page), "bytes": page.stat().st_size}
     assert "Adaptive: the policy before past" in page.read_text()
 
 

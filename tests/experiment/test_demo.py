@@ -13,7 +13,15 @@ import pytest
 def test_the_demo_beats_random_textures_and_transfers(tmp_path):
     output = tmp_path / "run"
     done = subprocess.run(
-        [sys.executable, "-m", "mi_nerfattack.cli", "demo", "-o", str(output)],
+        [
+            sys.executable,
+            "-m",
+            "mi_nerfattack.cli",
+            "demo",
+            "-o",
+            str(output),
+            "--json",
+        ],
         capture_output=True,
         text=True,
         timeout=1800,
@@ -21,6 +29,7 @@ def test_the_demo_beats_random_textures_and_transfers(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     document = json.loads((output / "metrics.json").read_text())
+    assert json.loads(done.stdout) == document
     harmless = ("not converged", "texture at its bounds")  # it has few iterations
     assert [f for f in document["flags"] if not f.startswith(harmless)] == []
     means = {

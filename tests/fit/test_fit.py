@@ -188,7 +188,7 @@ def test_command_fits_a_folder(tmp_path, capsys):
         step_m=0.05,
         json=True,
     )
-    assert command.run() == 0
+    assert command.run().tell(True) == 0
     summary = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert summary["steps"] == 30
     assert [view["index"] for view in summary["per_view"]] == [0, 8]

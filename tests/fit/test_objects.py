@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.slow]
 def test_duck_is_upright_metric_and_yellow(data_folder, tmp_path):
     """Its bill points to +x; 0.3 m high, 0.322 m long, 0.224 m wide, as its file."""
     duck, out = data_folder / "assets" / "Duck.glb", tmp_path / "duck.safetensors"
-    Asset(str(duck), out, height_m=0.3, views=16, size=96, steps=100, json=True).run()
+    Asset(str(duck), out, height_m=0.3, views=16, size=96, steps=100).run()
     field = load_grid(out)
     renderer, camera = FieldRenderer(field, over_white=True), from_fov(96, 96, 40.0)
     middle = np.array([0, 0, 0.15])
@@ -67,7 +67,6 @@ def test_pictures_of_a_cube_come_out_again(tmp_path):
         views=32,
         size=96,
         steps=120,
-        json=True,
     ).run()
     faces = render_faces(load_grid(out), 128.0)
     np.testing.assert_allclose(faces.upper - faces.lower, 0.5)

@@ -160,6 +160,10 @@ def test_overlay_of_recordings(run, tmp_path, capsys):
         words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
         assert cli.main([str(word) for word in words]) == 0, capsys.readouterr().err
         assert "3 frames with ball" in capsys.readouterr().out
+    words = ["overlay", tmp_path / "drive", run, "-o", tmp_path / "as", "--json"]
+    assert cli.main([str(word) for word in words]) == 0
+    told = {"output": str(tmp_path / "as"), "frames": 3, "object": "ball"}
+    assert json.loads(capsys.readouterr().out) == told
     for path in sorted((tmp_path / "out").iterdir()):
         frame = files.read_image(path)
         assert (frame[:4] == 0).all()  # above the target

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from mi_nerfattack.commands.shared.options import given
 from mi_nerfattack.errors import InputError
@@ -13,6 +13,9 @@ from mi_nerfattack.errors import InputError
 if TYPE_CHECKING:
     from mi_nerfattack.robot.attacked import AttackedBox
     from mi_nerfattack.robot.monitor import Screen
+
+Told = tuple[dict[str, Any], str]
+"""What was written, for programs and as a sentence."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,8 @@ class BoxOptions:
         """Whether there is anything to write."""
         return self.print is not None or self.monitor is not None
 
-    def write(self, run: Path, on_page: Callable[[int, int], None]) -> list[str]:
-        """Check, read the box and write what is asked for; return what to tell.
+    def write(self, run: Path, on_page: Callable[[int, int], None]) -> dict[str, Told]:
+        """Check, read the box and write what is asked for; return what to tell of each.
 
         Raises:
             InputError: an option or file that cannot be used.
@@ -68,11 +71,11 @@ class BoxOptions:
         if self.monitor is not None:
             face = self.face or seen_most(box, views)
             show = self._shown(self.monitor, box, face, screen)
-        told = []
+        told = {}
         if self.print is not None:  # checks by itself before it writes
-            told.append(self._print(self.print, box, on_page))
+            told["print"] = self._print(self.print, box, on_page)
         if show is not None:
-            told.append(show())
+            told["monitor"] = show()
         return told
 
     def _checked(self) -> Screen:
@@ -88,18 +91,20 @@ class BoxOptions:
 
     def _print(
         self, path: Path, box: AttackedBox, on_page: Callable[[int, int], None]
-    ) -> str:
+    ) -> Told:
         from mi_nerfattack.robot.paper import write_net
 
         edges = box.edges_mm(self.size_mm)
         count = write_net(path, box, edges, self.paper, self.dpi, on_page)
         size = " x ".join(f"{edge:.1f}" for edge in edges)
         pages = "page" if count == 1 else "pages"
-        return f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
+        told = f"Wrote {path}: net of {box.name}, {size} mm, {count} {pages}"
+        figures = {"edges_mm": edges.tolist(), "pages": count}
+        return {"output": str(path), "box": box.name, **figures}, told
 
     def _shown(
         self, path: Path, box: AttackedBox, face: str, screen: Screen
-    ) -> Callable[[], str]:
+    ) -> Callable[[], Told]:
         """Make the picture; return what writes it and says so."""
         from mi_nerfattack.io import files
         from mi_nerfattack.robot.monitor import screen_image, screen_page
@@ -111,15 +116,22 @@ class BoxOptions:
         longest = float(edges.max())
         image = screen_image(screen, box.images[face], size, self.background, longest)
 
-        def write() -> str:
+        def write() -> Told:
             if path.suffix.lower() == ".png":
                 files.write_image(path, image)
             else:
                 about = f"{box.name}, {face}, run {box.run}, digest {box.digest[:16]}"
                 files.write_text(path, screen_page(image, about))
-            return (
+            dpi = float(MM * screen.px_per_mm[0])
+            figures = {"size_mm": [*map(float, size)], "pixels_per_inch": dpi}
+            return {
+                "output": str(path),
+                "box": box.name,
+                "face": face,
+                **figures,
+            }, (
                 f"Wrote {path}: {face} of {box.name}, {size[0]:.1f} x {size[1]:.1f} mm "
-                f"on {self.pixels} pixels, {MM * screen.px_per_mm[0]:.1f} an inch"
+                f"on {self.pixels} pixels, {dpi:.1f} an inch"
             )
 
         return write

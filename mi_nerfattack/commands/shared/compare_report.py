@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,13 +91,12 @@ class CompareArguments:
         return comparison
 
 
-def compare_file(path: Path, arguments: CompareArguments, as_json: bool) -> None:
-    """Compare a field file, and print the figures.
+def compare_file(path: Path, arguments: CompareArguments) -> Result:
+    """Compare a field file, and return the figures.
 
     Args:
         path: the field file.
         arguments: with a scene and routes.
-        as_json: print one line of JSON in place of the table.
 
     Raises:
         InputError: no scene is given, or a file is wrong.
@@ -112,10 +111,9 @@ def compare_file(path: Path, arguments: CompareArguments, as_json: bool) -> None
         )
     comparison = arguments.run(load_field(path), path)
     assert comparison is not None
-    if as_json:
-        print(json.dumps({"compare": document(comparison)}))
-    else:
-        print_comparison(comparison, path)
+    return Result(
+        {"compare": document(comparison)}, lambda: print_comparison(comparison, path)
+    )
 
 
 def compare_folder(output: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from mi_nerfattack.commands.shared.progress import StageBars
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,19 +50,17 @@ def finish(
     images: PosedImages,
     output: Path,
     provenance: Mapping[str, str],
-    as_json: bool,
     checkpoint: Path,
     depth: np.ndarray | None = None,
     against: CompareArguments | None = None,
-) -> None:
-    """Write the field and the report of its fit, compare it, and print the scores.
+) -> Result:
+    """Write the field and the report of its fit, compare it, and return the scores.
 
     Args:
         result: of the fit.
         images: that were fitted to.
         output: field file; the report lies beside it, see `report_folder`.
         provenance: source and settings, for the file's header.
-        as_json: print one line of JSON in place of the table.
         checkpoint: of the fit; removed when all is written.
         depth: (n, height, width), metres along the ray, or None.
         against: the scene to compare with; None, or one without a scene, compares
@@ -83,17 +81,18 @@ def finish(
     page = write_fit_report(report_folder(output), result, images, depth, title)
     comparison = None if against is None else against.run(result.field, output)
     checkpoint.unlink(missing_ok=True)  # before a closed pipe can end this
-    if as_json:
-        more = {} if comparison is None else {"compare": document(comparison)}
-        print(json.dumps(summary(result) | more))
-        return
-    console = Console()
-    console.print(scores_table(result))
-    console.print(
-        f"{verdict(judge_fit(result))}\n"
-        f"{result.steps} steps in {result.wall_s:.0f} s. Wrote {output} and {page}.",
-        soft_wrap=True,
-        highlight=False,
-    )
-    if comparison is not None:
-        print_comparison(comparison, output)
+    more = {} if comparison is None else {"compare": document(comparison)}
+
+    def show() -> None:
+        console = Console()
+        console.print(scores_table(result))
+        console.print(
+            f"{verdict(judge_fit(result))}\n{result.steps} steps in "
+            f"{result.wall_s:.0f} s. Wrote {output} and {page}.",
+            soft_wrap=True,
+            highlight=False,
+        )
+        if comparison is not None:
+            print_comparison(comparison, output)
+
+    return Result(summary(result) | more, show)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.finished import Frames
@@ -16,19 +17,17 @@ def run_scenario(
     path: Path,
     output: Path,
     resume: bool,
-    as_json: bool,
     object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
     anyway: bool = False,
     frames: Frames | None = 3,
-) -> int:
-    """Run a scenario with a progress bar on stderr, and print its table.
+) -> Result:
+    """Run a scenario with a progress bar on stderr; return its metrics and table.
 
     Args:
         path: the scenario file.
         output: the run folder.
         resume: continue from what an interrupted run left in it.
-        as_json: print the metrics as JSON in place of the table.
         object_field: makes, or names, the grid field that replaces the one of every
             object; None leaves them.
         force: resume although something has changed.
@@ -41,9 +40,10 @@ def run_scenario(
     with claimed(output, resume):
         how = {"resume": resume, "force": force, "anyway": anyway}
         document = _run(path, output, object_field(), started, frames, **how)
-    if as_json:
-        print(json.dumps(document, allow_nan=False))
-        return 0
+    return Result(document, lambda: _show(document, output, frames))
+
+
+def _show(document: dict[str, Any], output: Path, frames: Frames | None) -> None:
     from rich.console import Console
 
     from mi_nerfattack.report.table import metrics_table
@@ -55,7 +55,6 @@ def run_scenario(
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
     _print_files(console, output, document, frames)
-    return 0
 
 
 def _run(

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -111,13 +112,22 @@ class PolicyServer:
 
     def summary(self) -> str:
         """Return how many decisions were made, and of how old frames."""
-        if not self.ages_s:
+        found = self.figures()
+        if not found["decisions"]:
             return "no decisions"
-        middle, late = 1e3 * np.quantile(self.ages_s, [0.5, 0.99])
         return (
-            f"{len(self.ages_s)} decisions, on frames {middle:.0f} ms old in the "
-            f"median, {late:.0f} ms at the 99th percentile"
+            f"{found['decisions']} decisions, on frames "
+            f"{1e3 * found['age_median_s']:.0f} ms old in the median, "
+            f"{1e3 * found['age_99_s']:.0f} ms at the 99th percentile"
         )
+
+    def figures(self) -> dict[str, Any]:
+        """Return the same as numbers; ages are None of no decisions."""
+        ages: list[Any] = [None, None]
+        if self.ages_s:
+            ages = np.quantile(self.ages_s, [0.5, 0.99]).tolist()
+        names = "decisions", "age_median_s", "age_99_s", "refused"
+        return dict(zip(names, (len(self.ages_s), *ages, self.refused), strict=True))
 
     def _has_news(self) -> bool:
         car = self._car

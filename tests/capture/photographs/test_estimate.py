@@ -194,6 +194,14 @@ class TestCorner:
         assert files.read_image(tmp_path / "cameras.png").shape[2] >= 3
         table = json.loads((tmp_path / "transforms.json").read_text())
         assert table["units"] == "arbitrary"
+        output = str(tmp_path / "again")
+        arguments += ["-o", output, "--json"]
+        assert cli.main(["capture", str(corner[0] / "photographs"), *arguments]) == 0
+        told = json.loads(capsys.readouterr().out)
+        written = json.loads((tmp_path / "again" / "capture.json").read_text())
+        assert written.items() <= told.items() and told["placed"] == COUNT
+        assert told["transforms"] == f"{output}/transforms.json"
+        assert len(told["farthest"]) == 2 and told["distance"] > 0
 
 
 class TestUnusable:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
 import subprocess
@@ -189,18 +190,20 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(enable, "JoystickEnable", lambda *_: person)
         arguments = ["calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
         arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
-        assert cli.main(arguments) == 0
+        assert cli.main([*arguments, "--json"]) == 0
     found = read_calibration(output)
     assert found.erpm_per_ms == pytest.approx(ERPM_PER_MS, rel=0.003)
     assert found.servo_per_rad == pytest.approx(PER_RAD, rel=0.005)
     assert found.servo_centre == pytest.approx(CENTRE, abs=0.002)
     assert found.wheelbase_m == WHEELBASE_M
     assert len(person.asked) == 1 + 1 + 3 * 4
-    shown = capsys.readouterr().out
+    told, shown = capsys.readouterr()
     assert "Armed: without commands it brakes after 250 ms with 20 A." in shown
     assert "Braked: the enable button was let go" in shown
     assert not (tmp_path / "car.toml.arcs.json").exists()
-    assert f"Written to {output}." in shown and "(was 4000.0)" in shown
+    told = json.loads(told)
+    assert told["calibration"] == found.model_dump(mode="json")
+    assert told["before"]["erpm_per_ms"] == 4000 and 0 <= told["length_spread"] < 0.01
 
 
 @pytest.mark.slow
