@@ -12,16 +12,9 @@ import pytest
 @pytest.mark.slow
 def test_the_demo_beats_random_textures_and_transfers(tmp_path):
     output = tmp_path / "run"
+    command = [sys.executable, "-m", "mi_nerfattack.cli", "demo", "-o", str(output)]
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "mi_nerfattack.cli",
-            "demo",
-            "-o",
-            str(output),
-            "--json",
-        ],
+        [*command, "--json"],
         capture_output=True,
         text=True,
         timeout=1800,
