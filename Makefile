@@ -10,7 +10,7 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs check-python clean
+.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs dist check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
@@ -20,6 +20,7 @@ help:
 	@echo "make test-random  formats and geometry on other examples each time"
 	@echo "make lint         check format, lint and types"
 	@echo "make docs         build the documentation's site in build/docs"
+	@echo "make dist         build wheel and sdist, and run the wheel in an empty environment"
 	@echo "make clean        remove the virtual environment and what was built"
 
 demo: $(VENV)/.installed
@@ -51,6 +52,10 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	$(VENV)/bin/python docs/pictures.py
 	$(VENV)/bin/sphinx-build -W -n --keep-going -q -E -a docs build/docs
+
+# The wheel comes of the sdist, holds what one of the tree holds, and works by itself.
+dist: $(VENV)/.installed-dev
+	$(VENV)/bin/python .ci/dist.py "$(TORCH)"
 
 # A stamp says that the step is done, and is younger than what it was done from.
 $(VENV)/.installed: pyproject.toml | check-python

@@ -1,0 +1,92 @@
+"""Build wheel and sdist, and use the wheel in an environment that has nothing else.
+
+Run by `make dist`, in minutes: most of them install PyTorch, which comes from pip's
+cache once `make test` has fetched it. The arguments are further requirements.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DIST, TREE, EMPTY = ROOT / "dist", ROOT / "build" / "tree", ROOT / "build" / "empty"
+MOST_MB = 45
+RENDER = "render bundled:intersection/field.xml -o frame.png --size 48 16 --spp 1"
+
+
+def call(*command: str | Path, where: Path = ROOT) -> str:
+    """Run a command without what Python is told by variables; returns its output."""
+    known = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    words = [str(word) for word in command]
+    done = subprocess.run(words, cwd=where, env=known, stdout=subprocess.PIPE)
+    if done.returncode:
+        sys.stderr.buffer.write(done.stdout)
+        raise SystemExit(f"{' '.join(words)}: ended with {done.returncode}")
+    return done.stdout.decode()
+
+
+def build() -> Path:
+    """Build the sdist, a wheel of it and one of the tree; return the first wheel."""
+    for folder in (DIST, TREE):
+        shutil.rmtree(folder, ignore_errors=True)
+    module = (sys.executable, "-m", "build", "--outdir")
+    call(*module, DIST)
+    call(*module, TREE, "--wheel")
+    (wheel,), (other,) = DIST.glob("*.whl"), TREE.glob("*.whl")
+    found, wanted = contents(wheel), contents(other)
+    if wrong := [name for name, _ in sorted(found.items() ^ wanted.items())]:
+        raise SystemExit(f"{DIST}: the sdist builds other files: {', '.join(wrong)}")
+    for path in DIST.iterdir():
+        size = path.stat().st_size / 1e6
+        print(f"{path.name}: {size:.1f} MB", flush=True)
+        if size > MOST_MB:
+            raise SystemExit(f"{path.name}: {size:.1f} MB; at most {MOST_MB} MB")
+    return wheel
+
+
+def contents(wheel: Path) -> dict[str, int]:
+    """Return the checksum of each file in a wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        return {item.filename: item.CRC for item in archive.infolist()}
+
+
+def install(wheel: Path, *more: str) -> Path:
+    """Make an environment of the wheel and what it needs; return its programs."""
+    shutil.rmtree(EMPTY, ignore_errors=True)
+    call(sys.executable, "-m", "venv", EMPTY)
+    programs = EMPTY / ("Scripts" if os.name == "nt" else "bin")
+    pip = programs / "python", "-m", "pip", "--disable-pip-version-check", "-q"
+    call(*pip, "install", "--no-compile", *more, wheel)
+    return programs
+
+
+def use(programs: Path, version: str) -> None:
+    """Run the command line in an empty folder."""
+    ours = programs / "mi-nerfattack"
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder)
+        told = call(ours, "--version", where=where).split()
+        if told != ["mi-nerfattack", version]:
+            raise SystemExit(f"--version: {' '.join(told)}; the wheel is of {version}")
+        call(ours, "doctor", where=where)  # ends with 0 where the main job can run
+        frame = json.loads(call(ours, *RENDER.split(), "--json", where=where))
+        look = "from PIL import Image; print(*Image.open('frame.png').size, "
+        look += "*Image.open('frame.png').convert('L').getextrema())"
+        *size, least, most = map(
+            int, call(programs / "python", "-c", look, where=where).split()
+        )
+    if size != frame["size_px"] or least == most:
+        raise SystemExit(f"frame.png: {size}, {least} to {most}; not what was asked")
+    print(f"installed and run: {frame['seconds']:.1f} s for a frame")
+
+
+if __name__ == "__main__":
+    built = build()
+    use(install(built, *sys.argv[1:]), built.name.split("-")[1])
