@@ -10,7 +10,7 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs dist check-python clean
+.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs dist bench-gpu check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
@@ -20,6 +20,7 @@ help:
 	@echo "make test-random  formats and geometry on other examples each time"
 	@echo "make lint         check format, lint and types"
 	@echo "make docs         build the documentation's site in build/docs"
+	@echo "make bench-gpu    measure on an NVIDIA GPU, within 10 minutes, into bench/results"
 	@echo "make dist         build wheel and sdist, and run the wheel in an empty environment"
 	@echo "make clean        remove the virtual environment and what was built"
 
@@ -56,6 +57,10 @@ docs: $(VENV)/.installed-dev
 # The wheel comes of the sdist, holds what one of the tree holds, and works by itself.
 dist: $(VENV)/.installed-dev
 	$(VENV)/bin/python .ci/dist.py "$(TORCH)"
+
+# Refused without a GPU. PyTorch must be a build for CUDA; ours above may not be one.
+bench-gpu: $(VENV)/.installed-test
+	$(VENV)/bin/python -m bench gpu
 
 # A stamp says that the step is done, and is younger than what it was done from.
 $(VENV)/.installed: pyproject.toml | check-python

@@ -6,6 +6,8 @@ import sys
 
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
+from bench.commands.gpu import BenchFrames, BenchGpu
+from bench.commands.imports import BenchImports
 from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
@@ -42,6 +44,9 @@ COMMANDS = {
     "methods": BenchMethods,
     "overlay": BenchOverlay,
     "poses": BenchPoses,
+    "imports": BenchImports,
+    "frames": BenchFrames,
+    "gpu": BenchGpu,
 }
 
 

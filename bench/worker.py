@@ -49,7 +49,9 @@ def make_side(role: str, width: int, height: int, rest: list[str]) -> AbstractSi
     """Make a side; imports only what it needs."""
     if role in ("plain", "tuned"):
         from bench.render.peer import CHUNKS, TorchSide
+        from bench.torch import device
 
+        device.choose()
         chunks = tuple(int(size) for size in rest[1:]) or CHUNKS
         data = NGPData.read(Path(rest[0]))
         return TorchSide(role, data, width, height, chunks)
@@ -74,7 +76,9 @@ def make_trainer(role: str, start: str, *rest: str) -> AbstractTrainer:
     """
     if role in ("plain", "tuned"):
         from bench.fit.peer import TorchTrainer
+        from bench.torch import device
 
+        device.choose()
         pictures, rays, *chunk = rest
         return TorchTrainer(
             role, Path(start), Path(pictures), int(rays), *map(int, chunk)
@@ -101,7 +105,9 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
     if role != "ours":
         from bench.attack.peer import LOOKUPS, TorchAttack
         from bench.render.peer import CHUNKS
+        from bench.torch import device
 
+        device.choose()
         scene, item, *choices = others
         chunks = (int(choices[0]),) if choices else CHUNKS
         lookups = (choices[1],) if choices else tuple(LOOKUPS)

@@ -16,6 +16,19 @@ PARTS = sorted(
     for path in (ROOT / "mi_nerfattack").glob("*/__init__.py")
     if path.parent.name != "commands"
 )
+IMPORTING = """
+import sys, mitsuba
+known = {*sys.modules, *sys.stdlib_module_names}
+
+def roots():
+    found = {name.split(".")[0] for name in set(sys.modules) - known}
+    return sorted(found - {"mitsuba", "drjit"} - sys.stdlib_module_names)
+
+import mi_nerfattack
+print(*roots())
+mitsuba.set_variant("llvm_ad_rgb")
+print(*roots())
+"""
 RENDERING = """
 import sys
 import mi_nerfattack.deploy
@@ -66,6 +79,16 @@ def test_rendering_loads_neither_policies_nor_other_worlds(tmp_path):
     loaded = set(done.stdout.split())
     assert "mi_nerfattack.render.camera.intrinsics" in loaded
     assert not loaded & {"torch", "mujoco", "gymnasium", "pydantic", "matplotlib"}
+
+
+def test_an_import_adds_little_to_that_of_mitsuba():
+    """Installed are packages that Mitsuba brings, and three small ones."""
+    command = [sys.executable, "-c", IMPORTING]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    alone, with_variant = (set(line.split()) for line in done.stdout.splitlines())
+    assert alone == {"lazy_loader", "mi_nerfattack"}
+    small = {"PIL", "threadpoolctl", "tomli"}  # the last before Python 3.11
+    assert {"mi_nerfattack", "numpy"} <= with_variant <= alone | small | {"numpy"}
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from bench.attack.sides import AbstractAttack
 from bench.full_ngp import NGPData
 from bench.render.peer import CHUNKS, GRIDS
 from bench.render.sides import STOP, Clock
+from bench.torch import device
 from bench.torch.bricks import TorchBricks
 from bench.torch.loop import (
     Resized,
@@ -103,6 +104,7 @@ class TorchAttack(AbstractAttack):
         self.loop.objective(states).backward()
         self.optimiser.step()
         self.optimiser.zero_grad()
+        device.wait()
         return {**clock.per_step(1), "tape_mb": tape.size / 1e6 / self.job.horizon}
 
     def facts(self) -> dict[str, Any]:
@@ -112,6 +114,10 @@ class TorchAttack(AbstractAttack):
             "chunk_rays": self.view.chunk,
             "lookup": self.lookup,
         }
+
+    def memory(self) -> dict[str, float]:
+        """Add what tensors took of a GPU, in MB."""
+        return super().memory() | device.memory()
 
     def _choose(self, chunks: tuple[int, ...], lookups: tuple[str, ...]) -> None:
         """Try out what there is to choose from."""
@@ -178,6 +184,7 @@ def _same(value: torch.Tensor) -> torch.Tensor:
 def _seconds(action: Callable[[], Any]) -> float:
     start = time.perf_counter()
     action()
+    device.wait()
     return time.perf_counter() - start
 
 

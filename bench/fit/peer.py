@@ -10,6 +10,7 @@ import torch
 
 from bench.full_ngp import NGPData
 from bench.render.sides import COUNTED_RAYS, AbstractTrainer, Clock
+from bench.torch import device
 from bench.torch.encoding import PlainHashGrid, TunedHashGrid
 from bench.torch.fit import Pictures, Plan, TorchFit
 from mi_nerfattack.system.cores import cores
@@ -54,6 +55,7 @@ class TorchTrainer(AbstractTrainer):
         """See :meth:`AbstractTrainer.steps`."""
         clock = Clock()
         loss = sum(self.fit.step() for _ in range(count))
+        device.wait()
         return {**clock.per_step(count), "loss": loss / count}
 
     def facts(self) -> dict[str, Any]:
@@ -66,10 +68,15 @@ class TorchTrainer(AbstractTrainer):
             "batches_by_rank": len(self.fit.plan.batches),
         }
 
+    def memory(self) -> dict[str, float]:
+        """Add what tensors took of a GPU, in MB."""
+        return super().memory() | device.memory()
+
     def _seconds(self, plan: Plan) -> float:
         """Time the gradients of a batch; the field does not change."""
         self.fit.plan = plan
         drawn = self.fit.draw()
         start = time.perf_counter()
         self.fit.gradients(*drawn)
+        device.wait()
         return time.perf_counter() - start

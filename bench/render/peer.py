@@ -11,6 +11,7 @@ import torch
 
 from bench.full_ngp import NGPData
 from bench.render.sides import STOP, AbstractSide, route_rays
+from bench.torch import device
 from bench.torch.encoding import PlainHashGrid, TunedHashGrid
 from bench.torch.ngp import TorchNGP
 from mi_nerfattack.system.cores import cores
@@ -70,6 +71,10 @@ class TorchSide(AbstractSide):
             "backward_chunk_rays": self.backward_chunk,
         }
 
+    def memory(self) -> dict[str, float]:
+        """Add what tensors took of a GPU, in MB."""
+        return super().memory() | device.memory()
+
     def _forward(self, chunk: int, part: slice) -> float:
         start = time.perf_counter()
         with torch.no_grad():
@@ -79,6 +84,7 @@ class TorchSide(AbstractSide):
                 strict=True,
             )
             torch.cat([self.model.render(*some) for some in rays])
+        device.wait()
         return time.perf_counter() - start
 
     def _backward(self, chunk: int, part: slice) -> tuple[float, float]:
@@ -91,8 +97,10 @@ class TorchSide(AbstractSide):
             *(piece[part].split(chunk) for piece in pieces), strict=True
         ):
             objective = (self.model.render(origin, direction) * cotangent).sum()
+            device.wait()
             before = time.perf_counter()
             objective.backward()
+            device.wait()
             alone += time.perf_counter() - before
         total = time.perf_counter() - start
         for value in self.model.parameters.values():

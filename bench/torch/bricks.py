@@ -37,19 +37,19 @@ class TorchBricks(TorchNGP):
         self.parameters, self.density_scale = {}, 1.0
         self.lower = torch.tensor(numbers["lower"])
         self.extent = torch.tensor(numbers["upper"]) - self.lower
-        self.occupied = torch.from_numpy(halves(octants))
+        self.occupied = torch.as_tensor(halves(octants))
         self.window = TorchWindow(cells)
         self.step, self.cone = float(header["step_m"]), float(header["cone"])
         self.cone = max(self.cone, 1e-12)
-        self.sky = torch.from_numpy(tensors["sky"])
+        self.sky = torch.as_tensor(tensors["sky"])
         divided = tensors["subdivisions"].astype(np.int64)
         ends = np.cumsum((divided + 1) ** 3)
         first, parts = np.zeros(shape, np.int32), np.ones(shape, np.int32)
         first[cells], parts[cells] = np.append(0, ends[:-1]), divided
-        self.first = torch.from_numpy(first.ravel())
-        self.parts = torch.from_numpy(parts.ravel())
+        self.first = torch.as_tensor(first.ravel())
+        self.parts = torch.as_tensor(parts.ravel())
         vertices = tensors["vertices"].view(np.uint8).reshape(-1, 4)
-        self.vertices = torch.from_numpy(vertices.copy())
+        self.vertices = torch.as_tensor(vertices.copy())
         self.low, high = numbers["log_density"]
         self.scale = (high - self.low) / 255
 

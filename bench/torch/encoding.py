@@ -37,7 +37,7 @@ class AbstractHashGrid(ABC):
             for level, (_, edge, _) in enumerate(sizes)
         ]
         wrapped = np.array(factors, np.uint32).view(np.int32)  # of equal low bits
-        self.factors = torch.from_numpy(wrapped)
+        self.factors = torch.as_tensor(wrapped)
         self.scale = torch.tensor([scale for scale, _, _ in sizes])
         self.first = torch.tensor(np.cumsum(slots) - slots, dtype=torch.int32)
         self.mask = torch.tensor(slots - 1, dtype=torch.int32)

@@ -100,12 +100,12 @@ class TorchFit:
         self.optimiser = torch.optim.Adam(
             self.leaves, lr=learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
         )
-        self.colour = torch.from_numpy(pictures.colour).reshape(-1, 3)
-        self.direction = torch.from_numpy(pictures.direction).reshape(-1, 3)
-        self.origin = torch.from_numpy(pictures.origin)
+        self.colour = torch.as_tensor(pictures.colour).reshape(-1, 3)
+        self.direction = torch.as_tensor(pictures.direction).reshape(-1, 3)
+        self.origin = torch.as_tensor(pictures.origin)
         self.pixels = pictures.colour.shape[1]
         self.rays, self.huber = rays, huber
-        self.random = torch.Generator().manual_seed(seed)
+        self.random = torch.Generator(torch.get_default_device()).manual_seed(seed)
         self.plan = Plan(rays)
 
     def step(self) -> float:

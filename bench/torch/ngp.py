@@ -91,7 +91,7 @@ class TorchNGP:
         self.lower = _single(data.lower)
         self.extent = _single(data.upper) - self.lower
         self.density_scale = 1 / float(np.max(data.upper - data.lower))
-        self.occupied = torch.from_numpy(halves(data.octants))
+        self.occupied = torch.as_tensor(halves(data.octants))
         self.window = TorchWindow(data.cells)
         self.step, self.cone = data.step_m, max(data.cone, 1e-12)
         self.evaluated = 0
@@ -300,7 +300,7 @@ def spherical_harmonics(direction: torch.Tensor) -> torch.Tensor:
 
 
 def _single(value: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.array(value, np.float32))
+    return torch.as_tensor(np.array(value, np.float32))
 
 
 def halves(octants: np.ndarray) -> np.ndarray:

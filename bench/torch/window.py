@@ -25,7 +25,7 @@ class TorchWindow:
         for axis in range(3):
             halves = np.repeat(halves, 2, axis)
         least = ndimage.minimum_filter(halves, 2)[2:-1, 2:-1, 2:-1]
-        self._vertices = torch.from_numpy(least.astype(np.uint8).ravel())
+        self._vertices = torch.as_tensor(least.astype(np.uint8).ravel())
         self._shape = least.shape
 
     def __call__(self, unit: torch.Tensor) -> torch.Tensor:

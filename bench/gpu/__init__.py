@@ -1,0 +1,1 @@
+"""`bench gpu`: everything that is measured, on an NVIDIA GPU beside PyTorch there."""
