@@ -62,6 +62,7 @@ class CompareDrives:
         )
         from mi_nerfattack.robot.compare.summary import sentences
 
+        files.check_folder(self.output)
         variant.ensure()
         written = read_criteria(self.criteria)
         read_register(self.output)

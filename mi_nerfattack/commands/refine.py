@@ -60,9 +60,11 @@ class Refine:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.refine.refine import refine
+        from mi_nerfattack.io import files
         from mi_nerfattack.scenario.policy import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
+        files.check_folder(self.output)
         variant.ensure()
         task = self._task()
         alone = isinstance(task.found.scenario.policy, HttpSection)

@@ -62,11 +62,14 @@ class Replay:
             take_checkpoints,
         )
         from mi_nerfattack.experiment.sweep.table import read_table
+        from mi_nerfattack.io import files
         from mi_nerfattack.system.workers import Processes
 
         if self.rows < 0 or not (self.row or self.rows):
             raise InputError("replay: no row; give ROW, or --rows 1 or more")
         check_positive(self, "cores")
+        if self.output is not None:
+            files.check_folder(self.output)
         workers = Processes(cells_at_a_time(self.workers, self.cores), pieces_each=1)
         variant.ensure()
         wanted = read_replay(self.folder, self.row, self.rows, self.seed)

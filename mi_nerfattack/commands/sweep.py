@@ -60,9 +60,12 @@ class Sweep:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.experiment.sweep.grid import load_cells
+        from mi_nerfattack.io import files
 
         check_positive(self, "cores", "memory_gb", "minutes")
         workers = self._workers()
+        if not self.check:
+            files.check_folder(self.output)
         variant.ensure()
         cells = load_cells(self.grid)
         return self._check(cells) if self.check else self._run(cells, workers)

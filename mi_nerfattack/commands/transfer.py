@@ -82,11 +82,13 @@ class Transfer:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.transfer.run import check_output, run_transfer
+        from mi_nerfattack.io import files
         from mi_nerfattack.report.plots.transfer import quality_condition
         from mi_nerfattack.report.table import quality_table, transfer_table
         from mi_nerfattack.scenario.policy import HttpSection
         from mi_nerfattack.system.workers import chosen_workers
 
+        files.check_folder(self.output)
         variant.ensure()
         work = self._work()
         policies = [found.scenario.policy for found in work.attacks]

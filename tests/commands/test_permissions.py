@@ -32,6 +32,11 @@ VERBS = {
     "report": ["report", "absent", "-o"],
     "overlay": ["overlay", "absent", "absent", "-o"],
     "check": ["check", SCENES / "demo.toml", "-o"],
+    "transfer": ["transfer", "absent", "-o"],
+    "refine": ["refine", "absent", "-o"],
+    "sweep": ["sweep", "absent", "-o"],
+    "replay": ["replay", "absent", "0", "-o"],
+    "compare-drives": ["compare-drives", "absent", "absent", "-o"],
     "calibrate": ["calibrate", "/dev/absent", "-o"],
     "drive": ["drive", "--policy", "expert", "--simulated", "--log"],
 }
