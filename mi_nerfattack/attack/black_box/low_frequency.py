@@ -14,8 +14,9 @@ from mi_nerfattack.errors import InputError
 class LowFrequency:
     """Changes of colour on a coarse lattice around each object, interpolated.
 
-    Trilinear between as many vertices as the number of coefficients allows; all zeros
-    are the original textures, or others. Colours that are not allowed are projected.
+    Trilinear between as many vertices as the number of coefficients allows, as many of
+    each object, and more along its longer edges; all zeros are the original textures,
+    or others. Colours that are not allowed are projected.
 
     Args:
         colourings: of the objects.
@@ -41,24 +42,47 @@ class LowFrequency:
                 f"coefficients: {most}; {len(colourings)} objects need at least "
                 f"{3 * len(colourings)}"
             )
-        edge = int(np.cbrt(vertices) + 1e-9)
         self.colourings = colourings
         self._middle = [c.start for c in colourings] if middle is None else middle
-        self._shape = (len(colourings), edge, edge, edge, 3)
-        self.count = int(np.prod(self._shape))
-        self._weights = [_weights(c.level.resolution, edge) for c in colourings]
+        self._weights = [
+            [_weights(c.level.resolution, n) for n in lattice(c.extent, vertices)]
+            for c in colourings
+        ]
+        self._shapes = [
+            (*(weights.shape[1] for weights in axes), 3) for axes in self._weights
+        ]
+        sizes = [int(np.prod(shape)) for shape in self._shapes]
+        self._ends = np.cumsum(sizes)
+        self.count = int(self._ends[-1])
 
     def propose(self, coefficients: np.ndarray) -> Proposal:
-        """Return what coefficients (count,) make."""
-        lattices = np.reshape(coefficients, self._shape)
-        changes = map(_spread, lattices, self._weights)
+        """Return what coefficients make: (count,), by x, y, z, channel, in C order."""
+        parts = np.split(np.asarray(coefficients), self._ends[:-1])
         colours = [
-            colouring.project(start + change)
-            for colouring, start, change in zip(
-                self.colourings, self._middle, changes, strict=True
+            colouring.project(start + _spread(part.reshape(shape), weights))
+            for colouring, start, part, shape, weights in zip(
+                *(self.colourings, self._middle, parts, self._shapes, self._weights),
+                strict=True,
             )
         ]
         return propose(self.colourings, colours)
+
+
+def lattice(extent: np.ndarray, most: int) -> tuple[int, int, int]:
+    """Return numbers of vertices along x, y, z that cover a box most evenly.
+
+    The largest room of a vertex along an edge is as small as can be, then the next.
+
+    Args:
+        extent: (3,), of the box.
+        most: vertices, at least 1.
+    """
+    shapes = [
+        (x, y, most // (x * y))
+        for x in range(1, most + 1)
+        for y in range(1, most // x + 1)
+    ]
+    return min(shapes, key=lambda shape: sorted(extent / shape, reverse=True))
 
 
 def _weights(fine: int, coarse: int) -> np.ndarray:
@@ -67,7 +91,7 @@ def _weights(fine: int, coarse: int) -> np.ndarray:
     return np.clip(1 - np.abs(at - np.arange(coarse)), 0, 1)
 
 
-def _spread(lattice: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    w = weights
-    dense = np.einsum("zi,yj,xk,ijkc->zyxc", w, w, w, lattice, optimize=True)
+def _spread(values: np.ndarray, weights: Sequence[np.ndarray]) -> np.ndarray:
+    x, y, z = weights
+    dense = np.einsum("xi,yj,zk,ijkc->zyxc", x, y, z, values, optimize=True)
     return dense.reshape(-1, 3).astype(np.float32)

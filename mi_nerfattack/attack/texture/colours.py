@@ -73,6 +73,9 @@ class Colours(AbstractColouring):
         smoothing: passes of a binomial filter over neighbouring vertices' gradients.
         constraints: what colours are allowed.
 
+    Attributes:
+        extent: (3,), of the lattice along x, y, z of the object's own frame, metres.
+
     Raises:
         InputError: no level is so coarse, or a fixed region lies beside the object.
     """
@@ -95,6 +98,7 @@ class Colours(AbstractColouring):
                 f"{field.levels()[0].resolution} vertices an edge"
             )
         self.level = levels[-1]
+        self.extent = field.upper - field.lower
         self.smoothing = smoothing
         self._original = field.texture.numpy().copy()
         colours = np.clip(vertex_colours(field, self.level), 1e-4, 1 - 1e-4)

@@ -18,6 +18,7 @@ from mi_nerfattack.attack.black_box import (
     RandomSearch,
     SurrogateJudge,
 )
+from mi_nerfattack.attack.black_box.low_frequency import lattice
 from mi_nerfattack.attack.black_box.random_looks import RandomLooks
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.texture.colours import Colours, vertex_colours
@@ -135,7 +136,7 @@ def test_low_frequencies_are_interpolated_and_projected():
     zero = basis.propose(np.zeros(48))
     np.testing.assert_array_equal(zero.textures[0], fields[0].texture.numpy())
     change = np.zeros((2, 2, 2, 2, 3))
-    change[1, :, :, 1, 0] = 0.1  # more red to the right in the second
+    change[1, 1, :, :, 0] = 0.1  # more red to the right in the second
     change[1, :, :, :, 2] = 1.0  # as blue as is allowed
     for field, texture in zip(
         fields, basis.propose(change.ravel()).textures, strict=True
@@ -146,6 +147,35 @@ def test_low_frequencies_are_interpolated_and_projected():
     cube = second.reshape(8, 8, 8, 3)
     np.testing.assert_allclose(cube[2, 5, :, 0], np.linspace(0.5, 0.6, 8), atol=1e-4)
     np.testing.assert_allclose(cube[..., 2], 0.7, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("extent", "most", "counts"),
+    [
+        ([1, 1, 1], 1, (1, 1, 1)),
+        ([1, 1, 1], 8, (2, 2, 2)),
+        ([1, 1, 1], 27, (3, 3, 3)),
+        ([4.2, 1.8, 1.5], 3, (3, 1, 1)),
+        ([4.2, 1.8, 1.5], 14, (3, 2, 2)),
+        ([1, 1, 9], 5, (1, 1, 5)),
+    ],
+)
+def test_lattices_have_as_many_vertices_as_are_allowed(extent, most, counts):
+    assert lattice(np.array(extent, float), most) == counts
+
+
+def test_lattices_lie_along_an_object():
+    """Two vertices of a long object are its ends, each coefficient a channel there."""
+    field = grey()[0]
+    colouring = Colours(field)
+    colouring.extent = np.array([1.0, 5.0, 1.0])
+    basis = LowFrequency([colouring], 8)
+    assert basis.count == 6
+    texture = basis.propose(np.array([0, 0, 0, 0, 0.2, 0])).textures[0]
+    field.set_parameter("texture", texture)
+    cube = vertex_colours(field, field.levels()[-1]).reshape(8, 8, 8, 3)
+    np.testing.assert_allclose(cube[3, :, 2, 1], np.linspace(0.5, 0.7, 8), atol=1e-4)
+    np.testing.assert_allclose(cube[..., [0, 2]], 0.5, atol=1e-6)
 
 
 def test_blocks_lie_where_the_object_is_and_shrink():
