@@ -1,15 +1,19 @@
-"""Render the pictures of the plugin reference into build/pictures.
+"""Make the pictures of the plugin reference and the gallery in build/pictures.
 
-A picture that is younger than its plugin and this file is kept; `make docs` runs this.
+A picture that is younger than what it is made by is kept; `make docs` runs this.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import follow
+
 ROOT = Path(__file__).parents[1]
+GALLERY = ROOT / "docs/gallery.md"
 FOLDER = ROOT / "build/pictures"
 WIDTH, HEIGHT, SPP = 480, 200, 16
 
@@ -126,18 +130,33 @@ SCENES: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 
-def is_stale(name: str) -> bool:
-    """Tell whether a picture is missing, or older than what it shows."""
-    picture = FOLDER / f"{name}.png"
-    sources = (Path(__file__), ROOT / "plugins" / f"{name}.py")
+def is_stale(name: str, *sources: Path) -> bool:
+    """Tell whether a picture is missing, or older than what it is made by."""
+    picture = FOLDER / name
     return not picture.exists() or any(
         source.stat().st_mtime > picture.stat().st_mtime for source in sources
     )
 
 
+def draw_gallery() -> None:
+    """Run the gallery's blocks, unless all of its pictures are there."""
+    names = re.findall(r"\.\./build/pictures/(\S+)\)", GALLERY.read_text("utf-8"))
+    sources = (GALLERY, *(ROOT / "docs/examples").iterdir())
+    if any(is_stale(name, *sources) for name in names):
+        for line in follow.follow(GALLERY, ROOT, long=False):
+            print(line, flush=True)
+
+
 def main() -> None:
-    """Render what is stale."""
-    names = [name for name in SCENES if is_stale(name)]
+    """Make what is stale."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    draw_gallery()
+    plugins = ROOT / "plugins"
+    names = [
+        name
+        for name in SCENES
+        if is_stale(f"{name}.png", Path(__file__), plugins / f"{name}.py")
+    ]
     if not names:
         return
     import mi_nerfattack  # before mitsuba
@@ -145,7 +164,6 @@ def main() -> None:
     mi_nerfattack.variant.ensure()
     import mitsuba as mi
 
-    FOLDER.mkdir(parents=True, exist_ok=True)
     for name in names:
         scene = mi.load_dict(SCENES[name](), parallel=False)
         image = mi.render(scene, spp=64 if name == "field_emitter" else SPP)

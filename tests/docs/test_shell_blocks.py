@@ -1,7 +1,7 @@
 """Commands of the documentation: all parse, and blocks that take no input run.
 
 A block is what stands between fences without a language and calls us. Each is run as it
-stands, or is listed with the reason why not.
+stands, or is listed with the reason why not. Those of `bash` are run by docs/follow.py.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from mi_nerfattack.commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIALS = sorted((ROOT / "docs/tutorials").glob("*.md"))
 RUN = {
     "mi-nerfattack render scenes/intersection/field.xml -o hydrant.exr",
     "mi-nerfattack render scenes/intersection/field.xml -o hydrant.png \\",
@@ -52,14 +53,14 @@ SKIPPED = {
 }
 
 
-def blocks(page: Path) -> list[str]:
+def blocks(page: Path, languages: tuple[str, ...] = ("",)) -> list[str]:
     """Find the blocks of a page that call us."""
     fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
     ours = r"^(\S*/)?(mi-nerfattack|python -m|make|pip) "
     return [
         text
         for language, text in fenced
-        if not language and re.search(ours, text, re.M)
+        if language in languages and re.search(ours, text, re.M)
     ]
 
 
@@ -73,8 +74,10 @@ def commands(text: str) -> list[list[str]]:
 
 CALLS = [
     pytest.param(words, id=f"{page.stem}-{k}-{words[0]}")
-    for page in PAGES
-    for k, words in enumerate(w for b in blocks(page) for w in commands(b))
+    for page in [*PAGES, *TUTORIALS]
+    for k, words in enumerate(
+        words for text in blocks(page, ("", "bash")) for words in commands(text)
+    )
 ]
 
 
