@@ -199,10 +199,13 @@ def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> st
     corners = " ".join(f"({x:.2f}, {y:.2f})" for x, y in settings.judge.fence.points)
     where = "the simulated room" if config.simulated else config.camera
     sent = f", frames as JPEG of quality {config.jpeg_quality}"
+    is_cut = (config.speed_ms or 0.0) > route.speed_ms
+    cut = f", cut from {config.speed_ms} by --max-speed-ms" if is_cut else ""
     lines = [
         f"Policy     {config.policy}, control in {config.control_unit}"
         f"{sent if config.jpeg_quality else ''}",
-        f"Route      {route.name}, {route.length:.1f} m, at {route.speed_ms:g} m/s",
+        f"Route      {route.name}, {route.length:.1f} m, at {route.speed_ms:g} m/s"
+        f"{cut}",
         f"Fence      {corners}, m",
         f"Limits     {limits.speed_ms:g} m/s, {limits.acceleration_ms2:g} m/s2, "
         f"{limits.steering_rad:g} rad, {limits.steering_rate:g} rad/s",

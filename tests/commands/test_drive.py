@@ -44,10 +44,11 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
     assert len(recording.track.times) == 20 and recording.image(0).max() > 50
     assert main([*SIMULATED, "--log", str(log)]) == 2  # never written over
     assert f"{log}: exists; choose another name" in capsys.readouterr().err
-    assert main([*SIMULATED, "--check"]) == 0
+    assert main([*SIMULATED, "--check", "--speed-ms", "3"]) == 0
     told = capsys.readouterr().out
     assert "camera     ready" in told and "Armed" not in told
     assert "enable     ready" in told
+    assert "at 1.5 m/s, cut from 3.0 by --max-speed-ms" in told
 
 
 def test_a_drive_as_json(tmp_path, variant, capsys):

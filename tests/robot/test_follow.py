@@ -14,6 +14,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 from helpers.boxes import made_box
+from helpers.waiting import wait_for
 from scipy.ndimage import binary_opening
 from scipy.spatial.transform import Rotation
 
@@ -145,13 +146,6 @@ def served():
         yield server, tracker, said, errors
     thread.join(10)
     assert not thread.is_alive()
-
-
-def wait_for(condition) -> None:
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_each_new_pose_is_an_event(served):
