@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mi_nerfattack.commands.shared.box_options import make_screen
+from mi_nerfattack.commands.shared.terminal import say
 
 if TYPE_CHECKING:
     from mi_nerfattack.robot.attacked import AttackedBox, Views
@@ -80,9 +81,6 @@ class Monitor:
         tracker = open_tracker(
             self.tracker, views.mount, self.rotation, self.tracker_sender
         )
-
-        def say(text: str) -> None:
-            print(text, flush=True)
 
         with closing(tracker):
             server = FollowServer(

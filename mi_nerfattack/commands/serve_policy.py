@@ -10,6 +10,7 @@ import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import PolicyOptions
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import say
 
 if TYPE_CHECKING:
     from mi_nerfattack.robot.remote.server import Control
@@ -66,9 +67,6 @@ class ServePolicy:
         if self.size is not None:
             width, height = self.size
             make_control()(np.zeros((height, width, 3), np.uint8))
-
-        def say(text: str) -> None:
-            print(text, flush=True)
 
         with closing(PolicyServer(endpoint, key, make_control, say)) as server:
             sealed = "sealed by the key" if key else "on this computer alone"
