@@ -35,6 +35,7 @@ from mi_nerfattack.commands.shared.result import Result
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.commands.train import Train
 from mi_nerfattack.commands.transfer import Transfer
+from mi_nerfattack.commands.view import View
 
 
 class Command(Protocol):
@@ -70,6 +71,7 @@ COMMANDS: dict[str, type[Command]] = {
     "compare-drives": CompareDrives,
     "calibrate": Calibrate,
     "report": Report,
+    "view": View,
 }
 
 __all__ = ["COMMANDS", "Command"]

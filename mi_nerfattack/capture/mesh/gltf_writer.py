@@ -16,14 +16,24 @@ _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 
 
 def write_glb(path: str | Path, mesh: ColouredMesh) -> None:
-    """Write a mesh atomically, in metres and with glTF's y up.
+    """Write a mesh atomically; see :func:`glb_bytes`.
+
+    Args:
+        path: of the .glb file.
+        mesh: z up.
+    """
+    files.write_bytes(path, glb_bytes(mesh, Path(path).stem))
+
+
+def glb_bytes(mesh: ColouredMesh, name: str) -> bytes:
+    """Return a mesh as a .glb file, in metres and with glTF's y up.
 
     Colours stay linear and floating point, as glTF wants them. The material is unlit
     (`KHR_materials_unlit`), since the colours hold the light of the capture already.
 
     Args:
-        path: of the .glb file.
         mesh: z up; x stays, z becomes y, and y becomes -z.
+        name: of the mesh.
     """
     blob, views, accessors = b"", [], []
     for array, kind, target in (
@@ -51,7 +61,7 @@ def write_glb(path: str | Path, mesh: ColouredMesh) -> None:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": Path(path).stem}],
+        "nodes": [{"mesh": 0, "name": name}],
         "meshes": [
             {"primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}
         ],
@@ -67,7 +77,7 @@ def write_glb(path: str | Path, mesh: ColouredMesh) -> None:
         "bufferViews": views,
         "accessors": accessors,
     }
-    files.write_bytes(path, _glb(json.dumps(tree, separators=(",", ":")), blob))
+    return _glb(json.dumps(tree, separators=(",", ":")), blob)
 
 
 def _y_up(vectors: np.ndarray) -> np.ndarray:

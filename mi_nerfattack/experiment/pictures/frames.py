@@ -34,9 +34,14 @@ STRIP_FRAMES = 6
 WORST_S = 1.0
 
 
-def nominal_drives(done: Finished) -> list[Drive]:
-    """Return the first drive of each environment and case, in the order of plots."""
-    found = [d for d in done.drives if d.run == 0 and d.case in done.looks]
+def nominal_drives(drives: Sequence[Drive], cases: Collection[str]) -> list[Drive]:
+    """Return the first drive of each environment and case, in the order of plots.
+
+    Args:
+        drives: of a run.
+        cases: of which drives are wanted.
+    """
+    found = [d for d in drives if d.run == 0 and d.case in cases]
     return sorted(
         found, key=lambda d: (environment_order(d.environment), CASES.index(d.case))
     )
@@ -81,7 +86,7 @@ def write_frames(
         frames: which frames become files.
         on_progress: told about every time step.
     """
-    world, nominal = done.world, nominal_drives(done)
+    world, nominal = done.world, nominal_drives(done.drives, done.looks)
     places, passed = aligned_steps(world.route, nominal, STRIP_FRAMES)
     rows: dict[str, list[np.ndarray]] = {}
     digests, count = world.scenario.digests(), 0

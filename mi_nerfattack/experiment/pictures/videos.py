@@ -26,7 +26,8 @@ def write_videos(output: Path, done: Finished, on_progress: OnProgress) -> None:
         on_progress: told about every frame.
     """
     files.make_folder(output / "videos")
-    groups = groupby(nominal_drives(done), lambda drive: drive.environment)
+    nominal = nominal_drives(done.drives, done.looks)
+    groups = groupby(nominal, lambda drive: drive.environment)
     for label, group in groups:
         drives = list(group)
         pictures = _pictures(output, drives, f"{label}: video", on_progress)

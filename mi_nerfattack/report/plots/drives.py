@@ -58,6 +58,8 @@ _STYLES: dict[str, dict[str, Any]] = {
         "linestyle": (0, (5, 1.2)),
     },
 }
+#: By case, as ``#rrggbb``.
+CASE_COLOURS = {case: str(style["color"]) for case, style in _STYLES.items()}
 _LABELS = {case: case.replace("_", " ") for case in CASES}
 _DARK = {
     RANDOM: "#4d4d4d",

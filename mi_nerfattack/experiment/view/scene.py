@@ -1,0 +1,195 @@
+"""What stands in the browser's scene: points, drives, objects, and the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mi_nerfattack.capture.mesh.gltf_writer import glb_bytes
+from mi_nerfattack.capture.mesh.surface import (
+    ColouredMesh,
+    field_surface,
+    seen_colours,
+)
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.experiment.view.points import CELL_M, Cloud
+from mi_nerfattack.experiment.view.run import ViewedRun, drive_name, to_wxyz
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.report.plots.drives import CASE_COLOURS
+from mi_nerfattack.rollout.drive import ATTACK, Drive
+
+if TYPE_CHECKING:
+    import viser
+
+_UP_M = 0.06  # of lines over the ground
+_THICK_M, _THIN_M = 0.06, 0.02
+_GLTF_TO_WORLD = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # y up to z up
+_CAMERA_M = 1.2  # of the frustum
+_ROUTE = (154, 154, 154)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """An object's surface, which all its looks share.
+
+    Attributes:
+        surface: where its field is opaque; None where it is nowhere.
+        looks: colours (n, 3) of the surface's vertices by case, linear.
+    """
+
+    surface: ColouredMesh | None
+    looks: Mapping[str, np.ndarray]
+
+
+def object_shapes(viewed: ViewedRun) -> list[ObjectShape]:
+    """Return the surfaces of the objects' fields, in their own frames.
+
+    Cost: a second or so an object.
+    """
+    world, found = viewed.world, []
+    cases = [case for case, look in viewed.looks.items() if look is not None]
+    for field in world.fields:
+        try:
+            surface = field_surface(field)
+        except InputError:  # a mist, which has none
+            found.append(ObjectShape(None, {}))
+            continue
+        looks = {}
+        for case in cases:
+            viewed.show(case, {})
+            looks[case] = seen_colours(field, surface.vertices, surface.normals)
+        found.append(ObjectShape(surface, looks))
+    return found
+
+
+class RunScene:
+    """The nodes of a run in the scene of a server.
+
+    Args:
+        scene: of the server, empty.
+        viewed: the run.
+        cloud: the points of its place.
+        shapes: of its objects.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        viewed: ViewedRun,
+        cloud: Cloud,
+        shapes: list[ObjectShape],
+    ) -> None:
+        self._scene, self._viewed = scene, viewed
+        self.cloud = scene.add_point_cloud(
+            "/scene",
+            cloud.points.astype(np.float32),
+            cloud.colours,
+            point_size=CELL_M,
+            precision="float32",
+            point_shading="flat",
+        )
+        self._add_lines()
+        self._looks: list[dict[str, Any]] = []
+        self._frames: list[Any] = []
+        world = viewed.world
+        for item, posed, field, shape in zip(
+            world.scenario.objects,
+            world.surrogate.objects,
+            world.fields,
+            shapes,
+            strict=True,
+        ):
+            name = f"/objects/{item.id}"
+            self._frames.append(scene.add_frame(name, show_axes=False))
+            self._looks.append(self._add_object(name, posed.pose.scale, field, shape))
+        camera = viewed.world.surrogate.camera
+        self.camera = scene.add_camera_frustum(
+            "/camera",
+            fov=2 * math.atan(camera.height / (2 * camera.fy)),
+            aspect=camera.width / camera.height * camera.fy / camera.fx,
+            scale=_CAMERA_M,
+            thickness=_THIN_M,
+        )
+
+    def show(self, case: str, poses: list[Pose]) -> None:
+        """Show the objects of a case.
+
+        Args:
+            case: of a drive; without objects they are hidden.
+            poses: where they stand.
+        """
+        hidden = self._viewed.looks[case] is None
+        for frame, looks, pose in zip(self._frames, self._looks, poses, strict=True):
+            frame.position, frame.wxyz = pose.translation, to_wxyz(pose.rotation)
+            for name, node in looks.items():
+                node.visible = not hidden and name in (case, "")
+
+    def look_from(self, camera_to_world: np.ndarray, image: np.ndarray) -> None:
+        """Put the camera somewhere, and what it sees before it."""
+        self.camera.position = camera_to_world[:3, 3]
+        self.camera.wxyz = to_wxyz(camera_to_world[:3, :3])
+        self.camera.image = image
+
+    def _add_object(
+        self, name: str, scale: float, field: GridField, shape: ObjectShape
+    ) -> dict[str, Any]:
+        """Add an object's looks; of a mist its box, whatever it looks like."""
+        if shape.surface is None:
+            box = self._scene.add_box(
+                f"{name}/box",
+                dimensions=tuple(scale * (field.upper - field.lower)),
+                position=scale * (field.upper + field.lower) / 2,
+                wireframe=True,
+            )
+            return {"": box}
+        nodes = {}
+        for case, colours in shape.looks.items():
+            data = glb_bytes(replace(shape.surface, colours=colours), case)
+            nodes[case] = self._scene.add_glb(
+                f"{name}/{case}",
+                data,
+                scale=scale,
+                wxyz=_GLTF_TO_WORLD,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        return nodes
+
+    def _add_lines(self) -> None:
+        """Draw the lane's centre, and the drives."""
+        route = self._viewed.world.route
+        self._add_line("/route", route.points, _ROUTE, _THIN_M)
+        first = {id(drive) for drive in self._viewed.shown}
+        for drive in self._viewed.drives:
+            colour = _rgb(CASE_COLOURS[drive.case])
+            thick = _THICK_M if id(drive) in first else _THIN_M
+            environment, case = drive_name(drive).split(": ")
+            name = f"/drives/{environment}/{case}/{drive.run}"
+            self._add_line(name, drive.states[:, :2], colour, thick)
+
+    def _add_line(self, name: str, points: np.ndarray, colour: Any, m: float) -> None:
+        """Draw a line through points (n, 2) of the ground."""
+        raised = np.column_stack([points, np.full(len(points), _UP_M)])
+        parts = np.stack([raised[:-1], raised[1:]], axis=1)
+        self._scene.add_line_segments(name, parts, colour, thickness=m)
+
+
+def first_look(viewed: ViewedRun, drive: Drive) -> tuple[np.ndarray, np.ndarray]:
+    """Return from where a reader looks at first, and at what, (3,) each, metres."""
+    x, y, heading = drive.states[0]
+    behind = np.array([x - 9 * math.cos(heading), y - 9 * math.sin(heading), 7.0])
+    middle = drive.states[len(drive.states) // 2, :2]
+    stand = [pose.translation[:2] for pose in viewed.poses(ATTACK, {})]
+    target = np.mean([middle, *stand], axis=0)
+    return behind, np.array([*target, 1.0])
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """Read ``#rrggbb``."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
