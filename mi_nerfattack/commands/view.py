@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+if TYPE_CHECKING:
+    from mi_nerfattack.commands.shared.progress import StageBars
+    from mi_nerfattack.experiment.view.scene import Contents
 
 
 @dataclass(frozen=True)
@@ -19,9 +24,12 @@ class View:
 
     run_folder: tyro.conf.Positional[Path]
     """Finished run folder of attack."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Write one HTML file, which opens by itself, and end: the scene, with one drive
+    that plays."""
     drive: str | None = None
-    """Shown first: ENVIRONMENT: CASE, as "deployment: attack"; past the attack in the
-    surrogate by default."""
+    """Shown first, or written: ENVIRONMENT: CASE, as "deployment: attack"; past the
+    attack in the surrogate by default."""
     host: str = "127.0.0.1"
     """Name or address to listen at. Whoever gets there sees the run, and moves its
     objects: this computer alone, by default."""
@@ -31,26 +39,27 @@ class View:
     """Open it in the browser of this computer."""
 
     def run(self) -> int:
-        """Read, listen, and render."""
+        """Show it, or write the file."""
+        from mi_nerfattack import variant
+
+        variant.ensure()
+        if self.output is None:
+            self._serve()
+        else:
+            self._write(self.output)
+        return 0
+
+    def _serve(self) -> None:
+        """Render what the browser asks for, until Ctrl-C."""
         import webbrowser
 
-        from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.experiment.view.points import scene_cloud
-        from mi_nerfattack.experiment.view.run import read_viewed
-        from mi_nerfattack.experiment.view.scene import object_shapes
         from mi_nerfattack.experiment.view.server import serving
         from mi_nerfattack.experiment.view.viewer import Viewer
 
-        variant.ensure()
         with serving(self.host, self.port) as server:
             with StageBars() as bars:
-                bars.say(f"reading {self.run_folder}")
-                viewed = read_viewed(self.run_folder)
-                drive = viewed.drive(self.drive)
-                look = bars.counter("looking around", "frame ")
-                cloud = scene_cloud(viewed.world, drive.states, look)
-                viewer = Viewer(server, viewed, cloud, object_shapes(viewed), drive)
+                viewer = Viewer(server, self._read(bars))
             name = f"[{self.host}]" if ":" in self.host else self.host
             address = f"http://{name}:{server.get_port()}"
             print(f"Showing {self.run_folder} at {address}; Ctrl-C ends", flush=True)
@@ -60,4 +69,26 @@ class View:
                 viewer.run()
             except KeyboardInterrupt:
                 print("Ended", flush=True)
-        return 0
+
+    def _write(self, output: Path) -> None:
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.experiment.view.page import write_view
+        from mi_nerfattack.io import files
+
+        if output.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"--output: {output}; name an .html file")
+        files.check_writable(output)
+        with StageBars() as bars:
+            write_view(output, self._read(bars), bars.counter("frames", "frame "))
+        size = output.stat().st_size / 1e6
+        print(f"Written: {output.resolve()} ({size:.1f} MB)")
+
+    def _read(self, bars: StageBars) -> Contents:
+        from mi_nerfattack.experiment.view.scene import read_contents
+        from mi_nerfattack.system.extras import load_extra
+
+        load_extra("viser", "view", "the viewer")
+        bars.say(f"reading {self.run_folder}")
+        look = bars.counter("looking around", "frame ")
+        return read_contents(self.run_folder, self.drive, look)

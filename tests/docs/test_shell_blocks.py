@@ -50,6 +50,7 @@ SKIPPED = {
     "sweep.md": USAGE,
     "training.md": LONG,
     "transfer.md": INPUT,
+    "view.md": INPUT,
 }
 
 

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
+from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.simulated import SurrogateEnvironment
 from mi_nerfattack.deploy.views.rays import PixelRays
@@ -15,6 +17,7 @@ from mi_nerfattack.scenario.world import World
 APART_M = 4.0  # between the places that are looked around from
 FARTHEST_M = 60.0
 CELL_M = 0.1
+SAME = 0.05  # of a depth, by which its neighbours may differ
 MOST = 200_000
 
 
@@ -40,7 +43,7 @@ def scene_cloud(
 
     The surrogate without objects, through the drives' own camera, turned to four sides
     at places `APART_M` apart: a point lies at the expected depth of a ray that meets
-    at least half an opacity within `FARTHEST_M`. What no such ray meets is not there.
+    at least half an opacity. What no such ray meets is not there.
     Cost: four frames a place.
 
     Args:
@@ -50,19 +53,33 @@ def scene_cloud(
     """
     sensor = world.surrogate.showing([])
     environment = SurrogateEnvironment(sensor, kinematic_vehicle(world.place))
-    rays = PixelRays(sensor.camera)
-    points, colours = [], []
+    rays, parts = PixelRays(sensor.camera), []
     places = _places(states)
     for number, pose in enumerate(places, start=1):
-        frame = environment.reset(world.route, pose)
-        seen = rays.at(frame.camera_to_world)
-        depth = frame.depth.ravel()
-        near = depth < FARTHEST_M
-        along = seen.direction.numpy().T[near] * depth[near, None]
-        points.append(frame.camera_to_world[:3, 3] + along)
-        colours.append(frame.image.reshape(-1, 3)[near])
+        parts.append(frame_points(environment.reset(world.route, pose), rays))
         on_frame(number, len(places))
-    return thinned(Cloud(np.concatenate(points), np.concatenate(colours)))
+    points = np.concatenate([part.points for part in parts])
+    colours = np.concatenate([part.colours for part in parts])
+    return thinned(Cloud(points, colours))
+
+
+def frame_points(frame: CameraFrame, rays: PixelRays) -> Cloud:
+    """Put a point where each pixel's ray ends.
+
+    Left out where the depth is beyond `FARTHEST_M`, or another than around it: at an
+    edge, where a ray that meets two things ends between them.
+
+    Args:
+        frame: of any environment.
+        rays: of its camera.
+    """
+    pose = frame.camera_to_world
+    depth = np.minimum(frame.depth.astype(np.float64), 2 * FARTHEST_M)
+    apart = np.abs(depth - ndimage.median_filter(depth, 3, mode="nearest"))
+    kept = (depth < FARTHEST_M) & (apart < SAME * depth)
+    along = rays.at(pose).direction.numpy().T.reshape(*depth.shape, 3)[kept]
+    points = pose[:3, 3] + along * depth[kept][:, None]
+    return Cloud(points, frame.image[kept])
 
 
 def thinned(cloud: Cloud, cell_m: float = CELL_M, most: int = MOST) -> Cloud:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,8 +17,13 @@ from mi_nerfattack.capture.mesh.surface import (
     seen_colours,
 )
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.view.points import CELL_M, Cloud
-from mi_nerfattack.experiment.view.run import ViewedRun, drive_name, to_wxyz
+from mi_nerfattack.experiment.view.points import CELL_M, Cloud, scene_cloud
+from mi_nerfattack.experiment.view.run import (
+    ViewedRun,
+    drive_name,
+    read_viewed,
+    to_wxyz,
+)
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.report.plots.drives import CASE_COLOURS
@@ -29,7 +35,8 @@ if TYPE_CHECKING:
 _UP_M = 0.06  # of lines over the ground
 _THICK_M, _THIN_M = 0.06, 0.02
 _GLTF_TO_WORLD = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # y up to z up
-_CAMERA_M = 1.2  # of the frustum
+_FRAME_M = 3.0  # width of the frame before the camera
+_NEAR_M, _BEHIND_M, _ABOVE_M = 12.0, 8.0, 5.0  # of the first look
 _ROUTE = (154, 154, 154)
 
 
@@ -44,6 +51,42 @@ class ObjectShape:
 
     surface: ColouredMesh | None
     looks: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a browser is shown.
+
+    Attributes:
+        viewed: the run.
+        drive: that is shown first.
+        cloud: points of its place.
+        shapes: of its objects.
+    """
+
+    viewed: ViewedRun
+    drive: Drive
+    cloud: Cloud
+    shapes: Sequence[ObjectShape]
+
+
+def read_contents(
+    folder: Path, drive: str | None, on_frame: Callable[[int, int], None]
+) -> Contents:
+    """Read a run folder, look around, and find the objects' surfaces.
+
+    Args:
+        folder: of the run.
+        drive: shown first, see :meth:`ViewedRun.drive`.
+        on_frame: told how many frames were looked at, of how many.
+
+    Raises:
+        InputError: as of :func:`read_viewed`, or there is no such drive.
+    """
+    viewed = read_viewed(folder)
+    first = viewed.drive(drive)
+    cloud = scene_cloud(viewed.world, first.states, on_frame)
+    return Contents(viewed, first, cloud, object_shapes(viewed))
 
 
 def object_shapes(viewed: ViewedRun) -> list[ObjectShape]:
@@ -72,19 +115,12 @@ class RunScene:
 
     Args:
         scene: of the server, empty.
-        viewed: the run.
-        cloud: the points of its place.
-        shapes: of its objects.
+        contents: what stands there.
     """
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        viewed: ViewedRun,
-        cloud: Cloud,
-        shapes: list[ObjectShape],
-    ) -> None:
-        self._scene, self._viewed = scene, viewed
+    def __init__(self, scene: viser.SceneApi, contents: Contents) -> None:
+        self._scene, self._viewed = scene, contents.viewed
+        viewed, cloud = contents.viewed, contents.cloud
         self.cloud = scene.add_point_cloud(
             "/scene",
             cloud.points.astype(np.float32),
@@ -101,20 +137,27 @@ class RunScene:
             world.scenario.objects,
             world.surrogate.objects,
             world.fields,
-            shapes,
+            contents.shapes,
             strict=True,
         ):
             name = f"/objects/{item.id}"
             self._frames.append(scene.add_frame(name, show_axes=False))
             self._looks.append(self._add_object(name, posed.pose.scale, field, shape))
         camera = viewed.world.surrogate.camera
+        high, wide = camera.height / (2 * camera.fy), camera.width / (2 * camera.fx)
+        volume = float(np.cbrt(high * wide / 3))  # that viser scales to 1
+        self._ahead = _FRAME_M / (2 * wide)  # of the frame, metres
+        self._high = 2 * self._ahead * high
         self.camera = scene.add_camera_frustum(
             "/camera",
-            fov=2 * math.atan(camera.height / (2 * camera.fy)),
-            aspect=camera.width / camera.height * camera.fy / camera.fx,
-            scale=_CAMERA_M,
+            fov=2 * math.atan(high),
+            aspect=wide / high,
+            scale=self._ahead * volume,
             thickness=_THIN_M,
+            format="png",
         )
+        self._text: viser.LabelHandle | None = None
+        self._apart: viser.ImageHandle | None = None
 
     def show(self, case: str, poses: list[Pose]) -> None:
         """Show the objects of a case.
@@ -134,6 +177,32 @@ class RunScene:
         self.camera.position = camera_to_world[:3, 3]
         self.camera.wxyz = to_wxyz(camera_to_world[:3, :3])
         self.camera.image = image
+
+    def tell(self, text: str, apart: np.ndarray | None) -> None:
+        """Write a line above the camera, and hang a picture there.
+
+        Args:
+            text: to write.
+            apart: (height, width, 3), uint8, as large as what the camera sees; None
+                for none.
+        """
+        if self._text is None:
+            self._text = self._scene.add_label(
+                "/camera/text", text, position=(0.0, -1.7 * self._high, self._ahead)
+            )
+        self._text.text = text
+        if apart is None:
+            return
+        if self._apart is None:
+            self._apart = self._scene.add_image(
+                "/camera/apart",
+                apart,
+                render_width=_FRAME_M,
+                render_height=self._high,
+                format="png",
+                position=(0.0, -1.1 * self._high, self._ahead),
+            )
+        self._apart.image = apart
 
     def _add_object(
         self, name: str, scale: float, field: GridField, shape: ObjectShape
@@ -180,13 +249,16 @@ class RunScene:
 
 
 def first_look(viewed: ViewedRun, drive: Drive) -> tuple[np.ndarray, np.ndarray]:
-    """Return from where a reader looks at first, and at what, (3,) each, metres."""
-    x, y, heading = drive.states[0]
-    behind = np.array([x - 9 * math.cos(heading), y - 9 * math.sin(heading), 7.0])
-    middle = drive.states[len(drive.states) // 2, :2]
-    stand = [pose.translation[:2] for pose in viewed.poses(ATTACK, {})]
-    target = np.mean([middle, *stand], axis=0)
-    return behind, np.array([*target, 1.0])
+    """Return from where a reader looks at first, and at what, (3,) each, metres.
+
+    From behind and above the car, where it first is near the objects.
+    """
+    stand = [pose.translation for pose in viewed.poses(ATTACK, {})]
+    target = np.mean(stand, axis=0)
+    away = np.linalg.norm(drive.states[:, :2] - target[:2], axis=1)
+    x, y, heading = drive.states[np.argmax(away <= max(_NEAR_M, away.min()))]
+    back = np.array([math.cos(heading), math.sin(heading)]) * _BEHIND_M
+    return np.array([*([x, y] - back), _ABOVE_M]), target
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

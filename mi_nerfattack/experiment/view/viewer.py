@@ -11,14 +11,13 @@ import numpy as np
 
 from mi_nerfattack.errors import NerfAttackError
 from mi_nerfattack.experiment.view.frames import FrameSource
-from mi_nerfattack.experiment.view.points import Cloud
 from mi_nerfattack.experiment.view.run import (
     ViewedRun,
     drive_name,
     offset_of,
     to_wxyz,
 )
-from mi_nerfattack.experiment.view.scene import ObjectShape, RunScene, first_look
+from mi_nerfattack.experiment.view.scene import Contents, RunScene, first_look
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import Drive
 
@@ -48,22 +47,13 @@ class Viewer:
 
     Args:
         server: empty.
-        viewed: the run.
-        cloud: points of its place.
-        shapes: of its objects.
-        drive: that is shown first.
+        contents: what is shown.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        viewed: ViewedRun,
-        cloud: Cloud,
-        shapes: list[ObjectShape],
-        drive: Drive,
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, contents: Contents) -> None:
+        viewed, drive = contents.viewed, contents.drive
         self.viewed, self.frames = viewed, FrameSource(viewed)
-        self.scene = RunScene(server.scene, viewed, cloud, shapes)
+        self.scene = RunScene(server.scene, contents)
         eye, target = first_look(viewed, drive)
         server.initial_camera.position, server.initial_camera.look_at = eye, target
         self.moved: dict[int, np.ndarray] = {}

@@ -1,0 +1,263 @@
+"""A run in the viewer, without a browser: geometry, time, and what is rendered when."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mi_nerfattack import cli
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.views.rays import PixelRays
+from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.experiment.view import viewer as module
+from mi_nerfattack.experiment.view.frames import FULL, FrameSource, heat
+from mi_nerfattack.experiment.view.points import (
+    FARTHEST_M,
+    Cloud,
+    frame_points,
+    scene_cloud,
+    thinned,
+)
+from mi_nerfattack.experiment.view.run import offset_of, read_viewed, to_wxyz
+from mi_nerfattack.experiment.view.scene import Contents, object_shapes
+from mi_nerfattack.experiment.view.server import serving
+from mi_nerfattack.experiment.view.viewer import Viewer, following
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
+from mi_nerfattack.render.camera.outside import seen_at
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.rollout.offset import offset_pose
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.fixture(scope="module")
+def viewed(found_run):
+    return read_viewed(found_run)
+
+
+@pytest.fixture(scope="module")
+def contents(viewed):
+    drive = viewed.drive()
+    cloud = scene_cloud(viewed.world, drive.states[:1])
+    return Contents(viewed, drive, cloud, object_shapes(viewed))
+
+
+@pytest.fixture
+def viewer(contents):
+    with serving("127.0.0.1", 0) as server:
+        made = Viewer(server, contents)
+        assert made.turn(0)
+        yield made
+
+
+def test_offset_puts_an_object_where_the_handle_is():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        start = Pose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3), 1.7)
+        turned = Rotation.random(rng=rng).as_matrix()
+        position = rng.normal(size=3)
+        found = offset_pose(start, offset_of(start, position, to_wxyz(turned)))
+        np.testing.assert_allclose(found[0], turned, atol=1e-9)
+        np.testing.assert_allclose(found[1], position, atol=1e-9)
+
+
+def test_points_lie_behind_their_pixels():
+    camera = from_fov(20, 12, 80.0)
+    pose = mount_matrix(np.array([[3.0, -2.0, 0.7]]), CameraMount(1.5, 0.2, 5.0))[0]
+    depth = np.full((12, 20), 7.0, np.float32)
+    depth[:, 10:] = 20.0
+    depth[4, 4], depth[0, :5] = 12.0, np.inf  # between two things, and the sky
+    image = np.arange(12 * 20 * 3).reshape(12, 20, 3).astype(np.uint8)
+    found = frame_points(CameraFrame(image, depth, pose), PixelRays(camera))
+    kept = np.isfinite(depth) & (depth != 12.0)
+    rows, columns = np.nonzero(kept)
+    np.testing.assert_allclose(
+        seen_at(camera, pose, found.points),
+        np.stack([columns, rows], axis=1) + 0.5,
+        atol=1e-3,
+    )
+    away = np.linalg.norm(found.points - pose[:3, 3], axis=1)
+    np.testing.assert_allclose(away, depth[kept], rtol=1e-5)
+    np.testing.assert_array_equal(found.colours, image[kept])
+
+
+def test_thinned_keeps_one_point_a_cell():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-2, 2, (4000, 3))
+    colours = rng.integers(0, 256, (4000, 3), dtype=np.uint8)
+    found = thinned(Cloud(points, colours), 1.0)
+    cells = {tuple(cell) for cell in np.floor(found.points).astype(int)}
+    assert len(cells) == len(found.points) == 4**3
+    first = np.nonzero((points == found.points[0]).all(1))[0][0]
+    np.testing.assert_array_equal(found.colours[0], colours[first])
+    assert 0 < len(thinned(Cloud(points, colours), 0.01, 100).points) <= 100
+
+
+def test_cloud_is_of_the_scene_alone(contents):
+    points = contents.cloud.points
+    assert len(points) > 50
+    assert np.isfinite(points).all()
+    start = contents.drive.states[0]
+    assert np.linalg.norm(points[:, :2] - start[:2], axis=1).max() < FARTHEST_M
+
+
+def test_heat_is_brightest_from_half_on():
+    dark = np.zeros((1, 3, 3), np.uint8)
+    light = dark.copy()
+    light[0, 1], light[0, 2] = FULL, 255
+    found = heat(light, dark)
+    np.testing.assert_array_equal(found[0, 1], found[0, 2])
+    assert found[0, 1].sum() > found[0, 0].sum()
+
+
+def test_played_to_the_end_it_begins_again():
+    assert [following(step, 3) for step in range(4)] == [1, 2, 3, 0]
+
+
+@pytest.mark.parametrize("name", ["surrogate: attack", "deployment: attack"])
+def test_frames_are_those_of_the_drive(viewed, name):
+    """As its own environment gives them, driven there by the recorded controls."""
+    drive = viewed.drive(name)
+    frames = FrameSource(viewed)
+    found = [frames.see(drive, step) for step in (2, 0)]
+    viewed.show(drive.case, {})
+    environment = viewed.world.open(drive.environment)
+    expected = [environment.reset(viewed.world.route, drive.states[0], drive.seed)]
+    expected += [environment.step(float(control)) for control in drive.controls]
+    np.testing.assert_array_equal(found[0], expected[2].image)
+    np.testing.assert_array_equal(found[1], expected[0].image)
+    environment.close()
+    frames.close()
+
+
+@pytest.mark.parametrize("label", ["surrogate", "deployment"])
+def test_a_moved_object_is_seen_elsewhere(viewed, label):
+    frames = FrameSource(viewed)
+    drive = viewed.drive(f"{label}: attack")
+    before = frames.see(drive, 0)
+    bare = frames.see(drive, 0, "no_object")
+    away = frames.see(drive, 0, moved={0: np.array([0, 0, 50.0, 0, 0, 0])})
+    again = frames.see(drive, 0)
+    assert np.abs(before.astype(int) - bare).max() > 20
+    np.testing.assert_array_equal(away, bare)
+    np.testing.assert_array_equal(again, before)
+    apart = frames.difference(drive, 0, before, {})
+    assert apart is not None
+    assert len(np.unique(apart.reshape(-1, 3), axis=0)) > 1
+    assert frames.difference(viewed.drive(f"{label}: own"), 0, before, {}) is None
+    frames.close()
+
+
+def test_what_is_asked_for_is_rendered_once(viewer, viewed):
+    first = viewer.seen.image
+    assert not viewer.turn(0)
+    viewer.slider.value = 2
+    assert viewer.turn(0)
+    assert not np.array_equal(viewer.seen.image, first)
+    pose = viewed.cameras(viewed.drive())[2]
+    np.testing.assert_allclose(viewer.scene.camera.position, pose[:3, 3])
+    assert "0.2 s" in viewer.told.content
+    viewer.slider.value = 0
+    viewer.choice.value = "surrogate: no_object"
+    assert viewer.turn(0)
+    assert not viewer.apart.visible
+    assert not np.array_equal(viewer.seen.image, first)
+
+
+def test_dragged_typed_and_put_back(viewer, viewed):
+    first, x = viewer.seen.image, viewer.positions[0].value[0]
+    viewer.handles[0].position = viewer.handles[0].position + [0, 0, 50.0]
+    viewer._drag(0, None)
+    assert viewer.turn(0)
+    assert module.HAND_MOVED in viewer.told.content
+    bare = FrameSource(viewed).see(viewed.drive(), 0, "no_object")
+    np.testing.assert_array_equal(viewer.seen.image, bare)
+    assert viewer.positions[0].value[2] > 50
+    viewer.positions[0].value = (x, 0.0, -50.0)
+    assert viewer.turn(0)
+    np.testing.assert_allclose(viewer.handles[0].position, [x, 0, -50])
+    viewer._put_back(None)
+    assert viewer.turn(0)
+    np.testing.assert_array_equal(viewer.seen.image, first)
+    assert module.HAND_MOVED not in viewer.told.content
+
+
+def test_played_in_time(viewer, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    viewer._toggle(None)
+    viewer.turn(0)
+    assert viewer.slider.value == 0
+    assert not viewer.turn(0)  # not due
+    now[0] += 0.1
+    assert viewer.turn(0)
+    assert (viewer.slider.value, viewer.play.label) == (1, "Pause")
+    viewer._toggle(None)
+    viewer.turn(0)
+    now[0] += 10
+    assert not viewer.turn(0)
+    assert (viewer.slider.value, viewer.play.label) == (1, "Play")
+
+
+def test_an_environment_that_does_not_open_is_told(viewer, monkeypatch):
+    def refuse(*arguments):
+        raise InputError("no server listens")
+
+    monkeypatch.setattr(type(viewer.viewed.world), "open", refuse)
+    viewer.choice.value = "deployment: attack"
+    assert viewer.turn(0)
+    assert viewer.told.content == "**No frame**: no server listens"
+
+
+def test_folders_that_are_no_runs(found_run, tmp_path, capsys):
+    assert cli.main(["view", str(tmp_path / "none")]) == 2
+    assert "holds no finished attack" in capsys.readouterr().err
+    copy = shutil.copytree(found_run, tmp_path / "run")
+    shutil.rmtree(copy / "drives")
+    with pytest.raises(InputError, match="drives: no drives; they were removed"):
+        read_viewed(copy)
+
+
+def test_a_drive_that_there_is_not(viewed):
+    with pytest.raises(InputError, match="'a: b'; one of surrogate: no_object, "):
+        viewed.drive("a: b")
+
+
+def test_a_page_needs_a_name(found_run, capsys):
+    assert cli.main(["view", str(found_run), "-o", "page.png"]) == 2
+    assert "page.png; name an .html file" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port {port}: cannot listen there"):
+            with serving("127.0.0.1", port):
+                pass
+
+
+def test_a_place_that_is_not_here():
+    with pytest.raises(InputError, match="--host 203.0.113.1 .*address of this comp"):
+        with serving("203.0.113.1", 0):
+            pass
+
+
+def test_without_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(SetupError, match=r"mi-nerfattack\[view\]"):
+        with serving("127.0.0.1", 0):
+            pass
+
+
+def test_nobody_makes_it_public():
+    with serving("127.0.0.1", 0) as server:
+        assert server.request_share_url() is None
+        assert server._share_tunnel is None
