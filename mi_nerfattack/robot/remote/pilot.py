@@ -159,6 +159,16 @@ class RemotePilot(AbstractPilot):
                 self._changed.wait(_FIRST_ASK_S)
 
     def _work(self) -> None:
+        try:
+            self._send_on()
+        except Exception as error:  # a thread has nobody else to tell
+            with self._changed:
+                self._failure = (
+                    f"policy at {self._endpoint}: sending failed "
+                    f"({type(error).__name__}: {error})"
+                )
+
+    def _send_on(self) -> None:
         """Send frames, and ask for the time, again and again, until it is closed."""
         due_s = self._clock()
         while True:

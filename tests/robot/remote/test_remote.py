@@ -18,6 +18,7 @@ from mi_nerfattack.robot.devices import (
     DeviceLostError,
     Frame,
 )
+from mi_nerfattack.robot.remote import frames
 from mi_nerfattack.robot.remote.link import TO_POLICY, ZenohLink
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, Kind, Message, Sealer, draw_id
@@ -108,6 +109,20 @@ def stranger(endpoint):
         yield session
     finally:
         session.close()
+
+
+def test_a_frame_that_cannot_be_sent_is_told(monkeypatch):
+    endpoint = free_endpoint()
+
+    def fail(*_: object) -> bytes:
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setattr(frames, "pack_frame", fail)
+    with serving(endpoint), closing(connected(endpoint)) as pilot:
+        pilot.submit(frame(1, 7))
+        wait_for(lambda: pilot._failure)
+        with pytest.raises(DeviceLostError, match="sending failed .ZeroDivisionError"):
+            pilot.newest()
 
 
 def test_decisions_come_back(monkeypatch):
