@@ -1,5 +1,7 @@
 """Build wheel and sdist, and use the wheel in an environment that has nothing else.
 
+Also ask there how much of the package is typed for whoever installs it.
+
 Run by `make dist`, in minutes: most of them install PyTorch, which comes from pip's
 cache once `make test` has fetched it. The arguments are further requirements.
 """
@@ -18,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 DIST, TREE, EMPTY = ROOT / "dist", ROOT / "build" / "tree", ROOT / "build" / "empty"
 MOST_MB = 45
+LEAST_TYPED = 0.9  # of the public names, so that other people's checkers know them
 RENDER = "render bundled:intersection/field.xml -o frame.png --size 48 16 --spp 1"
 
 
@@ -87,6 +90,22 @@ def use(programs: Path, version: str) -> None:
     print(f"installed and run: {frame['seconds']:.1f} s for a frame")
 
 
+def check_types(programs: Path) -> None:
+    """Ask pyright for how many of the installed public names it knows the type."""
+    pyright = Path(sys.executable).with_name("pyright"), "--outputjson"
+    words = *pyright, "--ignoreexternal", "--verifytypes", "mi_nerfattack"
+    known = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
+    with tempfile.TemporaryDirectory() as where:  # it ends with 1 below 100 %
+        done = subprocess.run(words, cwd=where, env=known, stdout=subprocess.PIPE)
+    found = json.loads(done.stdout)["typeCompleteness"]
+    share = found["completenessScore"]
+    print(f"{share:.1%} of the public names are typed, {found['exportedSymbolCounts']}")
+    if share < LEAST_TYPED:
+        raise SystemExit(f"types: less than {LEAST_TYPED:.0%}; annotate what is new")
+
+
 if __name__ == "__main__":
     built = build()
-    use(install(built, *sys.argv[1:]), built.name.split("-")[1])
+    installed = install(built, *sys.argv[1:])
+    use(installed, built.name.split("-")[1])
+    check_types(installed)

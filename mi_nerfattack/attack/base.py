@@ -72,9 +72,9 @@ class AbstractAttack(ABC):
         self.freedom = freedom
         self.sensor = sensor
         self.history: list[IterationRecord] = []
-        self.best_objective = np.inf
-        self.best_mean_m = 0.0
-        self.best_offsets = self._offsets()
+        self.best_objective: float = np.inf
+        self.best_mean_m: float = 0.0
+        self.best_offsets: np.ndarray = self._offsets()
         self.whole = True
 
     @property

@@ -61,8 +61,8 @@ class GradientAttack(AbstractAttack):
     ) -> None:
         freedom = freedom or Freedom()
         super().__init__(rollout, route, initial, freedom, differentiable(rollout.loop))
-        self.schedule = schedule or Schedule(sys.maxsize)
-        self.optimiser = Adam(lr=1.0)
+        self.schedule: Schedule = schedule or Schedule(sys.maxsize)
+        self.optimiser: Adam = Adam(lr=1.0)
         self._colourings: dict[str, AbstractColouring] = {}
         self._best: Parameters = {}  # of the iteration with the least objective
         self._last: IterationRecord | None = None  # what the last update gave

@@ -133,15 +133,17 @@ class BrickField(AbstractField):
         cone: float,
         info: dict[str, str] | None = None,
     ) -> None:
-        self.lower = np.asarray(lower, np.float64)
-        self.upper = np.asarray(upper, np.float64)
+        self.lower: np.ndarray = np.asarray(lower, np.float64)
+        self.upper: np.ndarray = np.asarray(upper, np.float64)
         check_box(self.lower, self.upper)
-        self.step_m, self.cone = float(step_m), float(cone)
+        self.step_m: float = float(step_m)
+        self.cone: float = float(cone)
         check_positive("step_m", self.step_m)
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
         _check_bricks(occupancy, subdivisions, vertices, sky)
-        self.codes, self.info = codes, dict(info or {})
+        self.codes = codes
+        self.info: dict[str, str] = dict(info or {})
         self.occupy(occupancy)
         self.subdivisions = subdivisions
         self.vertices = mi.UInt32(np.ascontiguousarray(vertices, np.uint32))

@@ -105,18 +105,18 @@ class GridField(AbstractField):
         info: dict[str, str] | None = None,
     ) -> None:
         self.layout = layout
-        self.lower = np.asarray(lower, np.float64)
-        self.upper = np.asarray(upper, np.float64)
+        self.lower: np.ndarray = np.asarray(lower, np.float64)
+        self.upper: np.ndarray = np.asarray(upper, np.float64)
         check_box(self.lower, self.upper)
-        self.density_scale = float(density_scale)
+        self.density_scale: float = float(density_scale)
         voxel = float((self.upper - self.lower).max()) / layout.max_resolution
-        self.step_m = voxel if step_m is None else float(step_m)
-        self.cone = 0.0
+        self.step_m: float = voxel if step_m is None else float(step_m)
+        self.cone: float = 0.0
         check_positive("step_m", self.step_m)
         check_positive("density_scale", self.density_scale)
-        self.info = dict(info or {})
+        self.info: dict[str, str] = dict(info or {})
         self.occupy(occupancy or Occupancy.full())
-        self.encoding = HashGridEncoding(
+        self.encoding: HashGridEncoding = HashGridEncoding(
             mi.Float,
             3,
             n_levels=layout.levels,
@@ -127,7 +127,7 @@ class GridField(AbstractField):
             align_corners=True,
             init_scale=0.0,
         )
-        self.n_vertices = self.encoding.n_params // 4
+        self.n_vertices: int = self.encoding.n_params // 4
         self._density = flat_parameter(density, (self.n_vertices,), "density")
         self._texture = flat_parameter(texture, (self.n_vertices, 3), "texture")
         self._pack()

@@ -117,19 +117,19 @@ class NGPField(AbstractField):
         info: dict[str, str] | None = None,
     ) -> None:
         self.layout = layout
-        self.lower = np.asarray(lower, np.float64)
-        self.upper = np.asarray(upper, np.float64)
+        self.lower: np.ndarray = np.asarray(lower, np.float64)
+        self.upper: np.ndarray = np.asarray(upper, np.float64)
         check_box(self.lower, self.upper)
-        self.density_scale = 1.0 / float((self.upper - self.lower).max())
-        self.step_m = float(step_m)
-        self.cone = float(cone)
+        self.density_scale: float = 1.0 / float((self.upper - self.lower).max())
+        self.step_m: float = float(step_m)
+        self.cone: float = float(cone)
         check_positive("step_m", self.step_m)
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
-        self.info = dict(info or {})
+        self.info: dict[str, str] = dict(info or {})
         self.occupy(occupancy or Occupancy.full())
         rng = dr.rng(seed=seed)
-        self.encoding = HashGridEncoding(
+        self.encoding: HashGridEncoding = HashGridEncoding(
             mi.Float,
             3,
             n_levels=layout.levels,

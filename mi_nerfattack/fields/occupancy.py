@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,12 +28,14 @@ class Occupancy:
     """
 
     def __init__(self, cells: np.ndarray, octants: np.ndarray | None = None) -> None:
-        self.cells = np.ascontiguousarray(cells, dtype=bool)
+        self.cells: np.ndarray = np.ascontiguousarray(cells, dtype=bool)
         if self.cells.ndim != 3 or min(self.cells.shape) < 1:
             raise ValueError(f"occupancy: shape {cells.shape}; expected (rx, ry, rz)")
         rx, ry, rz = self.cells.shape
-        self.shape = (rx, ry, rz)
-        self.octants = None if octants is None else octants * self.cells
+        self.shape: tuple[int, int, int] = (rx, ry, rz)
+        self.octants: np.ndarray | None = (
+            None if octants is None else octants * self.cells
+        )
         seen = self.cells if self.octants is None else self.octants > 0
         if seen.all():
             distance = np.zeros(self.shape, np.uint8)
@@ -45,7 +49,7 @@ class Occupancy:
         grids = [distance] if self.octants is None else [distance, self.octants]
         byte = dr.uint8_array_t(mi.Float)
         #: What :meth:`query` reads, (rx ry rz,) each.
-        self.arrays = [byte(grid.ravel()) for grid in grids]
+        self.arrays: list[Any] = [byte(grid.ravel()) for grid in grids]
         dr.make_opaque(self.arrays)
 
     @staticmethod

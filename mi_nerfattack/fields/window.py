@@ -38,7 +38,7 @@ class Window:
 
     def __init__(self, cells: np.ndarray) -> None:
         self.cells = cells
-        self.is_open = bool(cells.all())
+        self.is_open: bool = bool(cells.all())
         self._vertices = mi.UInt32(_vertex_bits(cells, self.is_open).ravel())
         dr.make_opaque(self._vertices)
 

@@ -41,7 +41,7 @@ class AbstractBlackBox(AbstractPolicy):
         output: int | None = None,
     ) -> None:
         self.name = name
-        self.preprocess = preprocess or Preprocess()
+        self.preprocess: Preprocess = preprocess or Preprocess()
         self.control_scale, self.output = float(control_scale), output
 
     @abstractmethod

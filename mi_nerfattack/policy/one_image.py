@@ -24,7 +24,7 @@ class OneImage(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.network = network
-        self.axes = [tuple(shape).index(-1) for shape in recurrent]
+        self.axes: list[int] = [tuple(shape).index(-1) for shape in recurrent]
 
     def forward(
         self, image: torch.Tensor, *rest: torch.Tensor

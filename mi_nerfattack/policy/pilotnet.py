@@ -45,7 +45,7 @@ class PilotNet(nn.Module):
         if unit not in ("rad/s", "rad"):
             raise InputError(f"PilotNet.unit: {unit!r}; 'rad/s' or 'rad'")
         self.goals = goals
-        self.max_control = float(max_control)
+        self.max_control: float = float(max_control)
         self.unit = unit
         self.features = nn.Sequential(
             nn.Conv2d(3, 24, 5, stride=2),

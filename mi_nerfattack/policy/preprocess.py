@@ -41,7 +41,7 @@ class Crop(AbstractTransform):
     """
 
     def __init__(self, top: int, bottom: int, left: int, right: int) -> None:
-        self.margins = top, bottom, left, right
+        self.margins: tuple[int, int, int, int] = top, bottom, left, right
         if min(self.margins) < 0:
             raise InputError(f"crop_px: {list(self.margins)}; none below 0")
 
@@ -63,7 +63,7 @@ class FractionalCrop(AbstractTransform):
     """
 
     def __init__(self, top: float, bottom: float, left: float, right: float) -> None:
-        self.parts = top, bottom, left, right
+        self.parts: tuple[float, float, float, float] = top, bottom, left, right
         if min(self.parts) < 0 or top + bottom >= 1 or left + right >= 1:
             raise InputError(
                 f"crop_fraction: {list(self.parts)}; none below 0, and top with "
@@ -215,7 +215,7 @@ class Normalise(AbstractTransform):
     ) -> None:
         if not scale or not all(value > 0 for value in std):
             raise InputError(f"scale {scale}, std {list(std)}; not 0, and positive")
-        self.scale = float(scale)
+        self.scale: float = float(scale)
         self.mean = torch.tensor(mean, dtype=torch.float64)[:, None, None]
         self.std = torch.tensor(std, dtype=torch.float64)[:, None, None]
 
@@ -275,7 +275,7 @@ class Preprocess:
     ) -> None:
         if min(frames, stride) < 1:
             raise InputError(f"frames {frames}, stride {stride}; at least 1 each")
-        self.transforms = tuple(transforms)
+        self.transforms: tuple[AbstractTransform, ...] = tuple(transforms)
         self.frames, self.stride, self.layout = frames, stride, layout
 
     @property

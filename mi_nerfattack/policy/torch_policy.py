@@ -62,11 +62,11 @@ class TorchPolicy(AbstractPolicy):
         self.module = module.eval()
         for parameter in module.parameters():  # a ScriptModule has no requires_grad_
             parameter.requires_grad_(False)
-        self.goal = _own_goal(module) if goal is None else goal
-        self.preprocess = preprocess or Preprocess()
-        self.recurrent = check_hidden(recurrent)
+        self.goal: AbstractGoal = _own_goal(module) if goal is None else goal
+        self.preprocess: Preprocess = preprocess or Preprocess()
+        self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
         self.control_scale, self.output = float(control_scale), output
-        self.name = name or type(module).__name__
+        self.name: str = name or type(module).__name__
         self._checked = False
 
     def control(self, image: Any, goal: Any) -> Any:

@@ -24,7 +24,7 @@ class PosedField:
 
     def __init__(self, field: AbstractField, pose: Pose | None = None) -> None:
         self.field = field
-        self.pose = pose or Pose.identity()
+        self.pose: Pose = pose or Pose.identity()
         self.move(self.pose.rotation, self.pose.translation)
         self._inverse_scale = mi.Float(1 / self.pose.scale)
         self._step = mi.Float(field.step_m * self.pose.scale)
@@ -41,7 +41,7 @@ class PosedField:
             rotation: (3, 3), field to world.
             translation: (3,) of the field's origin, metres in the world.
         """
-        self.placed = Pose(rotation, translation, self.pose.scale)
+        self.placed: Pose = Pose(rotation, translation, self.pose.scale)
         rotation = np.asarray(rotation, np.float32)
         self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
         self._origin = mi.Point3f(*map(float, translation))

@@ -29,7 +29,8 @@ class AbstractSceneMarch(ABC):
     """
 
     def __init__(self, posed: PosedField, stop: float) -> None:
-        self.posed, self.stop = posed, stop
+        self.posed = posed
+        self.stop = stop
         self._orders: dict[tuple[int, int], mi.UInt32] = {}
         self._frozen = freeze_method(self._record, self._state)
 

@@ -100,8 +100,8 @@ class SplatBackground(AbstractBackdrop):
     """
 
     def __init__(self, splats: Splats, pose: Pose | None = None) -> None:
-        self.name = splats.source
-        self.pose = pose or Pose.identity()
+        self.name: str = splats.source
+        self.pose: Pose = pose or Pose.identity()
         order, groups = _group(splats)
         centers, scales, rotations = _in_world(splats, self.pose)
         self._terms = splats.harmonics.shape[1]

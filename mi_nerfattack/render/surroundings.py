@@ -94,7 +94,9 @@ class Surroundings:
                 f"variant {mi.variant()!r}: a nested integrator behind the fields of a "
                 "sensor needs colour; set MI_NERFATTACK_VARIANT=llvm_ad_rgb"
             )
-        self.scene, self.behind, self.seed = scene, behind, seed
+        self.scene = scene
+        self.behind = behind
+        self.seed = seed
         self._sampler = sampler
         reach = (clip.far_m - clip.near_m) * ray_lengths(camera).ravel()
         self._reach = mi.Float(reach.tolist())

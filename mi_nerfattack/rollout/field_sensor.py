@@ -82,17 +82,19 @@ class FieldSensor(AbstractDifferentiableSensor):
             raise ValueError(
                 "objects: two of them share a field, and so a texture; load it twice"
             )
-        self.scene = tuple(scene) if isinstance(scene, Sequence) else (scene,)
-        self.objects = list(objects)
+        self.scene: tuple[Layer, ...] = (
+            tuple(scene) if isinstance(scene, Sequence) else (scene,)
+        )
+        self.objects: list[PosedField] = list(objects)
         self.camera = camera
-        self.mount = mount or CameraMount()
+        self.mount: CameraMount = mount or CameraMount()
         self.jitter_seed, self.stop = jitter_seed, stop
-        self.composite = composite or DepthComposite()
+        self.composite: AbstractComposite = composite or DepthComposite()
         self.composite.check(self._fields)
         self.surroundings, self.clip = surroundings, clip or Clip()
         near = self.clip.near_m * ray_lengths(camera).ravel()
         self._near = mi.Float(near.tolist()) if self.clip.near_m else None
-        self.renders = 0
+        self.renders: int = 0
         self._offsets = np.zeros((len(objects), 6))
         self._wrenches: list[Any] | None = None
         # Tracing these in Python takes longer than running them.

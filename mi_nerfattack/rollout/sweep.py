@@ -70,7 +70,9 @@ class StepRecorder:
         on_period: Callable[[int, list[np.ndarray]], None] | None = None,
     ) -> None:
         self.on_period = on_period
-        self.directions = [np.asarray(d, np.float32).ravel() for d in directions]
+        self.directions: list[np.ndarray] = [
+            np.asarray(d, np.float32).ravel() for d in directions
+        ]
         self._before: list[np.ndarray] = []
         self._rows: list[tuple[list[float], list[float]]] = []
 

@@ -116,7 +116,7 @@ class CameraSection(Section):
     height_m: Positive = 1.4
     forward_m: Finite = 0.5
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
-    later: ClassVar = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    later: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
     def build(self) -> tuple[Camera, CameraMount]:
         """Make intrinsics and mount."""

@@ -47,7 +47,9 @@ _WORDS = {"tuple_type": "must be an array", "model_type": "must be a table"}
 class Section(BaseModel):
     """A table of the file, or the keys of one kind in it; unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, strict=True
+    )
 
     #: Keys that came when there were scenarios already. At their defaults they do not
     #: count, so that what was made before them is still known by its digest.

@@ -43,10 +43,12 @@ class Transition:
             raise ValueError(f"substeps: {substeps}; at least 1")
         if delay < 0:
             raise ValueError(f"delay: {delay}; at least 0 integration steps")
-        self.dynamics, self.integrator = dynamics, integrator
-        self.dt = period / substeps
+        self.dynamics = dynamics
+        self.integrator = integrator
+        self.dt: float = period / substeps
         self.substeps = substeps
-        self.lag, self.late = divmod(delay, substeps)
+        self.lag: int = delay // substeps
+        self.late: int = delay % substeps
         calls = (self._advance, self._vjp, self._jvp)
         if dynamics.recordable:
             calls = tuple(freeze_method(call, self._sizes) for call in calls)
@@ -59,7 +61,9 @@ class Transition:
         """
         return period - self.lag - 1, period - self.lag
 
-    def controls(self, controls: Sequence[Any], period: int, like: Any) -> tuple:
+    def controls(
+        self, controls: Sequence[Any], period: int, like: Any
+    ) -> tuple[Any, ...]:
         """Pick the older and the newer control (n,) out of a drive's.
 
         Args:
@@ -83,13 +87,15 @@ class Transition:
             self.integrator.check(self.dynamics, before, after, control, self.dt)
         return path[-1]
 
-    def vjp(self, state: Any, older: Any, newer: Any, cotangent: Any) -> tuple:
+    def vjp(
+        self, state: Any, older: Any, newer: Any, cotangent: Any
+    ) -> tuple[Any, ...]:
         """Multiply (m, n) by the derivatives: those by state, older, newer."""
         result = self._vjp_call(state, older, newer, cotangent)
         dr.eval(result)
         return result
 
-    def jvp(self, primals: tuple, tangents: tuple) -> Any:
+    def jvp(self, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
         """Return the tangent (m, n) from those of state, older and newer control."""
         result = self._jvp_call(primals, tangents)
         dr.eval(result)

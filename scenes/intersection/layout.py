@@ -5,6 +5,8 @@ The main road runs along x, the side road leaves it to the south. Lengths in met
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 LANE_WIDTH = 3.5
@@ -76,7 +78,7 @@ def _turn(start, corner, end, radius: float) -> np.ndarray:
     return curve + lead + np.maximum(s - first - arc, 0.0) * after
 
 
-def routes() -> dict[str, dict]:
+def routes() -> dict[str, dict[str, Any]]:
     """Return the three routes as routes.json holds them."""
     half = LANE_WIDTH / 2
     x = np.arange(-25.0, 35.0 + ROUTE_SPACING / 2, ROUTE_SPACING)

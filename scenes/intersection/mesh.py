@@ -88,7 +88,9 @@ def box_faces(low: np.ndarray, high: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.array(value) for name, value in corners.items()}
 
 
-def prism(radii: list[float], heights: list[float], sides: int) -> tuple:
+def prism(
+    radii: list[float], heights: list[float], sides: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the smooth side wall of a solid of revolution: vertices, faces.
 
     Args:

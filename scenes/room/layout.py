@@ -5,6 +5,8 @@ The room's middle is the origin, x runs along its longer walls. Lengths in metre
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 LENGTH, WIDTH, HEIGHT = 6.0, 5.0, 2.7
@@ -48,7 +50,7 @@ def track() -> np.ndarray:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
 
 
-def routes() -> dict[str, dict]:
+def routes() -> dict[str, dict[str, Any]]:
     """Return the loop as routes.json holds it."""
     return {
         "square": {

@@ -53,7 +53,7 @@ class LowFrequency:
         ]
         sizes = [int(np.prod(shape)) for shape in self._shapes]
         self._ends = np.cumsum(sizes)
-        self.count = int(self._ends[-1])
+        self.count: int = int(self._ends[-1])
 
     def propose(self, coefficients: np.ndarray) -> Proposal:
         """Return what coefficients make: (count,), by x, y, z, channel, in C order."""

@@ -69,7 +69,7 @@ class PriorSearch(AbstractSearch):
                 "and at least one candidate"
             )
         self.basis, self.reach = basis, reach
-        self.scale = 1.0
+        self.scale: float = 1.0
         self._prior, self._candidates, self._seed = prior, candidates, seed
         self._points = np.zeros((0, basis.count))  # what was told, then candidates
         self._guesses = np.zeros(0)  # the prior's, of the same

@@ -97,7 +97,7 @@ class Colours(AbstractColouring):
                 f"resolution: {resolution}; the coarsest level of the object has "
                 f"{field.levels()[0].resolution} vertices an edge"
             )
-        self.level = levels[-1]
+        self.level: GridLevel = levels[-1]
         self.extent = field.upper - field.lower
         self.smoothing = smoothing
         self._original = field.texture.numpy().copy()
@@ -106,7 +106,7 @@ class Colours(AbstractColouring):
             constraints or Constraints(), field, self.level, colours
         )
         self._raw = _logit(colours)
-        self.start = self._allowed.start
+        self.start: np.ndarray = self._allowed.start
 
     def texture(self, value: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.texture`."""

@@ -112,7 +112,7 @@ class Allowed:
             self._lower = np.full_like(original, max(low, MARGIN))
         if high is not None:
             self._upper = np.full_like(original, min(high, 1 - MARGIN))
-        self.start = np.clip(original, self._lower, self._upper)
+        self.start: np.ndarray = np.clip(original, self._lower, self._upper)
         if gamut := constraints.gamut:
             self.start = gamut.draw(self.start, gamut.centre).astype(np.float32)
         if constraints.linf is not None:

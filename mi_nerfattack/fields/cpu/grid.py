@@ -34,7 +34,7 @@ class PackedGrid:
     def __init__(self, encoding: HashGridEncoding) -> None:
         self._levels = [_Level(encoding, k) for k in range(encoding.n_levels)]
         self._words = encoding.n_features_per_level // 2
-        self.table = pack_words(dr.detach(encoding.data).numpy())
+        self.table: AbstractWords = pack_words(dr.detach(encoding.data).numpy())
 
     def encode(self, unit: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """Evaluate the features at points.

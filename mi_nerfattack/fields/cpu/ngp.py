@@ -48,7 +48,7 @@ class PackedNGP:
         self._joined = np.vstack([last[:1], joined]).astype(np.float32)
         matrices = (*hidden, self._joined, self._view, *rest)
         parts = b"".join(np.ascontiguousarray(part).tobytes() for part in matrices)
-        self.digest = hashlib.sha256(parts).hexdigest()
+        self.digest: str = hashlib.sha256(parts).hexdigest()
 
     @staticmethod
     def suits(field: NGPField) -> bool:

@@ -31,7 +31,7 @@ class SharedRows:
         self.array = dr.zeros(mi.Float, height * width)
         dr.make_opaque(self.array)
         dr.sync_thread()
-        self.view = rows(self.array, width)
+        self.view: np.ndarray = rows(self.array, width)
 
 
 def rows(values: mi.Float, width: int) -> np.ndarray:

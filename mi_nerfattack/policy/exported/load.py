@@ -34,8 +34,8 @@ class ExportedNetwork(torch.nn.Module):
         """Take a program over; `name` is for messages."""
         super().__init__()
         self.program, self.name = program.module(), name
-        self.sizes = _image_sizes(program)
-        self.batch = self.sizes[0] if self.sizes else None
+        self.sizes: tuple[int | None, ...] = _image_sizes(program)
+        self.batch: int | None = self.sizes[0] if self.sizes else None
 
     def train(self, mode: bool = True) -> ExportedNetwork:
         """Do nothing: an exported program cannot change its mode."""

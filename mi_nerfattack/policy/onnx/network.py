@@ -68,19 +68,21 @@ class OnnxNetwork(torch.nn.Module):
         """Take a ``ModelProto`` apart; `name` is for messages."""
         super().__init__()
         self.name = name
-        self.opset = _opset(model, name)
+        self.opset: int = _opset(model, name)
         graph = model.graph
         self.whole: dict[str, torch.Tensor] = {}
         self.floating: dict[str, str] = {}
         nodes = [_node(node, name) for node in graph.node]
         self._read_constants(graph, nodes)
-        self.nodes = [node for node in nodes if node.operator != "Constant"]
+        self.nodes: list[Node] = [node for node in nodes if node.operator != "Constant"]
         known = {*self.whole, *self.floating}
-        self.inputs = [_input(i) for i in graph.input if i.name not in known]
-        self.outputs = [output.name for output in graph.output]
+        self.inputs: list[Input] = [
+            _input(i) for i in graph.input if i.name not in known
+        ]
+        self.outputs: list[Any] = [output.name for output in graph.output]
         if not self.inputs or not self.inputs[0].sizes:
             raise InputError(f"{name}: has no image among its inputs")
-        self.batch = self.inputs[0].sizes[0]
+        self.batch: int | None = self.inputs[0].sizes[0]
         self._measured: set[tuple[torch.Size, ...]] = set()
 
     def forward(self, *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -90,7 +90,7 @@ class FrameRenderer:
     ) -> None:
         if spp is not None and spp < 1:
             raise InputError(f"spp: {spp}; at least 1")
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self.scene = load_scene(path, parameters, size_px)
         self.sensor = _pick_sensor(path, self.scene, sensor)
         if self.scene.integrator() is None:
