@@ -21,6 +21,7 @@ from mi_nerfattack.commands.shared.result import Result
 
 WITHOUT_FIGURES = {
     "monitor": "serves a page until Ctrl-C, and tells its address",
+    "view": "serves a page until Ctrl-C, or writes it; tells its address, or its path",
     "bench quality": "runs other commands, and shows what they print",
     "bench table2": "writes a page from a sweep's table, and tells its path",
     "bench methods": "writes a page from a sweep's table, and tells its path",
