@@ -42,8 +42,8 @@ class Occupancy:
         else:
             from scipy import ndimage  # slow to import
 
-            distance = ndimage.distance_transform_cdt(~seen, metric="chessboard")
-            distance = np.minimum(distance, MAX_DISTANCE).astype(np.uint8)
+            far: Any = ndimage.distance_transform_cdt(~seen, metric="chessboard")
+            distance = np.minimum(far, MAX_DISTANCE).astype(np.uint8)
         grids = [distance] if self.octants is None else [distance, self.octants]
         byte = dr.uint8_array_t(mi.Float)
         #: What :meth:`query` reads, (rx ry rz,) each.
