@@ -12,6 +12,7 @@ import pytest
 from helpers.modes import obeyed_modes
 
 from mi_nerfattack.cli import main
+from mi_nerfattack.commands import COMMANDS
 
 SCENES = Path(__file__).parents[2] / "scenes"
 ROOM = SCENES / "room"
@@ -30,6 +31,7 @@ VERBS = {
     "retrain": ["retrain", "absent", "--data", "absent", "-o"],
     "export": ["export", SCENES / "cube/field.safetensors", "-o"],
     "report": ["report", "absent", "-o"],
+    "view": ["view", "absent", "-o"],
     "overlay": ["overlay", "absent", "absent", "-o"],
     "check": ["check", SCENES / "demo.toml", "-o"],
     "transfer": ["transfer", "absent", "-o"],
@@ -40,8 +42,19 @@ VERBS = {
     "calibrate": ["calibrate", "/dev/absent", "-o"],
     "drive": ["drive", "--policy", "expert", "--simulated", "--log"],
 }
-ENDINGS = {"render": "exr", "report": "html", "check": "png", "drive": "mcap"}
+ENDINGS = {
+    "render": "exr",
+    "report": "html",
+    "view": "html",
+    "check": "png",
+    "drive": "mcap",
+}
 FIELDS = ("fit", "bake", "asset", "train", "retrain", "export")
+
+
+def test_every_verb_that_writes_is_tried():
+    without_output = {"doctor", "monitor", "serve-policy"}
+    assert {words[0] for words in VERBS.values()} == COMMANDS.keys() - without_output
 
 
 @pytest.mark.parametrize("verb", VERBS)
