@@ -188,7 +188,10 @@ class RunScene:
         """
         if self._text is None:
             self._text = self._scene.add_label(
-                "/camera/text", text, position=(0.0, -1.7 * self._high, self._ahead)
+                "/camera/text",
+                text,
+                position=(0.0, -1.8 * self._high, self._ahead),
+                anchor="bottom-center",
             )
         self._text.text = text
         if apart is None:

@@ -34,6 +34,7 @@ CLOUD = (
     "Points: where rays of the drives' own camera end in the surrogate's field. "
     "Objects: the surface where their fields are half opaque, in their own colours."
 )
+SEEN, WOULD_SEE = "What the policy saw", "What the policy would see"
 HAND_MOVED = (
     "**Moved by hand**: the car stays on the recorded drive, and no policy saw this."
 )
@@ -118,6 +119,7 @@ class Viewer:
             self.told.content = f"**No frame**: {err}"
             return
         self.seen.image = seen
+        self.seen.label = WOULD_SEE if moved else SEEN
         self.scene.look_from(self.viewed.cameras(drive)[step], seen)
         self.apart.visible = apart is not None
         if apart is not None:
@@ -133,7 +135,7 @@ class Viewer:
         self.told = gui.add_markdown("")
         camera = self.viewed.world.surrogate.camera
         black = np.zeros((camera.height, camera.width, 3), np.uint8)
-        self.seen = gui.add_image(black, label="What the policy saw", format="png")
+        self.seen = gui.add_image(black, label=SEEN, format="png")
         label = "Where the attack acts: difference to the objects' own textures"
         self.apart = gui.add_image(black, label=label, format="png")
         for handle in (self.choice, self.slider):
