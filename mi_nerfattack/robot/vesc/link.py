@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import time
 from threading import Condition, Event, Lock, Thread
 from typing import NamedTuple
@@ -44,7 +46,7 @@ class SerialLink:
         self.port = port
         try:
             self._serial = serial.Serial(
-                port, baudrate, timeout=PAUSE_S, write_timeout=WRITE_S, exclusive=True
+                port, baudrate, timeout=PAUSE_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as err:
             found = ", ".join(sorted(p.device for p in list_ports.comports()))
@@ -69,9 +71,19 @@ class SerialLink:
         raw = b"".join(map(encode_frame, payloads))
         with self._writing:
             try:
-                self._serial.write(raw)
+                self._write(raw)
             except Exception as err:  # pyserial has no common class of its own
                 raise DeviceLostError(f"{self.port}: {err}; check its cable") from err
+
+    def _write(self, raw: bytes) -> None:
+        """Write all; a busy computer's pause is no fault of the port.
+
+        pyserial's own time limit also refuses what has long gone out.
+        """
+        while raw:
+            if not select.select([], [self._serial.fileno()], [], WRITE_S)[1]:
+                raise TimeoutError(f"takes nothing for {WRITE_S:g} s")
+            raw = raw[os.write(self._serial.fileno(), raw) :]
 
     def newest(self, kind: Id) -> Answer | None:
         """Return the newest answer of a kind; None before the first.

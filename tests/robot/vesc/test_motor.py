@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import select
 import signal
 import subprocess
 import sys
 import termios
+import time
 from collections.abc import Callable
 from contextlib import closing
 from typing import Any
@@ -20,7 +22,7 @@ from helpers.waiting import wait_for
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.robot.devices import Command, DeviceLostError, MotorValues
 from mi_nerfattack.robot.vesc.calibration import Calibration
-from mi_nerfattack.robot.vesc.link import SerialLink
+from mi_nerfattack.robot.vesc.link import WRITE_S, SerialLink
 from mi_nerfattack.robot.vesc.motor import VescMotor
 
 
@@ -151,6 +153,37 @@ def test_a_brake_is_sent_where_nothing_is_heard(start, monkeypatch, error):
         wait_for(is_lost)
         motor.brake()
         car.wait_for_line(event="command 7", mode="brake")
+
+
+@pytest.fixture
+def line():
+    """A link, and the descriptor of its other end, which nobody reads."""
+    far, near = os.openpty()
+    with closing(SerialLink(os.ttyname(near))) as link:
+        yield link, far
+    os.close(near)
+    os.close(far)
+
+
+def test_a_pause_of_the_computer_is_no_fault_of_the_port(line, monkeypatch):
+    link, far = line
+    write = os.write
+
+    def pause(descriptor: int, data: bytes) -> int:
+        count = write(descriptor, data)
+        time.sleep(2 * WRITE_S)
+        return count
+
+    monkeypatch.setattr(os, "write", pause)
+    link.send(b"abc")
+    assert b"abc" in os.read(far, 100)
+
+
+def test_a_port_that_takes_nothing_is_lost(line):
+    link, _ = line
+    with pytest.raises(DeviceLostError, match="takes nothing for 0.1 s; check its"):
+        for _ in range(10_000):
+            link.send(bytes(250))
 
 
 @pytest.fixture
