@@ -60,7 +60,8 @@ class Viewer:
         self.moved: dict[int, np.ndarray] = {}
         self._changed = threading.Event()
         self._changed.set()
-        self._due: float | None = None
+        self._is_playing = False
+        self._due = 0.0  # when the next frame is, while playing
         gui = server.gui
         gui.set_panel_label(viewed.world.scenario.name)
         self._add_time(gui, drive)
@@ -84,15 +85,14 @@ class Viewer:
         Returns:
             whether anything was rendered.
         """
-        if self._due is not None:
+        if self._is_playing:
             patience_s = min(patience_s, max(0.0, self._due - time.monotonic()))
         if not self._changed.wait(patience_s):
-            if self._due is None or time.monotonic() < self._due:
+            if not self._is_playing or time.monotonic() < self._due:
                 return False
             self.slider.value = following(self.slider.value, int(self.slider.max))
         self._changed.clear()
-        if self._due is not None:
-            self._due = time.monotonic() + self.viewed.world.scenario.vehicle.dt_s
+        self._due = time.monotonic() + self.viewed.world.scenario.vehicle.dt_s
         self._render()
         return True
 
@@ -190,8 +190,8 @@ class Viewer:
         self._changed.set()
 
     def _toggle(self, event: Any) -> None:
-        self._due = time.monotonic() if self._due is None else None
-        self.play.label = "Play" if self._due is None else "Pause"
+        self._is_playing = not self._is_playing
+        self.play.label = "Pause" if self._is_playing else "Play"
         self._ask(event)
 
     def _drag(self, number: int, event: Any) -> None:
