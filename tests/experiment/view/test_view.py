@@ -99,8 +99,12 @@ def test_thinned_keeps_one_point_a_cell():
     assert 0 < len(thinned(Cloud(points, colours), 0.01, 100).points) <= 100
 
 
-def test_cloud_is_of_the_scene_alone(contents):
+def test_cloud_is_of_the_scene_alone(contents, viewed):
     points = contents.cloud.points
+    viewed.show("attack", {0: np.array([0, 0, 50.0, 0, 0, 0])})
+    without = scene_cloud(viewed.world, contents.drive.states[:1])
+    np.testing.assert_array_equal(points, without.points)
+    np.testing.assert_array_equal(contents.cloud.colours, without.colours)
     assert len(points) > 50
     assert np.isfinite(points).all()
     start = contents.drive.states[0]
