@@ -172,6 +172,8 @@ class FollowServer:
                 f"{endpoint}: cannot listen there ({error.strerror}); give another "
                 "--listen"
             ) from error
+        # from now on, for `close` waits for its end
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     @property
     def address(self) -> str:
@@ -180,13 +182,11 @@ class FollowServer:
         return f"http://{Endpoint(str(host), int(port))}/"
 
     def run(self) -> None:
-        """Serve until `close`, or until the tracker's end.
+        """Tell of the camera until `close`, or until the tracker's end.
 
         Raises:
             DeviceLostError: no more poses will come.
         """
-        thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-        thread.start()
         while not self._closed.wait(STALE_S / 5):
             self._tell(self._tracker.newest(self._body))
 

@@ -197,6 +197,17 @@ def test_a_port_that_is_taken_is_one_message(served):
         )
 
 
+def test_it_ends_though_it_was_never_run():
+    """As where nobody can be told its address, or by Ctrl-C meanwhile."""
+    standing = StandingScreen.on_face(SCREEN, BOX, "front")
+    here = Endpoint("127.0.0.1", 0)
+    server = FollowServer(here, "", standing, BOX, Told(), "car", np.zeros(3), print)
+    thread = threading.Thread(target=server.close, daemon=True)
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium to show a page")
 def test_a_browser_shows_what_the_camera_would_see(tmp_path):
