@@ -140,7 +140,7 @@ def test_all_devices_are_asked(kind, held, code, message, capsys):
     bench.held = held[0]
     bench.at(2.0, lambda: setattr(bench, "held", held[1]))
     rig = rig_of(bench, kind(bench), StandInEnable(bench))
-    assert _check(rig, SETTINGS) == code
+    assert _check(rig, SETTINGS).tell(as_json=False) == code
     told = capsys.readouterr().out.splitlines()[1:]
     assert message in "\n".join(told)
     assert sum("ready" in line for line in told) == 5 - code and not bench.events
@@ -154,8 +154,9 @@ def test_a_drive_that_sent_nothing_leaves_no_log(tmp_path, is_simulated, capsys)
     if is_simulated:  # Ctrl-C before the button is pressed
         bench.at(0.5, lambda: signal.raise_signal(signal.SIGINT))
         rig = rig_of(bench, StandInMotor(bench), StandInEnable(bench))
-        stop, _ = _drive(rig, config, SETTINGS)
+        stop, _, written = _drive(rig, config, SETTINGS)
         assert stop.cause is Cause.INTERRUPTED
+        assert written == {"log": None, "messages": {}}
     else:  # it is let go while the wheels turn
         rig = rig_of(bench, TurningMotor(bench), Pad(3))
         with pytest.raises(InputError, match="let go"):
