@@ -284,14 +284,16 @@ def test_fit_ends_with_its_comparison(place, tmp_path, capsys):
     output = tmp_path / "wall.safetensors"
     kept = tmp_path / "wall.checkpoint.safetensors"
     kept.write_bytes(b"")
-    finish(result, images, output, {"source": "x"}, True, kept, against=against)
+    about = {"source": "x"}
+    found = finish(result, images, output, about, kept, against=against)
+    assert found.tell(as_json=True) == 0
     assert not kept.exists()
     table = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert table["psnr_heldout_db"] == psnr and table["steps"] == 25
     assert table["compare"]["routes"]["ahead"]["frames"] == 5
     saved = load_field(output)
     assert isinstance(saved, GridField) and saved.info["fit.source"] == "x"
-    finish(result, images, output, {}, False, kept)
+    assert finish(result, images, output, {}, kept).tell(as_json=False) == 0
     assert "good enough as an object to attack" in capsys.readouterr().out
     assert (tmp_path / "wall.report" / "report.html").is_file()
 

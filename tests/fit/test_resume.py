@@ -134,7 +134,8 @@ def test_interrupted_command_is_resumed(tmp_path, monkeypatch, capsys):
             Fit(folder, output, **settings).run()
     kept = tmp_path / "field.checkpoint.safetensors"
     assert sorted(tmp_path.iterdir()) == [kept, folder]
-    assert Fit(folder, output, resume=True, **settings).run().code == 0
+    resumed = Fit(folder, output, resume=True, **settings).run()
+    assert resumed.tell(as_json=False) == 0
     assert output.is_file() and not kept.exists()
     assert "50 steps" in capsys.readouterr().out
 
