@@ -62,7 +62,8 @@ class PolicyServer:
         lost_s: silence after which another car may take over, seconds.
 
     Attributes:
-        ages_s: of frames when they were decided on, by the car's offset.
+        decisions: that were made.
+        ages_s: of their frames then, by the car's offset; of the newest 100,000.
         refused: messages whose seal was wrong.
 
     Raises:
@@ -88,7 +89,7 @@ class PolicyServer:
         self._car: _Car | None = None
         self._hello: bytes | None = None
         self.ages_s: deque[float] = deque(maxlen=_KEPT)
-        self.refused = 0
+        self.decisions = self.refused = 0
         self._link = ZenohLink(endpoint, True, self._receive)
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> None:
@@ -127,7 +128,7 @@ class PolicyServer:
         if self.ages_s:
             ages = np.quantile(self.ages_s, [0.5, 0.99]).tolist()
         names = "decisions", "age_median_s", "age_99_s", "refused"
-        return dict(zip(names, (len(self.ages_s), *ages, self.refused), strict=True))
+        return dict(zip(names, (self.decisions, *ages, self.refused), strict=True))
 
     def _has_news(self) -> bool:
         car = self._car
@@ -211,9 +212,10 @@ class PolicyServer:
         self, car: _Car, frame: SentFrame, control: float, received: float
     ) -> None:
         decided = self._clock()
+        self.decisions += 1
+        self.ages_s.append(decided - frame.ahead_s - frame.time_s)
         sent = SentDecision(control, frame.index, frame.time_s, received, decided)
         self._send(car.link, Kind.DECISION, sent.pack())
-        self.ages_s.append(decided - frame.ahead_s - frame.time_s)
 
     def _send(self, link: bytes, kind: Kind, body: bytes) -> None:
         with self._changed:

@@ -19,6 +19,7 @@ from mi_nerfattack.robot.devices import (
     Frame,
 )
 from mi_nerfattack.robot.remote import frames
+from mi_nerfattack.robot.remote import server as remote_server
 from mi_nerfattack.robot.remote.link import TO_POLICY, ZenohLink
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, Kind, Message, Sealer, draw_id
@@ -132,6 +133,7 @@ def test_decisions_come_back(monkeypatch):
     monkeypatch.setattr(
         ZenohLink, "send", lambda link, raw: (sent.append(raw), send(link, raw))[1]
     )
+    monkeypatch.setattr(remote_server, "_KEPT", 2)  # ages, not decisions
     endpoint = free_endpoint()
     with serving(endpoint) as (server, notices, made):
         with closing(connected(endpoint)) as pilot:
@@ -148,7 +150,7 @@ def test_decisions_come_back(monkeypatch):
                 assert whole == pytest.approx(decision.time_s - taken)
                 assert min(delays.there_s, delays.back_s) >= -error - 1e-6
             assert abs(pilot.offset.ahead_s - AHEAD_S) <= pilot.offset.error_s + 1e-6
-            assert made[0].seen == [20, 90, 50] and len(server.ages_s) == 3
+            assert made[0].seen == [20, 90, 50] and len(server.ages_s) == 2
             assert server.summary().startswith("3 decisions, on frames ")
             # what was recorded, and what is made up, moves nothing
             forged = Sealer(b"x" * 16).seal(
