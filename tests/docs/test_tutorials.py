@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+PAGES = [p for p in sorted((DOCS / "tutorials").glob("*.md")) if p.stem != "index"]
 
 
 def follow(*words: object) -> subprocess.CompletedProcess[str]:
