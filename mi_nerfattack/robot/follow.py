@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import socket
 import sys
@@ -18,9 +16,13 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.pages.elements import render
+from mi_nerfattack.report.pages.elements import address, render
 from mi_nerfattack.robot.attacked import FACES, AttackedBox
-from mi_nerfattack.robot.devices import AbstractTracker, DeviceLostError
+from mi_nerfattack.robot.devices import (
+    AbstractTracker,
+    DeviceLostError,
+    TrackedPose,
+)
 from mi_nerfattack.robot.monitor import Screen, levels_sent
 from mi_nerfattack.robot.remote.sealed import Endpoint
 
@@ -118,10 +120,8 @@ def follow_page(
     """
     screen, pictures = standing.screen, {}
     for face, image in box.images.items():
-        buffer = io.BytesIO()
-        Image.fromarray(levels_sent(image, screen.gamma)).save(buffer, "PNG")
-        data = base64.b64encode(buffer.getvalue()).decode("ascii")
-        pictures[face] = (*image.shape[1::-1], data)
+        sent = Image.fromarray(levels_sent(image, screen.gamma))
+        pictures[face] = (*sent.size, address(sent, "PNG"))
     return render(
         "monitor.html.j2",
         title=f"{box.name}, run {box.run}, digest {box.digest[:16]}",
@@ -197,7 +197,7 @@ class FollowServer:
             self._server.shutdown()
             self._server.server_close()
 
-    def _tell(self, pose: Any) -> None:
+    def _tell(self, pose: TrackedPose | None) -> None:
         lost = pose is None or time.monotonic() - pose.time_s > STALE_S
         if lost and not self._lost:
             self._say(

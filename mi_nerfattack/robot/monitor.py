@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from dataclasses import dataclass
 
@@ -13,7 +11,7 @@ from PIL import Image
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.capture.posed_images import resize_area
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.report.pages.elements import render
+from mi_nerfattack.report.pages.elements import address, render
 from mi_nerfattack.robot.net import MM
 
 _MAX_PX = 16384
@@ -140,8 +138,6 @@ def screen_page(image: np.ndarray, title: str) -> str:
         image: (height, width, 3), uint8, as sent to the monitor.
         title: of the page.
     """
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
     height, width = image.shape[:2]
     return render(
         "monitor.html.j2",
@@ -149,7 +145,7 @@ def screen_page(image: np.ndarray, title: str) -> str:
         width=width,
         height=height,
         background="#" + image[0, 0].tobytes().hex(),
-        picture=base64.b64encode(buffer.getvalue()).decode("ascii"),
+        picture=address(Image.fromarray(image), "PNG"),
     )
 
 

@@ -30,17 +30,18 @@ def render(template: str, **values: Any) -> str:
     return environment.get_template(template).render(values)
 
 
-def address(image: Image.Image, **options: Any) -> Markup:
-    """Return the address of an image that holds it: WebP in a `data:` URI.
+def address(image: Image.Image, kind: str = "WEBP", **options: Any) -> Markup:
+    """Return the address of an image that holds it, a `data:` URI.
 
     Args:
         image: sRGB.
-        options: of Pillow's writer of WebP.
+        kind: of Pillow's formats.
+        options: of its writer.
     """
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", **options)
+    image.save(buffer, kind, **options)
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Markup(f"data:image/webp;base64,{data}")
+    return Markup(f"data:image/{kind.lower()};base64,{data}")
 
 
 def _embedded(path: str | Path) -> Markup:
