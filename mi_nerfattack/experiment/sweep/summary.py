@@ -227,9 +227,11 @@ def _black_box(attacks: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     told: dict[tuple[str, str], list[list[str]]] = {}
     for own in by_place.values():
         gradients = [attack for attack in own if attack["attack_method"] == GRADIENT]
-        # the one whose last objective is the least, where there are several settings
-        gradients.sort(key=lambda attack: attack["curve"]["objective"][-1])
-        for attack, gradient in product(own, gradients[:1]):
+        if not gradients:
+            continue
+        # of several settings, the one whose last objective is the least
+        gradient = min(gradients, key=lambda one: one["curve"]["objective"][-1])
+        for attack in own:
             if attack["attack_method"] not in _NOT_COMPARED:
                 name = f"{attack['method']} ({attack['cell']})"
                 curves = gradient["curve"], {name: attack["curve"]}
