@@ -48,21 +48,16 @@ class LowFrequency:
             [_weights(c.level.resolution, n) for n in lattice(c.extent, vertices)]
             for c in colourings
         ]
-        self._shapes = [
-            (*(weights.shape[1] for weights in axes), 3) for axes in self._weights
-        ]
-        sizes = [int(np.prod(shape)) for shape in self._shapes]
-        self._ends = np.cumsum(sizes)
+        self._ends = np.cumsum([np.prod(_shape(axes)) for axes in self._weights])
         self.count: int = int(self._ends[-1])
 
     def propose(self, coefficients: np.ndarray) -> Proposal:
         """Return what coefficients make: (count,), by x, y, z, channel, in C order."""
         parts = np.split(np.asarray(coefficients), self._ends[:-1])
         colours = [
-            colouring.project(start + _spread(part.reshape(shape), weights))
-            for colouring, start, part, shape, weights in zip(
-                *(self.colourings, self._middle, parts, self._shapes, self._weights),
-                strict=True,
+            colouring.project(start + _spread(part, axes))
+            for colouring, start, part, axes in zip(
+                self.colourings, self._middle, parts, self._weights, strict=True
             )
         ]
         return propose(self.colourings, colours)
@@ -91,7 +86,12 @@ def _weights(fine: int, coarse: int) -> np.ndarray:
     return np.clip(1 - np.abs(at - np.arange(coarse)), 0, 1)
 
 
-def _spread(values: np.ndarray, weights: Sequence[np.ndarray]) -> np.ndarray:
-    x, y, z = weights
-    dense = np.einsum("xi,yj,zk,ijkc->zyxc", x, y, z, values, optimize=True)
+def _shape(axes: Sequence[np.ndarray]) -> tuple[int, ...]:
+    """Return vertices along x, y, z, and channels."""
+    return *(weights.shape[1] for weights in axes), 3
+
+
+def _spread(part: np.ndarray, axes: Sequence[np.ndarray]) -> np.ndarray:
+    values = part.reshape(_shape(axes))
+    dense = np.einsum("xi,yj,zk,ijkc->zyxc", *axes, values, optimize=True)
     return dense.reshape(-1, 3).astype(np.float32)
