@@ -56,12 +56,12 @@ class View:
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.view.server import serving
         from mi_nerfattack.experiment.view.viewer import Viewer
+        from mi_nerfattack.robot.remote.sealed import Endpoint
 
         with serving(self.host, self.port) as server:
             with StageBars() as bars:
                 viewer = Viewer(server, self._read(bars))
-            name = f"[{self.host}]" if ":" in self.host else self.host
-            address = f"http://{name}:{server.get_port()}"
+            address = f"http://{Endpoint(self.host, server.get_port())}"
             print(f"Showing {self.run_folder} at {address}; Ctrl-C ends", flush=True)
             if self.open:
                 webbrowser.open(address)
