@@ -88,7 +88,6 @@ class Retrain:
         from rich.console import Console
 
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.retrain.among import AmongFound, attacked_policy
         from mi_nerfattack.experiment.retrain.compare import (
@@ -100,7 +99,6 @@ class Retrain:
         )
         from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.io import files
-        from mi_nerfattack.policy.exported.program import SUFFIX
         from mi_nerfattack.policy.pilotnet import PilotNet
         from mi_nerfattack.report.table import card_table, retrain_table
         from mi_nerfattack.system.workers import chosen_workers
@@ -108,10 +106,7 @@ class Retrain:
         from mi_nerfattack.training.imitate import imitate
         from mi_nerfattack.training.record import training_record, write_trained
 
-        check_output(self.output)
-        about = self.output.with_name(f"{self.output.stem}-retrain.json")
-        for path in (*map(self.output.with_suffix, (SUFFIX, ".json")), about):
-            files.check_writable(path)
+        about = self._check_outputs()
         variant.ensure()
         attacks = read_found([*self.run_folders, *self.held_out])
         policy, place = attacked_policy(attacks), self._place(attacks)
@@ -144,6 +139,18 @@ class Retrain:
             print(f"{self.output}: written; program, record and table are beside it")
 
         return Result({**document, "environments": result.card}, show)
+
+    def _check_outputs(self) -> Path:
+        """Check that all can be written; return where the comparison is."""
+        from mi_nerfattack.commands.shared.fit_report import check_output
+        from mi_nerfattack.io import files
+        from mi_nerfattack.policy.exported.program import SUFFIX
+
+        check_output(self.output)
+        about = self.output.with_name(f"{self.output.stem}-retrain.json")
+        for path in (*map(self.output.with_suffix, (SUFFIX, ".json")), about):
+            files.check_writable(path)
+        return about
 
     def _adapt(
         self,
