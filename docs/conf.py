@@ -8,10 +8,10 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-sys.path.append(str(Path(__file__).parent / "extensions"))
-import plugin_reference  # noqa: E402
+from mi_nerfattack import ranges
 
-from mi_nerfattack import ranges  # noqa: E402
+sys.path.append(str(Path(__file__).parent / "extensions"))
+import plugin_reference  # noqa: E402  lies in the folder above
 
 project = "mi-nerfattack"
 copyright = "The mi-nerfattack authors"

@@ -7,11 +7,11 @@ plugins for the active variant and for every later one.
 from __future__ import annotations
 
 from mi_nerfattack.backend import llvm as _llvm
+from mi_nerfattack.errors import InputError, NerfAttackError, SetupError
 
-_llvm.setup()  # before anything imports drjit
+_llvm.setup()
 
-from mi_nerfattack.backend import variant  # noqa: E402
-from mi_nerfattack.errors import InputError, NerfAttackError, SetupError  # noqa: E402
+from mi_nerfattack.backend import variant  # noqa: E402  imports drjit, after LLVM
 
 __version__ = "0.1.0"
 

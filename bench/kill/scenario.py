@@ -12,15 +12,16 @@ import torch
 from mi_nerfattack import variant
 from mi_nerfattack.io import files
 
-variant.ensure()  # the parts below define types of the variant
+# The parts below define types of the variant.
+variant.ensure()
 
 import mi_nerfattack.experiment.results  # noqa: E402, F401  slow, so before the fork
-from mi_nerfattack.backend.threads import one_thread  # noqa: E402
-from mi_nerfattack.experiment.job import Job  # noqa: E402
-from mi_nerfattack.fields import GridField, GridLayout, save_field  # noqa: E402
-from mi_nerfattack.policy.pilotnet import PilotNet  # noqa: E402
-from mi_nerfattack.policy.torch_policy import TorchPolicy  # noqa: E402
-from mi_nerfattack.scenario.scenario import load_scenario  # noqa: E402
+from mi_nerfattack.backend.threads import one_thread  # noqa: E402  see above
+from mi_nerfattack.experiment.job import Job  # noqa: E402  see above
+from mi_nerfattack.fields import GridField, GridLayout, save_field  # noqa: E402  see above
+from mi_nerfattack.policy.pilotnet import PilotNet  # noqa: E402  see above
+from mi_nerfattack.policy.torch_policy import TorchPolicy  # noqa: E402  see above
+from mi_nerfattack.scenario.scenario import load_scenario  # noqa: E402  see above
 
 HORIZON, RUNS = 2, 2
 EVERY = 3
