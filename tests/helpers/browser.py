@@ -93,10 +93,28 @@ class Page:
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, **about)
 
+    def resize(self, width, height):
+        """Give the page so many pixels, whatever the window has."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+
     def shot(self, path):
         """Write a screenshot."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         path.write_bytes(base64.b64decode(data))
+
+
+def chromium():
+    """Return the browser's program; skips where there is none."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        pytest.skip("needs Chromium on the path")
+    return program
 
 
 @contextmanager
@@ -104,9 +122,7 @@ def browser(folder, size=(1400, 900)):
     """Start a browser with one tab; skips where there is none."""
     from websockets.sync.client import connect
 
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        pytest.skip("needs Chromium on the path")
+    program = chromium()
     profile = folder / "profile"
     words = [
         *("--headless", "--remote-debugging-port=0", "--no-first-run", *DRAWING),

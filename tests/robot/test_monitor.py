@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from helpers.browser import chromium
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.robot.monitor import Screen, screen_image, screen_page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 FACE = np.full((64, 64, 3), (200, 30, 30), np.uint8)
 
 
@@ -73,7 +72,6 @@ def test_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium to show a page")
 @pytest.mark.parametrize("ratio", [1, 2])
 def test_page_in_a_browser(tmp_path, ratio):
     """Pixel by pixel; it warns unless window and scale are the monitor's."""
@@ -81,14 +79,13 @@ def test_page_in_a_browser(tmp_path, ratio):
     image = screen_image(screen, FACE, (150.0, 150.0))
     page, shot = tmp_path / "a.html", tmp_path / "a.png"
     page.write_text(screen_page(image, "a <face>"))
-    assert CHROMIUM is not None
     size = f"--window-size={1280 // ratio},{720 // ratio}"
     scale = f"--force-device-scale-factor={ratio}"
     still = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
     still += [f"--user-data-dir={tmp_path / 'profile'}", size, scale]
     for output in (f"--screenshot={shot}", "--dump-dom"):
         done = subprocess.run(
-            [CHROMIUM, *still, output, page.as_uri()],
+            [chromium(), *still, output, page.as_uri()],
             capture_output=True,
             text=True,
             timeout=120,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 
 import pytest
+from helpers.browser import chromium
 from helpers.made_runs import make_run, make_transfer
 
 from mi_nerfattack import cli
@@ -16,7 +16,6 @@ from mi_nerfattack.io import files
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("variant")]
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 #: Uses the page as a reader would, and tells what came of it.
 USE = """<script>
 const found = {}, box = document.querySelector(".scrubber");
@@ -48,9 +47,7 @@ document.body.dataset.found = JSON.stringify(found);
 
 @pytest.mark.parametrize("width", [1280, 500])
 def test_a_reader_uses_the_page(tmp_path, width):
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        pytest.skip("needs Chromium on the path")
+    program = chromium()
     for name in ("one", "two"):
         make_run(tmp_path / name)
     make_transfer(tmp_path / "moved")
@@ -65,7 +62,7 @@ def test_a_reader_uses_the_page(tmp_path, width):
         *(f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},900"),
     ]
     result = subprocess.run(
-        [browser, *words, path.as_uri()],
+        [program, *words, path.as_uri()],
         capture_output=True,
         text=True,
         timeout=600,
