@@ -8,6 +8,7 @@ from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
 from bench.commands.gpu import BenchFrames, BenchGpu
 from bench.commands.imports import BenchImports
+from bench.commands.matrix import BenchMatrix
 from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
@@ -42,6 +43,7 @@ COMMANDS = {
     "quality": BenchQuality,
     "table2": BenchTable2,
     "methods": BenchMethods,
+    "matrix": BenchMatrix,
     "overlay": BenchOverlay,
     "poses": BenchPoses,
     "imports": BenchImports,
