@@ -24,6 +24,9 @@ class BenchTable2:
     retrained: Path | None = None
     """Folder of `mi-nerfattack retrain`, its --data, whose runs were the sweep's
     cells."""
+    budgets: Path | None = None
+    """Folder of the sweep of scenes/budgets.toml, finished or not; OUTPUT/budgets gets
+    its table."""
 
     def run(self) -> int:
         """Read, write and copy."""
@@ -40,7 +43,12 @@ class BenchTable2:
         if self.retrained is not None:
             retrained = read_retrained(self.retrained, {row["cell"] for row in rows})
             words.append("--retrained DATA")
-        text = page(summary, rows, retrained, results.stamp({}, words))
+        budgets = None
+        if self.budgets is not None:
+            budgets = results.summary_of(self.budgets)
+            results.copy_files([RESULTS], self.budgets, self.output / "budgets")
+            words.append("--budgets BUDGETS")
+        text = page(summary, rows, retrained, results.stamp({}, words), budgets)
         results.copy_files((RESULTS, SUMMARY), self.folder, self.output)
         files.write_text(self.output / "README.md", text)
         print(f"{self.output / 'README.md'}: written")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bench.methods.tuning import METHODS, rows, settings_of
 from bench.table2.page import flags, provenance, section
-from bench.table2.rows import TITLES, cell, interval
-from mi_nerfattack.experiment.sweep.summary import GRADIENT
-from mi_nerfattack.rollout.drive import ATTACK, RANDOM
+from bench.table2.rows import METHOD_HEADER, TITLES, method_rows
 
 _INTRODUCTION = """\
 # Methods of attack at equal numbers of rendered frames
@@ -28,7 +26,6 @@ gradient's at the same places: below 1, the gradient is better."""
 _TUNING = """\
 Mean error in the surrogate past one attack a route, metres, and its geometric mean over
 the routes: the largest of a method is chosen, once all its settings are done."""
-_HEADER = ["route", "method", "frames", "past random looks", "past the attack", "ratio"]
 
 
 def page(
@@ -50,9 +47,9 @@ def page(
     parts = [_INTRODUCTION, flags(tuning if summary is None else summary)]
     if summary is not None:
         for environment, title in TITLES.items():
-            own = list(_compared(summary, environment))
+            own = list(method_rows(summary, environment, METHODS))
             if own:
-                parts.append(section(title, "", _HEADER, own))
+                parts.append(section(title, "", METHOD_HEADER, own))
     names, routes = (
         [choice["name"] for choice in grid[axis]] for axis in ("methods", "routes")
     )
@@ -68,34 +65,3 @@ def page(
     attacks = (tuning if summary is None else summary)["attacks"]
     parts.append(provenance(commands, attacks, table, made))
     return "\n\n".join(parts) + "\n"
-
-
-def _compared(summary: Mapping[str, Any], environment: str) -> Iterator[list[str]]:
-    """Yield a row for each method on each route, then on all."""
-    groups = {
-        (group["route"], group["method"], group["case"]): group
-        for group in summary["groups"]
-        if group["environment"] == environment
-    }
-    ratios = {
-        (row["route"], row["method"]): row["effect"]
-        for row in summary["comparisons"]
-        if (row["environment"], row["other_method"], row["other_case"])
-        == (environment, GRADIENT, ATTACK)
-    }
-    for route in dict.fromkeys(key[0] for key in groups):
-        for method in METHODS:
-            attack = groups.get((route, method, ATTACK))
-            if attack is None:
-                continue
-            effect, ratio = ratios.get((route, method)), ""
-            if effect is not None and effect["ratio"] is not None:
-                ratio = f"{effect['ratio']:.2f}{interval(effect['ratio_ci95'])}"
-            yield [
-                route or "all",
-                method,
-                f"{attack['frames']:.0f}",
-                cell(groups.get((route, method, RANDOM))),
-                cell(attack),
-                ratio,
-            ]

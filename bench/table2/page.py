@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from bench.table2.rows import (
     COLUMNS,
     FLOOR,
+    METHOD_HEADER,
     NAMES,
     PAPER,
     STEPS,
@@ -19,6 +20,7 @@ from bench.table2.rows import (
     cell,
     detail_rows,
     make_table,
+    method_rows,
     own_rows,
     paper_rows,
 )
@@ -50,6 +52,10 @@ _RETRAIN = (
     "--more FRAMES  # those of the bundled policy's training"
 )
 _REPLAY = "mi-nerfattack replay docs/table2 --rows 10  # any row comes back"
+_BUDGETS = """\
+The same places and unseen starts, [budgets](../../scenes/budgets.toml) of four times as
+much: `gradient` as above, 24 iterations from one start; 96 from one; 24 from four each.
+The ratio is that of the mean error to the first's, paired."""
 _AGAINST = [
     *("environment", "route", "ratio", "difference (m)", "spread over seeds (m)"),
     *("random out", "gradient out", "p (McNemar)"),
@@ -61,7 +67,11 @@ _DETAILS = [
 
 
 def page(
-    summary: Figures, rows: Sequence[Figures], retrained: Table, made: Figures
+    summary: Figures,
+    rows: Sequence[Figures],
+    retrained: Table,
+    made: Figures,
+    budgets: Figures | None = None,
 ) -> str:
     """Return the page.
 
@@ -70,6 +80,7 @@ def page(
         rows: of its table.
         retrained: of `rows.read_retrained`; may be empty.
         made: date, machine and command, as of `bench.results.stamp`.
+        budgets: ``summary.json`` of ``scenes/budgets.toml``.
 
     Raises:
         InputError: the sweep has no such attacks, or several budgets.
@@ -87,10 +98,14 @@ def page(
         section("Against random textures", "", _AGAINST, against),
         section("What was aimed at", "", ["aim", "found", ""], aims),
     ]
+    if budgets is not None:
+        parts += list(_budgets(budgets))
     if retrained:
         parts.append(_retraining(retrained))
     parts.append(section("All figures", "", _DETAILS, detail_rows(table)))
     commands = ["mi-nerfattack sweep scenes/table2.toml -o FOLDER"]
+    if budgets is not None:
+        commands.append("mi-nerfattack sweep scenes/budgets.toml -o BUDGETS")
     commands += [_RETRAIN] if retrained else []
     commands += [made["command"], _REPLAY]
     parts.append(provenance(commands, summary["attacks"], rows, made))
@@ -114,6 +129,18 @@ def flags(summary: Figures) -> str:
     if not told:
         return f"## Flags\n\n{cells} No flag was raised."
     return "\n".join([f"## Flags\n\n{cells}\n", *told])
+
+
+def _budgets(summary: Figures) -> Iterator[str]:
+    methods = dict.fromkeys(group["method"] for group in summary["groups"])
+    text = (
+        f"{_BUDGETS} {summary['complete']} of {summary['cells']} attacks are complete."
+    )
+    for environment in TITLES:
+        rows = method_rows(summary, environment, list(methods))
+        title = f"With more budget: {environment}"
+        yield section(title, text, METHOD_HEADER, rows)
+        text = ""
 
 
 def _retraining(retrained: Table) -> str:

@@ -59,6 +59,15 @@ TITLES = {
     SURROGATE: "Surrogate: the fitted fields",
 }
 
+METHOD_HEADER = (
+    "route",
+    "method",
+    "frames",
+    "past random looks",
+    "past the attack",
+    "ratio",
+)
+
 Figures = Mapping[str, Any]
 #: By route (None: all), environment and case.
 Table = dict[tuple[str | None, str, str], Figures]
@@ -302,3 +311,36 @@ def detail_rows(table: Table) -> Iterator[Sequence[str]]:
                     _share(*left, figures["departure_rate_ci95"]),
                     _out(figures),
                 )
+
+
+def method_rows(
+    summary: Figures, environment: str, methods: Sequence[str]
+) -> Iterator[Sequence[str]]:
+    """Yield a row for each method on each route, then on all, beside the gradient."""
+    groups = {
+        (group["route"], group["method"], group["case"]): group
+        for group in summary["groups"]
+        if group["environment"] == environment
+    }
+    ratios = {
+        (row["route"], row["method"]): row["effect"]
+        for row in summary["comparisons"]
+        if (row["environment"], row["other_method"], row["other_case"])
+        == (environment, GRADIENT, ATTACK)
+    }
+    for route in dict.fromkeys(key[0] for key in groups):
+        for method in methods:
+            attack = groups.get((route, method, ATTACK))
+            if attack is None:
+                continue
+            effect, ratio = ratios.get((route, method)), ""
+            if effect is not None and effect["ratio"] is not None:
+                ratio = f"{effect['ratio']:.2f}{interval(effect['ratio_ci95'])}"
+            yield (
+                route or "all",
+                method,
+                f"{attack['frames']:.0f}",
+                cell(groups.get((route, method, RANDOM))),
+                cell(attack),
+                ratio,
+            )

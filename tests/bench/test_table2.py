@@ -11,10 +11,12 @@ from bench.table2.page import page
 from bench.table2.rows import read_retrained
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.cell import Cell, changed
+from mi_nerfattack.experiment.sweep.grid import load_cells
 from mi_nerfattack.experiment.sweep.summary import summarise
 from mi_nerfattack.experiment.sweep.table import read_table
 from mi_nerfattack.rollout.drive import RANDOM
 
+SCENES = Path(__file__).parents[2] / "scenes"
 #: Mean errors by environment and route: without objects, past random looks, and past
 #: the attacks of two seeds.
 ERRORS = {
@@ -97,6 +99,30 @@ def test_rows_by_hand(tmp_path):
     assert "| 4.00 [" in met[2] and "| 2.00 [" in met[4]
     assert "| 0 of 4 drives |" in met[5] and "| 1.12 |" in met[6]
     assert "- policy.file: SHA-256 abc" in text and "with: mitsuba 3" in text
+
+
+def test_more_budget_stands_beside_the_same_attacks():
+    """0.9 m for each attack: 1.8 times the 0.5 m on average on the right."""
+    more = [
+        row
+        | {"method": "starts_4", "cell": f"{row['cell']}-more", "frames": 36}
+        | ({"cross_track_mean_m": 0.9} if row["case"] == "attack" else {})
+        for row in rows()
+    ]
+    text = page(summarise(rows()), rows(), {}, MADE, summarise([*rows(), *more]))
+    own = [line for line in lines(text, "right") if "| starts_4 | 36 |" in line]
+    assert len(own) == 2 and "0.900 ± 0.000" in own[0] and "| 1.80 [" in own[0]
+    assert "scenes/budgets.toml -o BUDGETS" in text
+    assert "8 of 8 attacks are complete" in text
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("variant")
+def test_budgets_have_the_attacks_of_table_2():
+    cells = load_cells(SCENES / "budgets.toml")
+    first = [cell for cell in cells if cell.method == "gradient"]
+    assert [c.id for c in first] == [c.id for c in load_cells(SCENES / "table2.toml")]
+    assert len(cells) == 3 * len(first)
 
 
 def test_flags_and_failures_are_told():
