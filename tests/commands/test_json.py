@@ -23,6 +23,7 @@ WITHOUT_FIGURES = {
     "monitor": "serves a page until Ctrl-C, and tells its address",
     "view": "serves a page until Ctrl-C, or writes it; tells its address, or its path",
     "bench quality": "runs other commands, and shows what they print",
+    "bench matrix": "runs another command, writes a page from it, and tells its path",
     "bench table2": "writes a page from a sweep's table, and tells its path",
     "bench methods": "writes a page from a sweep's table, and tells its path",
 }
