@@ -24,6 +24,7 @@ from mi_nerfattack.experiment.checks.before_attack import (
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.finished import Finished, Frames
+from mi_nerfattack.experiment.kept_drives import SharedDrives
 from mi_nerfattack.experiment.run_folder import RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages, step_counter
 from mi_nerfattack.rollout.drive import (
@@ -66,6 +67,7 @@ class Job:
         started: `time.perf_counter()` from which the wall time counts.
         frames: of each case, see ``pictures.frames.frame_steps``; None writes no
             pictures at all: no frames, plots, attribution and page.
+        shared: drives that other runs have in common with this one, if any.
     """
 
     scenario: Scenario
@@ -76,6 +78,7 @@ class Job:
     on_notice: OnNotice = _quiet
     started: float = field(default_factory=time.perf_counter)
     frames: Frames | None = 3
+    shared: SharedDrives | None = None
 
     def run(
         self, resume: bool = False, force: bool = False, anyway: bool = False
@@ -137,7 +140,8 @@ class Job:
             renders = world.renders + stages.renders
             return account.total(renders, folder.checkpoint.seconds)
 
-        stages = Stages(world, folder.drives, self.on_progress, effort)
+        kept, told = folder.drives, self.on_progress
+        stages = Stages(world, kept, told, effort, self.shared)
         stages.looks[OWN] = original = world.appearance()
         with closing(stages):
             flags = self._check(world, folder, stages, anyway)

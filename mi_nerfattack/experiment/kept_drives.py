@@ -1,18 +1,35 @@
-"""Drives that are finished: files of the run folder, so that none is repeated."""
+"""Drives that are finished: files of the run folder, so that none is repeated.
+
+Those that several runs of one sweep have in common are done by the first of them.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from mi_nerfattack.backend.versions import versions
+from mi_nerfattack.deploy.registry import environment_versions
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.identity import short_digest
 from mi_nerfattack.experiment.checkpoint import REMEDY
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.io import files
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
+from mi_nerfattack.scenario.deployment import SURROGATE
+from mi_nerfattack.scenario.scenario import is_within
+from mi_nerfattack.scenario.world import Appearance, World
 
 FORMAT = "mi_nerfattack attack drive 4"
+SHARED_FORMAT = "mi_nerfattack shared drive 1"
+#: Parts of a scenario that say how it is searched, not how it is driven.
+_OF_SEARCH = ("name", "attack", "baseline", "objective", "scene.bricks", "drive.runs")
 
 
 class DriveRecord(Record):
@@ -153,3 +170,58 @@ class KeptDrives:
 
     def _path(self, environment: str, case: str, run: int) -> Path:
         return self.folder / f"{environment}_{case}_{run:04d}.safetensors"
+
+
+@dataclass(frozen=True)
+class SharedDrives:
+    """Drives of one sweep by all that decides about them, a file each.
+
+    How an attack searches has no part in a drive: what objects show, and where they
+    stand, has. Cells that differ by their method alone have the drives without
+    objects, past their own textures and past equal random looks in common.
+
+    Args:
+        folder: of the files; made with the first.
+    """
+
+    folder: Path
+
+    def unit(
+        self, world: World, label: str, look: Appearance | None, run: int
+    ) -> Unit[Record]:
+        """Return the file of a drive.
+
+        Args:
+            world: of the run.
+            label: of the environment.
+            look: of all objects; None without.
+            run: index of the drive.
+        """
+        scenario = world.scenario
+        named = scenario.identity()
+        decisive = {k: v for k, v in named.items() if not is_within(k, _OF_SEARCH)}
+        if label == SURROGATE:
+            own, needed = scenario.attack, {}
+            decisive |= {"jitter": f"{own.jitter}", "attached": f"{own.attached}"}
+        else:
+            needed = environment_versions(world.deployments[label].environment)
+        start = world.initial[run % len(world.initial)]
+        identity = {
+            "format": SHARED_FORMAT,
+            **{f"version.{k}": v for k, v in (versions() | needed).items()},
+            **decisive,
+            "environment": label,
+            "look": "none" if look is None else _digest(look),
+            "start": json.dumps(np.asarray(start).tolist()),
+            "drive_seed": f"{scenario.seed + run}",
+        }
+        path = self.folder / f"{label}_{short_digest(identity)}.safetensors"
+        return Unit(path, identity, Record, "remove the file")
+
+
+def _digest(look: Appearance) -> str:
+    found = hashlib.sha256()
+    for values in (*look.textures, look.offsets):
+        found.update(f"{values.dtype} {values.shape}".encode())
+        found.update(np.ascontiguousarray(values).data)
+    return found.hexdigest()

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.experiment.effort import Effort
-from mi_nerfattack.experiment.kept_drives import KeptDrives
-from mi_nerfattack.rollout.drive import NO_OBJECT, RANDOM, Drive
+from mi_nerfattack.experiment.kept_drives import KeptDrives, SharedDrives
+from mi_nerfattack.io import files
+from mi_nerfattack.io.resumable import Record, misfits_told
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM, Drive
 from mi_nerfattack.rollout.loop import OnStep
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import Appearance, World
@@ -20,15 +22,17 @@ OnProgress = Callable[[str, int, int, str], None]
 Judge = Callable[[OnStep], float]
 
 
-def step_counter(on_progress: OnProgress, stage: str, total: int) -> OnStep:
+def step_counter(
+    on_progress: OnProgress, stage: str, total: int, done: int = 0
+) -> OnStep:
     """Return what reports the progress of sweeps through a drive, step by step.
 
     Args:
         on_progress: told.
         stage: what it is told.
         total: steps of all sweeps.
+        done: of them, before.
     """
-    done = 0
 
     def on_step(step: int) -> None:
         nonlocal done
@@ -50,6 +54,8 @@ class Stages:
         kept: drives that are finished.
         on_progress: told about every time step.
         effort: tells what the run has cost so far.
+        shared: drives that other runs have in common with this one, if any; those past
+            what its attack found are its own.
         looks: by case, what all its drives show; None for no objects.
         drives: all drives that were asked for so far.
         renders: frames that the world's surrogate did not render.
@@ -59,6 +65,7 @@ class Stages:
     kept: KeptDrives
     on_progress: OnProgress
     effort: Callable[[], Effort]
+    shared: SharedDrives | None = None
     looks: dict[str, Appearance | None] = field(
         default_factory=lambda: {NO_OBJECT: None}
     )
@@ -154,21 +161,49 @@ class Stages:
         objective: float | None = None,
     ) -> Drive:
         """Drive once, and keep the drive; it is the last sweep of a run."""
-        world, scenario = self.world, self.world.scenario
-        horizon = world.horizon
+        horizon, stage = self.world.horizon, f"{label}: {case}"
         before, total = ((run + 1) * sweeps - 1) * horizon, count * sweeps * horizon
+        on_step = step_counter(self.on_progress, stage, total, before)
+        if self.shared is None or case == ATTACK:
+            found = self._driven(label, case, run, look, on_step)
+        else:
+            found = self._common(self.shared, label, case, run, look, on_step)
+        self.kept.add(found, self.effort(), objective)
+        return found
 
-        def on_step(step: int) -> None:
-            self.on_progress(f"{label}: {case}", before + step + 1, total, "")
+    def _common(
+        self,
+        shared: SharedDrives,
+        label: str,
+        case: str,
+        run: int,
+        look: object,
+        on_step: OnStep,
+    ) -> Drive:
+        """Take up a drive that another run has done, or do it for others, too."""
+        world = self.world
+        shown = None if case == NO_OBJECT else world.appearance()
+        unit = shared.unit(world, label, shown, run)
+        if (kept := unit.read()) is None:
+            found = self._driven(label, case, run, look, on_step)
+            files.make_folder(shared.folder)
+            unit.write(found.arrays(), Record())
+            return found
+        about = label, world.route.name, case, run, world.scenario.seed + run
+        with misfits_told(unit.path):
+            return Drive(*about, **kept.tensors)
 
-        empty = case == NO_OBJECT
+    def _driven(
+        self, label: str, case: str, run: int, look: object, on_step: OnStep
+    ) -> Drive:
+        world, empty = self.world, case == NO_OBJECT
         found = drive(
             self._environment(label, look, empty),
             world.policy,
             world.route,
             world.initial[run % len(world.initial)],
-            scenario.seed + run,
-            horizon,
+            world.scenario.seed + run,
+            world.horizon,
             on_step,
             case,
             run,
@@ -176,7 +211,6 @@ class Stages:
         )
         counted = label == SURROGATE and not empty  # by the surrogate itself
         self.renders += 0 if counted else len(found.states)
-        self.kept.add(found, self.effort(), objective)
         return found
 
     def _environment(

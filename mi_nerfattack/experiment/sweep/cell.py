@@ -14,12 +14,15 @@ from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.job import Job
+from mi_nerfattack.experiment.kept_drives import SharedDrives
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.io.strict_toml import parse_toml
 from mi_nerfattack.scenario.scenario import Scenario
 
 #: Folder of the cells, in that of the sweep.
 CELLS = "cells"
+#: Folder of drives that cells have in common, in that of the sweep.
+SHARED = "shared"
 #: Empty file in the folder of a cell that is done.
 COMPLETE = "_complete"
 #: What a cell was done of: its row of the grid, digests and versions.
@@ -95,7 +98,8 @@ def changed(cell: Cell) -> list[str]:
 def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
     """Do a cell, or what is left of it, as ``mi-nerfattack attack`` would.
 
-    What an earlier run of the sweep left at work on it is waited for.
+    Drives that another cell has in common with it are taken from there. What an earlier
+    run of the sweep left at work on it is waited for.
 
     Args:
         cell: what to do.
@@ -118,7 +122,7 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
             )
         policy, frames = scenario.build_policy(), 3 if cell.pictures else None
         job = Job(scenario, cell.text, policy, output, lambda *told: on_step())
-        job.frames = frames
+        job.frames, job.shared = frames, SharedDrives(sweep / SHARED)
         with one_thread():
             job.run_claimed(resume=True, anyway=cell.anyway)
         about = asdict(cell) | {"versions": versions()}
