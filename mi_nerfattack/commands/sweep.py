@@ -12,6 +12,7 @@ from mi_nerfattack.commands.shared.result import Result
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
+    from mi_nerfattack.experiment.sweep.taken import Taken
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
@@ -29,6 +30,9 @@ class Sweep:
     """Grid file (TOML)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the sweep, new or begun."""
+    take: tuple[Path, ...] = ()
+    """Folders with results.parquet and summary.json of a sweep that was done elsewhere,
+    whole or in part: cells of the grid that are complete there are not done again."""
     check: bool = False
     """Do nothing yet: tell how many cells and frames there are, what time and disk they
     would take, and what would be refused."""
@@ -60,6 +64,7 @@ class Sweep:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.experiment.sweep.grid import load_cells
+        from mi_nerfattack.experiment.sweep.taken import read_taken
         from mi_nerfattack.io import files
 
         check_positive(self, "cores", "memory_gb", "minutes")
@@ -67,8 +72,10 @@ class Sweep:
         if not self.check:
             files.check_folder(self.output)
         variant.ensure()
-        cells = load_cells(self.grid)
-        return self._check(cells) if self.check else self._run(cells, workers)
+        cells, taken = load_cells(self.grid), read_taken(self.take)
+        if self.check:
+            return self._check([cell for cell in cells if cell.id not in taken.rows])
+        return self._run(cells, workers, taken)
 
     def _count(self) -> int:
         from mi_nerfattack.commands.shared.cells import cells_at_a_time
@@ -112,15 +119,15 @@ class Sweep:
         code = int(any(document["refused"].values()))
         return Result(document, lambda: print(*told, sep="\n"), code)
 
-    def _run(self, cells: list[Cell], workers: AbstractWorkers) -> Result:
+    def _run(self, cells: list[Cell], workers: AbstractWorkers, taken: Taken) -> Result:
         from rich.console import Console
 
         from mi_nerfattack.commands.shared.cells import do_cells
         from mi_nerfattack.experiment.sweep.summary import write_summary
         from mi_nerfattack.report.table import sweep_table
 
-        sweep = do_cells(cells, self.output, self.cores, workers)
-        document = write_summary(sweep.work.folder)
+        sweep = do_cells(cells, self.output, self.cores, workers, taken)
+        document = write_summary(sweep.work.folder, taken.attacks)
         failed = {cells[i].id: error for i, error in sorted(sweep.errors.items())}
         found = {
             "cells": len(cells),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
     from mi_nerfattack.experiment.sweep.sweep import Sweep
+    from mi_nerfattack.experiment.sweep.taken import Taken
     from mi_nerfattack.system.workers import AbstractWorkers
 
 
@@ -20,7 +21,11 @@ def cells_at_a_time(workers: int | None, cores: int) -> int:
 
 
 def do_cells(
-    cells: Sequence[Cell], folder: Path, cores: int, workers: AbstractWorkers
+    cells: Sequence[Cell],
+    folder: Path,
+    cores: int,
+    workers: AbstractWorkers,
+    taken: Taken | None = None,
 ) -> Sweep:
     """Do all cells that are not complete; returns what became of them.
 
@@ -29,6 +34,7 @@ def do_cells(
         folder: of the sweep.
         cores: that each cell renders with.
         workers: who does them.
+        taken: cells that were done elsewhere, if any.
 
     Raises:
         InputError: as of `Sweep.run`.
@@ -36,6 +42,7 @@ def do_cells(
     """
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
+    from mi_nerfattack.experiment.sweep.taken import Taken
 
     with StageBars() as bars:
 
@@ -46,6 +53,7 @@ def do_cells(
                 state += f", {len(sweep.errors)} failed"
             bars.show("cells", done, total, state, kept=done == sweep.kept)
 
-        sweep = Sweep(Cells(tuple(cells), folder.resolve(), cores), show)
+        work = Cells(tuple(cells), folder.resolve(), cores)
+        sweep = Sweep(work, show, taken or Taken())
         sweep.run(workers)
         return sweep

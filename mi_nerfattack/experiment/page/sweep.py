@@ -40,7 +40,7 @@ def read_sweep(
     cells = folder / CELLS
     known = {row["cell"] for row in rows}
     told = read_attacks(folder, rows)
-    sections = {attack["cell"]: attack["section"] for attack in told}
+    sections = {one["cell"]: one["section"] for one in told if "section" in one}
     notes = []
     begun = [path for path in cells.glob("*/") if not (path / COMPLETE).exists()]
     if begun:

@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain, product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.flags import black_box_better, noise_larger
 from mi_nerfattack.evaluation.intervals import share_interval
 from mi_nerfattack.evaluation.pairs import (
@@ -58,11 +60,14 @@ class Group(NamedTuple):
     case: str
 
 
-def write_summary(folder: Path) -> dict[str, Any]:
+def write_summary(
+    folder: Path, known: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+) -> dict[str, Any]:
     """Summarise a sweep, and write ``summary.json`` beside its table.
 
     Args:
-        folder: of the sweep; of cells whose folder is missing, curve and flags are.
+        folder: of the sweep.
+        known: attacks of other summaries, see :func:`read_attacks`.
 
     Returns:
         the document.
@@ -72,23 +77,52 @@ def write_summary(folder: Path) -> dict[str, Any]:
         SetupError: pyarrow is not installed.
     """
     rows = read_table(folder / RESULTS)
-    document = summarise(rows, read_attacks(folder, rows))
+    document = summarise(rows, read_attacks(folder, rows, known))
     files.write_json(folder / SUMMARY, document)
     return document
 
 
-def read_attacks(folder: Path, rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Return what the folders of complete cells tell of each attack.
+def told_attacks(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the attacks of a folder's ``summary.json`` by cell; none without one.
+
+    Raises:
+        InputError: the file is damaged, or of another version.
+    """
+    path = folder / SUMMARY
+    if not path.exists():
+        return {}
+    document = files.read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise InputError(
+            f"{path}: no summary of a sweep with schema {SCHEMA}; give the sweep's "
+            "command again, which makes it anew"
+        )
+    return {attack["cell"]: attack for attack in document["attacks"]}
+
+
+def read_attacks(
+    folder: Path,
+    rows: Iterable[Row],
+    known: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+) -> list[dict[str, Any]]:
+    """Return what is told of each attack: by its cell's folder, or a summary.
 
     Args:
         folder: of the sweep.
         rows: of its table.
+        known: attacks by cell, of :func:`told_attacks` elsewhere; those of cells
+            without a folder count, and before them those of the sweep's own summary.
 
     Returns:
         a row each, in the table's order: labels, `section` (`attack` of the
-        scenario), `attack_method` (its own word), `converged`, `flags` and `curve`.
+        scenario; a folder alone tells it), `attack_method` (its own word),
+        `converged`, `flags` and `curve`.
+
+    Raises:
+        InputError: a file is damaged.
     """
     cells = {row["cell"]: row for row in rows if row["status"] == "complete"}
+    earlier = {**known, **told_attacks(folder)}
     found = []
     for cell, row in cells.items():
         path = folder / CELLS / cell / METRICS
@@ -99,6 +133,8 @@ def read_attacks(folder: Path, rows: Iterable[Row]) -> list[dict[str, Any]]:
             attack |= {"section": section, "attack_method": section["method"]}
             attack |= {key: document[key] for key in ("converged", "flags")}
             found.append(attack | {"curve": document.get("curve")})
+        elif cell in earlier:
+            found.append(dict(earlier[cell]))
     return found
 
 

@@ -24,9 +24,11 @@ from mi_nerfattack.experiment.sweep.table import (
     Row,
     complete_rows,
     failed_row,
+    labels_of,
     require_parquet,
     write_table,
 )
+from mi_nerfattack.experiment.sweep.taken import Taken
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.system.workers import AbstractWork, AbstractWorkers, OnUnits
 
@@ -77,6 +79,7 @@ class Sweep:
     Attributes:
         work: its cells.
         on_change: called when anything has happened.
+        taken: cells that were done elsewhere; one that is done here, too, is not used.
         steps: control periods that cells have told of.
         complete: cells that are done, by their index.
         kept: how many were when this run began.
@@ -85,6 +88,7 @@ class Sweep:
 
     work: Cells
     on_change: Callable[[Sweep], None] = lambda sweep: None
+    taken: Taken = field(default_factory=Taken)
     steps: int = 0
     complete: set[int] = field(default_factory=set)
     kept: int = 0
@@ -118,6 +122,9 @@ class Sweep:
             for index, cell in enumerate(work.cells):
                 if is_complete(work.folder, cell):
                     self._take(index)
+                elif rows := self.taken.rows.get(cell.id):
+                    self.complete.add(index)
+                    self._rows[index] = [row | labels_of(cell) for row in rows]
                 elif (path := self._failure(index)).exists():
                     self._fail(index, files.read_text(path))
             self.kept = len(self.complete)

@@ -65,7 +65,7 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
     document = files.read_json(folder / METRICS)
     about = files.read_json(folder / PROVENANCE)
     frames = _frames(document)
-    labels = _labels(cell) | {"versions": json.dumps(about["versions"])}
+    labels = labels_of(cell) | {"versions": json.dumps(about["versions"])}
     return [
         {
             **labels,
@@ -88,7 +88,7 @@ def complete_rows(cell: Cell, sweep: Path) -> list[Row]:
 
 def failed_row(cell: Cell, error: str) -> Row:
     """Return the one row of a cell that failed."""
-    return {**_labels(cell), "status": "failed", "error": error}
+    return {**labels_of(cell), "status": "failed", "error": error}
 
 
 def write_table(path: Path, rows: Iterable[Row]) -> None:
@@ -173,7 +173,8 @@ def _check(path: Path, found: Any, rows: int, wanted: Any) -> None:
         raise InputError(f"{path}: {rows} rows; at most {MAX_ROWS} are read")
 
 
-def _labels(cell: Cell) -> Row:
+def labels_of(cell: Cell) -> Row:
+    """Return what all rows of a cell have in common."""
     return {
         "cell": cell.id,
         "route": cell.route,
