@@ -40,8 +40,9 @@ class BenchMethods:
         table = read_table((self.folder or self.tuning) / RESULTS)
         words = ["python -m bench methods TUNING"]
         words += [] if self.folder is None else ["FOLDER"]
-        grid = files.read_toml(ROOT / "scenes" / "tuning.toml")
-        text = page(summary, table, tuning, grid, results.stamp({}, words))
+        names = "tuning.toml", "methods.toml"
+        grids = [files.read_toml(ROOT / "scenes" / name) for name in names]
+        text = page(summary, table, tuning, *grids, results.stamp({}, words))
         results.copy_files([RESULTS], self.tuning, self.output / "tuning")
         if self.folder is not None:
             files.write_json(self.output / SUMMARY, summary)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from bench.methods.tuning import METHODS, rows, settings_of
 from bench.table2.page import flags, provenance, section
-from bench.table2.rows import METHOD_HEADER, TITLES, method_rows
+from bench.table2.rows import METHOD_HEADER, TITLES, interval, method_rows
+from mi_nerfattack.experiment.sweep.summary import GRADIENT
+from mi_nerfattack.rollout.drive import ATTACK
+from mi_nerfattack.scenario.deployment import SURROGATE
 
 _INTRODUCTION = """\
 # Methods of attack at equal numbers of rendered frames
@@ -26,6 +30,10 @@ gradient's at the same places: below 1, the gradient is better."""
 _TUNING = """\
 Mean error in the surrogate past one attack a route, metres, and its geometric mean over
 the routes: the largest of a method is chosen, once all its settings are done."""
+_AIM_HEADER = ["route", "method", "ratio", "places", "gradient above"]
+_AIM = """\
+The gradient above every other method on every route, at the places that both have: the
+mean error of each other method in the surrogate, divided by the gradient's."""
 
 
 def page(
@@ -33,6 +41,7 @@ def page(
     table: Sequence[Mapping[str, Any]],
     tuning: Mapping[str, Any],
     grid: Mapping[str, Any],
+    compared: Mapping[str, Any],
     made: Mapping[str, Any],
 ) -> str:
     """Return the page.
@@ -42,10 +51,16 @@ def page(
         table: rows of its table, else those of the tuning.
         tuning: ``summary.json`` of the tuning.
         grid: of the tuning, ``scenes/tuning.toml``.
+        compared: of the comparison, ``scenes/methods.toml``.
         made: date, machine and command, as of `bench.results.stamp`.
     """
-    parts = [_INTRODUCTION, flags(tuning if summary is None else summary)]
-    if summary is not None:
+    parts = [_INTRODUCTION]
+    if summary is None:
+        parts.append(flags(tuning, _cells(grid)))
+    else:
+        parts.append(flags(summary, _cells(compared)))
+        aims = list(_aim_rows(summary))
+        parts.append(section("What was aimed at", _AIM, _AIM_HEADER, aims))
         for environment, title in TITLES.items():
             own = list(method_rows(summary, environment, METHODS))
             if own:
@@ -55,8 +70,7 @@ def page(
     )
     settings = settings_of(tuning, names, routes)
     header = ["method", "setting", *routes, "geometric mean", ""]
-    total = len(names) * len(routes) * len(grid["seeds"])
-    text = f"{_TUNING} {tuning['complete']} of {total} attacks are done."
+    text = f"{_TUNING} {tuning['complete']} of {_cells(grid)} attacks are done."
     parts.append(section("Settings", text, header, rows(settings, routes)))
     commands = ["mi-nerfattack sweep scenes/tuning.toml -o TUNING"]
     if summary is not None:
@@ -65,3 +79,22 @@ def page(
     attacks = (tuning if summary is None else summary)["attacks"]
     parts.append(provenance(commands, attacks, table, made))
     return "\n\n".join(parts) + "\n"
+
+
+def _cells(grid: Mapping[str, Any]) -> int:
+    return math.prod(len(grid[axis]) for axis in ("methods", "routes", "seeds"))
+
+
+def _aim_rows(summary: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    """Yield a row for each other method on each route, then on all."""
+    for row in summary["comparisons"]:
+        labels = row["environment"], row["other_method"], row["other_case"]
+        effect = row["effect"]
+        if labels == (SURROGATE, GRADIENT, ATTACK) and effect["ratio"] is not None:
+            yield (
+                row["route"] or "all",
+                row["method"],
+                f"{effect['ratio']:.2f}{interval(effect['ratio_ci95'])}",
+                str(effect["attacks"]),
+                "yes" if effect["ratio"] < 1 else "**no**",
+            )

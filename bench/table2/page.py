@@ -121,11 +121,17 @@ def section(
     return "\n\n".join(filter(None, (f"## {title}", text, table)))
 
 
-def flags(summary: Figures) -> str:
-    """Return the section that tells a sweep's flags and failed cells."""
+def flags(summary: Figures, total: int | None = None) -> str:
+    """Return the section that tells a sweep's flags and failed cells.
+
+    Args:
+        summary: ``summary.json``.
+        total: cells of the grid, where the table may have fewer.
+    """
     told = [f"- **{flag}".replace(": ", ":** ", 1) for flag in summary["flags"]]
     told += [f"- **failed:** {r['cell']}: {r['error']}" for r in summary["failed"]]
-    cells = f"{summary['complete']} of {summary['cells']} attacks are complete."
+    total = summary["cells"] if total is None else total
+    cells = f"{summary['complete']} of {total} attacks are complete."
     if not told:
         return f"## Flags\n\n{cells} No flag was raised."
     return "\n".join([f"## Flags\n\n{cells}\n", *told])

@@ -23,6 +23,7 @@ GRID = {
     "routes": [{"name": name} for name in ROUTES],
     "seeds": [0],
 }
+COMPARED = GRID | {"methods": GRID["methods"][:3], "seeds": [1, 2, 3]}
 
 
 def rows(methods, seeds):
@@ -55,12 +56,12 @@ def test_the_largest_geometric_mean_is_chosen():
 
 
 def test_methods_beside_the_gradient():
-    table = rows({"gradient": (0.4, 0.8), "blocks": (0.1, 0.2)}, 2)
+    methods = {"gradient": (0.4, 0.8), "blocks": (0.1, 0.2), "above": (0.5, 1.0)}
+    table = rows(methods, 2)
     tuning = summarise(rows(TUNED, 1))
-    text = page(summarise(table), table, tuning, GRID, MADE)
-    found = [
-        line for line in text.splitlines() if line.startswith("| right | blocks |")
-    ]
+    text = page(summarise(table), table, tuning, GRID, COMPARED, MADE)
+    start = "| right | blocks | 50 |"
+    found = [line for line in text.splitlines() if line.startswith(start)]
     assert found == [
         "| right | blocks | 50 |  | 0.200 ± 0.000 [0.200, 0.200] (2); 0/2 out [0, 66] "
         "| 0.25 [0.250, 0.250] |"
@@ -68,9 +69,13 @@ def test_methods_beside_the_gradient():
     assert "| gradient | gradient_0.3 | 0.400 | 0.400 | 0.400 | chosen |" in text
     assert "| blocks | blocks_0.3 | 0.600 |  |  |  |" in text
     assert "scenes/methods.toml -o FOLDER" in text
+    assert "\n12 of 18 attacks are complete." in text
+    aims = text.partition("## What was aimed at")[2].partition("## Surrogate")[0]
+    assert "| straight | blocks | 0.25 [0.250, 0.250] | 2 | yes |" in aims
+    assert "| right | above | 1.25 [1.250, 1.250] | 2 | **no** |" in aims
 
 
 def test_settings_alone():
     table = rows(TUNED, 1)
-    text = page(None, table, summarise(table), GRID, MADE)
+    text = page(None, table, summarise(table), GRID, COMPARED, MADE)
     assert "9 of 10 attacks are done." in text and "scenes/methods.toml -o" not in text
