@@ -69,19 +69,27 @@ def test_the_command_chooses_drives_and_writes(tmp_path, monkeypatch, capsys):
     files.make_folder(sweep)
     many = [row(f"c{seed}", "gradient", seed, seed / 10) for seed in range(9)]
     write_table(sweep / "results.parquet", many)
-    given = []
+    given, remade = [], folder / "remade" / "0" / "cells"
 
     def run(words):
         given.append(words)
+        if words[0] == "replay":
+            for name in words[2:10]:
+                path = remade / name.partition(":")[0]
+                files.make_folder(path)
+                (path / "metrics.json").touch()
+            return
         labels = [words[1].rpartition("/")[2], words[2].rpartition("/")[2]]
         files.make_folder(folder)
         (folder / "transfer.json").write_text(json.dumps(document(labels)))
 
     monkeypatch.setattr("bench.commands.quality.run_command", run)
     assert main(["matrix", str(folder), str(sweep), "-o", str(output)]) == 0
-    first, second = given
+    again, first, second = given
+    assert again[1] == str(sweep) and again[-2:] == ["-o", str(remade.parent)]
+    assert again[2:10] == [f"c{8 - k}:surrogate:attack:0" for k in range(8)]
     assert second[: len(first)] == first
-    assert first[1:9] == [str(sweep / "cells" / f"c{8 - k}") for k in range(8)]
+    assert first[1:9] == [str(remade / f"c{8 - k}") for k in range(8)]
     assert "mujoco_gl_built_in" in second and "--environments" not in first
     text = (output / "README.md").read_text()
     assert "The 2 best attacks" in text
@@ -90,5 +98,8 @@ def test_the_command_chooses_drives_and_writes(tmp_path, monkeypatch, capsys):
     assert "| c8 | **0.600** |" in text and "| c7 | 0.200 |" in text
     table = parquet.read_table(output / "drives.parquet").to_pylist()
     assert len(table) == 8 and table[0]["case"] == "no_object"
+    given.clear()
+    assert main(["matrix", str(folder), str(sweep), "-o", str(output)]) == 0
+    assert [words[0] for words in given] == ["transfer", "transfer"]
     few = ["matrix", str(folder), str(tmp_path / "none")]
     assert main(few) == cli.EXIT_INPUT and "results.parquet" in capsys.readouterr().err
