@@ -32,8 +32,9 @@ _CHANGES = {
     "pose_learning_rate = 0.0005\nfinal_rate = 1.0\njitter = true\nnoise_sd = 0.02",
     "checkpoint_every = 3": f"checkpoint_every = {EVERY}",
 }
-#: Of an iteration, bytes: its record in the history takes some hundred.
-MOST_GROWTH = 2048
+#: Of an iteration, bytes: its record in the history, and room for a copy at a
+#: checkpoint, take one to two thousand; an image or a texture would take more.
+MOST_GROWTH = 4096
 
 
 @dataclass(frozen=True)
