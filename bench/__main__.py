@@ -15,6 +15,7 @@ from bench.commands.overlay import BenchOverlay
 from bench.commands.poses import BenchPoses
 from bench.commands.quality import BenchQuality
 from bench.commands.scaling import BenchScaling
+from bench.commands.soak import BenchSoak
 from bench.commands.speed import (
     BenchAttack,
     BenchComposite,
@@ -32,6 +33,7 @@ COMMANDS = {
     "fit": BenchFit,
     "attack": BenchAttack,
     "memory": BenchMemory,
+    "soak": BenchSoak,
     "scaling": BenchScaling,
     "composite": BenchComposite,
     "steps": BenchSteps,

@@ -16,7 +16,7 @@ from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.vehicle.route.route import Route
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class IterationRecord:
     """What one iteration gave, measured before its update.
 

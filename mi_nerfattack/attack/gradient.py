@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -215,7 +214,15 @@ class GradientAttack(AbstractAttack):
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
-        rows = [list(asdict(record).values())[:4] for record in self.history]
+        rows = [
+            (
+                one.iteration,
+                one.objective,
+                one.cross_track_mean_m,
+                one.cross_track_max_m,
+            )
+            for one in self.history
+        ]
         costs = [cost for record in self.history for cost in record.costs]
         counts = [len(record.costs) for record in self.history]
         result: dict[str, np.ndarray] = {

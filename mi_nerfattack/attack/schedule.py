@@ -65,10 +65,10 @@ class Schedule:
     def _turn(self, objectives: Sequence[float]) -> int | None:
         """Return after how many iterations the rates began to fall."""
         last = math.ceil(0.75 * self.max_iterations)
-        for done in range(min(len(objectives), last) + 1):
-            if done == last or has_settled(objectives[:done]):
-                return done
-        return None
+        settled = np.flatnonzero(_settled_after(objectives[:last]))
+        if len(settled):
+            return int(settled[0])
+        return last if len(objectives) >= last else None
 
 
 def has_settled(objectives: Sequence[float]) -> bool:
@@ -80,12 +80,19 @@ def has_settled(objectives: Sequence[float]) -> bool:
     Args:
         objectives: of each iteration, minimised.
     """
-    done = len(objectives)
-    if done < _FEWEST:
-        return False
-    best = np.minimum.accumulate(objectives)
-    gain = best[0] - best[-1]
-    return bool(gain > 0 and best[-1 - done // 5] - best[-1] < LEAST_GAIN * gain)
+    return bool(_settled_after(objectives)[-1])
+
+
+def _settled_after(objectives: Sequence[float]) -> np.ndarray:
+    """Return :func:`has_settled` after each number of iterations from 0, (n + 1,)."""
+    settled = np.zeros(len(objectives) + 1, bool)
+    done = np.arange(_FEWEST, len(objectives) + 1)
+    if len(done):
+        best = np.minimum.accumulate(objectives)
+        last = best[done - 1]
+        gain, late = best[0] - last, best[done - 1 - done // 5] - last
+        settled[done] = (gain > 0) & (late < LEAST_GAIN * gain)
+    return settled
 
 
 def _fall(turn: int) -> int:

@@ -79,18 +79,16 @@ class Asset:
 
     def run(self) -> Result:
         """Render or read the views, fit, score and write."""
+        from mi_nerfattack.commands.shared.fit_report import begun_fit
+
+        with begun_fit(self.output, self.resume) as checkpoint:
+            return self._fit(checkpoint)
+
+    def _fit(self, checkpoint: Path) -> Result:
         from mi_nerfattack import variant
-        from mi_nerfattack.commands.shared.fit_report import (
-            check_output,
-            finish,
-            show_fit,
-        )
-        from mi_nerfattack.fit.checkpoint import check_unfinished
+        from mi_nerfattack.commands.shared.fit_report import finish, show_fit
         from mi_nerfattack.fit.fit import fit_object
 
-        check_output(self.output)
-        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
-        check_unfinished(checkpoint, self.resume)
         self._options(has_depth=True)  # checks them before views are rendered
         variant.ensure()
         with StageBars() as bars:

@@ -258,6 +258,7 @@ class Capture:
     def run(self) -> Result:
         """Render or estimate, and write."""
         from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.io import locks
 
         is_scene = self.source.suffix.lower() == ".xml"
         other = self.photographs if is_scene else self.scene
@@ -267,7 +268,7 @@ class Capture:
                 f"{option}: not for {self.source}, which is {kind}; leave it out"
             )
         check_empty(self.output)
-        with StageBars() as bars:
+        with locks.claimed(self.output, "choose another"), StageBars() as bars:
             if is_scene:
                 path = self.scene.write(self.source, self.output, self.seed, bars)
                 document, show = self._views(path)

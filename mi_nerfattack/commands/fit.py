@@ -121,18 +121,9 @@ class Fit:
     def run(self) -> Result:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
-        from mi_nerfattack.capture.inputs import find_bounds, read_depth
-        from mi_nerfattack.capture.transforms import read_images
         from mi_nerfattack.commands.shared.compare_report import compare_file
-        from mi_nerfattack.commands.shared.fit_report import (
-            check_output,
-            finish,
-            show_fit,
-        )
-        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.commands.shared.fit_report import begun_fit
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.fit.checkpoint import check_unfinished
-        from mi_nerfattack.fit.fit import fit_ngp
 
         variant.ensure()
         self.against.check()
@@ -145,9 +136,16 @@ class Fit:
             return compare_file(self.folder, self.against)
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
-        check_output(self.output)
-        checkpoint = self.output.with_suffix(".checkpoint.safetensors")
-        check_unfinished(checkpoint, self.resume)
+        with begun_fit(self.output, self.resume) as checkpoint:
+            return self._fit(self.output, checkpoint)
+
+    def _fit(self, output: Path, checkpoint: Path) -> Result:
+        from mi_nerfattack.capture.inputs import find_bounds, read_depth
+        from mi_nerfattack.capture.transforms import read_images
+        from mi_nerfattack.commands.shared.fit_report import finish, show_fit
+        from mi_nerfattack.commands.shared.progress import StageBars
+        from mi_nerfattack.fit.fit import fit_ngp
+
         images = read_images(self.folder, self.long_edge, self.skip_missing)
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
@@ -168,7 +166,7 @@ class Fit:
         return finish(
             result,
             images,
-            self.output,
+            output,
             provenance,
             checkpoint,
             depth,

@@ -44,14 +44,14 @@ class OverlayCommand:
 
     def run(self) -> Result:
         """Read, project and write."""
-        from contextlib import closing
+        from contextlib import closing, nullcontext
 
         import numpy as np
 
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.deploy.replay.environment import open_recording
-        from mi_nerfattack.io import files
+        from mi_nerfattack.io import files, locks
         from mi_nerfattack.io.video import check_fps, write_video
         from mi_nerfattack.robot.attacked import read_box
         from mi_nerfattack.robot.overlay import Overlay
@@ -62,7 +62,10 @@ class OverlayCommand:
         recording = open_recording(
             self.recording, views.camera, views.mount, views.period
         )
-        with closing(recording), StageBars() as bars:
+        alone = (
+            nullcontext() if is_video else locks.claimed(self.output, "choose another")
+        )
+        with closing(recording), alone, StageBars() as bars:
             for remark in recording.remarks:
                 bars.say(f"{self.recording}: {remark}")
             overlay = Overlay(box, recording.camera, keyed=not self.paste)
@@ -75,7 +78,6 @@ class OverlayCommand:
                 check_fps(fps)
                 write_video(self.output, frames, fps)
             else:
-                files.make_folder(self.output)
                 for index, frame in enumerate(frames):
                     files.write_image(self.output / f"{index:05d}.png", frame)
         told = f"Wrote {self.output}: {len(times)} frames with {box.name}"

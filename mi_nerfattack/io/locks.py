@@ -48,6 +48,33 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+@contextmanager
+def claimed(folder: Path, remedy: str | None = None) -> Iterator[None]:
+    """Make a folder and keep other processes out of it.
+
+    At the end it is removed, with the parents that were made, if nothing was written.
+
+    Args:
+        folder: may be missing.
+        remedy: what to do where it is not empty; None where it may hold anything.
+
+    Raises:
+        InputError: the folder cannot be made, another process works in it, or it holds
+            what it may not.
+    """
+    made = [path for path in (folder, *folder.parents) if not os.path.exists(path)]
+    files.make_folder(folder)
+    with exclusive(folder):
+        if remedy is not None and any(folder.iterdir()):
+            raise InputError(f"{folder}: exists and is not an empty folder; {remedy}")
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # one that is not empty stays, and so its parents
+                for path in made:
+                    path.rmdir()
+
+
 def wait_for(folder: str | Path) -> None:
     """Wait until no process works in a folder, which may be missing.
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.faults import full_disk, kill
 from helpers.painted_place import ROUTES, make_place, with_policy
 from helpers.roadside import PaintedEnvironment, small_grid
 
@@ -80,6 +81,63 @@ def test_an_interrupted_evaluation_continues(place, capsys, monkeypatch):
     assert cli.main([*place, "--json", "--drives", "kept"]) == 0
     assert steps == 100 + 3 * 76
     capsys.readouterr()
+
+
+def card_of(place: list[str], drives: str) -> dict:
+    """The card that the command writes."""
+    path = Path(f"card of {drives}.json")
+    assert cli.main([*place, "--drives", drives, "-o", str(path)]) == 0
+    return files.read_json(path)
+
+
+def test_a_killed_evaluation_continues(place, tmp_path):
+    setup = (
+        "import pytest\n"
+        "from helpers.painted_place import make_place\n"
+        "make_place(Path('.'), pytest.MonkeyPatch())\n"
+    )
+    kill([*place, "--drives", "kept"], tmp_path, "run_", at=3, setup=setup)
+    kept = {p: p.stat().st_mtime_ns for p in Path("kept").rglob("run_*")}
+    assert len(kept) == 2
+    found = card_of(place, "kept")
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
+    assert found == card_of(place, "whole")
+
+
+def test_a_full_disk_keeps_whole_drives(place, capsys):
+    words = [*place, "--drives", "kept", "-o", "card.json"]
+    with full_disk("run_", at=2):
+        assert cli.main(words) == 2
+    assert "no space left on the disk" in capsys.readouterr().err
+    kept = {p: p.stat().st_mtime_ns for p in Path("kept").rglob("*.*")}
+    assert len(kept) == 1 and not Path("card.json").exists()
+    assert all(files.read_safetensors(path) for path in kept)
+    with full_disk("card"):
+        assert cli.main(words) == 2
+    assert "card.json: no space left on the disk" in capsys.readouterr().err
+    assert cli.main(words) == 0
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
+    assert files.read_json("card.json") == card_of(place, "whole")
+
+
+def test_two_processes_share_a_folder_of_drives(place, monkeypatch):
+    """A second evaluation, from its beginning to its end within a drive of the first.
+
+    Each drive that both make is one's or the other's, whole.
+    """
+    whole, cards, steps = PaintedEnvironment.step, [], 0
+
+    def step(self, control):
+        nonlocal steps
+        steps += 1
+        if steps == 100:
+            cards.append(card_of(place, "kept"))
+        return whole(self, control)
+
+    monkeypatch.setattr(PaintedEnvironment, "step", step)
+    found = card_of(place, "kept")
+    assert found == cards[0] == card_of(place, "whole")
+    assert {path.suffix for path in Path("kept").rglob("*.*")} == {".safetensors"}
 
 
 def test_a_folder_that_cannot_be_made_is_told_before_the_first_drive(place, capsys):

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import film_scenes as scenes
+from helpers.faults import kill
 from PIL import Image
 
 from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.io import exr, files
+from mi_nerfattack.io import exr, files, locks
 from mi_nerfattack.io.video import even_size, write_video
 from mi_nerfattack.render.pathtrace.frames import FrameRenderer
 
@@ -305,6 +306,30 @@ def test_full_disk_keeps_whole_frames(run, monkeypatch, output):
     names = {path.name for path in Path().rglob("*") if path.is_file()}
     names -= {"scene.xml", "path.json", "routes.json"}
     assert names == {"frame_0000.exr", "frame_0001.exr"}
+
+
+@pytest.mark.parametrize("output", ["out", "a.mp4"])
+def test_a_second_process_is_refused(run, output):
+    folder = Path(output).with_suffix("" if output == "out" else ".frames")
+    folder.mkdir()
+    with locks.exclusive(folder):
+        code, _, err = run(f"scene.xml --path path.json -o {output}")
+    assert code == 2 and "another process works in it" in err
+    assert not list(folder.iterdir()) and not Path("a.mp4").exists()
+
+
+def test_a_killed_path_is_continued(run, tmp_path):
+    """Its whole frames stay, and what it left of another one is removed."""
+    words = "render scene.xml --path path.json -o out".split()
+    kill(words, tmp_path, "frame_0001")
+    names = [path.name for path in Path("out").iterdir()]
+    assert len(names) == 2 and "frame_0000.exr" in names
+    first = Path("out/frame_0000.exr")
+    written = first.stat().st_mtime_ns
+    assert run(f"{' '.join(words[1:])} --skip-existing")[0] == 0
+    assert first.stat().st_mtime_ns == written
+    names = sorted(path.name for path in Path("out").iterdir())
+    assert names == [f"frame_000{i}.exr" for i in range(3)]
 
 
 def test_too_bright_for_half_says_what_to_do(run):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import boxes
+from helpers.faults import signalled
 from helpers.loopback import free_port
 from helpers.posed_folders import write_transforms
 from scipy.spatial.transform import Rotation
@@ -23,6 +25,7 @@ from mi_nerfattack.io.video import open_video, write_video
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, look_at
 from mi_nerfattack.robot import attacked
 from mi_nerfattack.robot.attacked import FACES, Views, read_box, seen_most
+from mi_nerfattack.robot.follow import FollowServer
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -193,6 +196,46 @@ def test_overlay_of_recordings(run, tmp_path, capsys):
         assert message in error and "Traceback" not in error, error
         after = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
         assert after == before
+
+
+@pytest.mark.parametrize("output", ["out", "out.mp4"])
+def test_an_interrupted_overlay_leaves_whole_frames_and_no_video(
+    run, tmp_path, capsys, output
+):
+    pytest.importorskip("cv2")
+    poses = np.stack([look_at(np.array([0.0, 0, 1]), np.array([9.0, 0, 1]))] * 4)
+    frames = np.zeros((4, 32, 48, 3), np.uint8)
+    write_transforms(tmp_path / "drive", frames, from_fov(48, 32, 60.0), poses, {})
+    words = ["overlay", tmp_path / "drive", run, "-o", tmp_path / output]
+    number = signal.SIGINT if output == "out" else signal.SIGTERM
+    with signalled("overlaying", number, at=2):
+        assert cli.main([str(word) for word in words]) == 130
+    assert "mi-nerfattack: interrupted" in capsys.readouterr().err
+    kept = sorted((tmp_path / "out").glob("*"))
+    assert len(kept) == (2 if output == "out" else 0)
+    assert all(files.read_image(path).shape == (32, 48, 3) for path in kept)
+    assert len(list(tmp_path.iterdir())) == 1 + bool(kept)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_monitor_at_work(run, tmp_path, capsys, monkeypatch, number):
+    """And what it listened at is free again."""
+    poses = tmp_path / "poses.csv"
+    poses.write_text("time_s,x_m,y_m,heading_rad\n0,4,3,0\n900,4.1,3,0\n")
+    told = []
+
+    def send(server, pose) -> None:
+        told.append(pose)
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(FollowServer, "_tell", send)
+    address = f"127.0.0.1:{free_port()}"
+    words = ["monitor", run, "--tracker", f"replay:{poses}", "--listen", address]
+    for _ in range(2):
+        assert cli.main([*map(str, words), "--face", "left"]) == 0
+        out, err = capsys.readouterr()
+        assert out.endswith("Ended\n") and "Traceback" not in err
+    assert len(told) == 2
 
 
 @pytest.mark.parametrize("period", [0.2, 1e-4])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,29 @@ def check_output(path: Path) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: is not a folder; make it first")
     files.check_writable(path)
+
+
+@contextmanager
+def begun_fit(output: Path, resume: bool) -> Iterator[Path]:
+    """Check that a fit may begin, and keep other processes out until it ends.
+
+    It claims the folder of its report.
+
+    Args:
+        output: field file.
+        resume: whether a fit to it may be unfinished.
+
+    Returns:
+        the path of its checkpoint.
+    """
+    from mi_nerfattack.fit.checkpoint import check_unfinished
+    from mi_nerfattack.io import locks
+
+    check_output(output)
+    with locks.claimed(report_folder(output)):
+        checkpoint = output.with_suffix(".checkpoint.safetensors")
+        check_unfinished(checkpoint, resume)
+        yield checkpoint
 
 
 def report_folder(output: Path) -> Path:

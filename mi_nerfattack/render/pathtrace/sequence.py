@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_nerfattack.io import exr, files
+from mi_nerfattack.io import exr, files, locks
 from mi_nerfattack.io.resumable import differences, refuse
 from mi_nerfattack.io.video import check_fps, write_video
 from mi_nerfattack.render.pathtrace.frames import (
@@ -76,9 +76,10 @@ def render_folder(
 
     Raises:
         InputError: a frame that cannot be written, or one that is there and shows
-            something else.
+            something else, or another process works in the folder.
     """
-    return _render(shot, folder, progress, lambda frame: frame)
+    with locks.exclusive(files.make_folder(folder)):
+        return _render(shot, Path(folder), progress, lambda frame: frame)
 
 
 def render_video(
@@ -106,12 +107,13 @@ def render_video(
     folder = working_folder(path)
     # 8 bits clip what is too bright for 16-bit floats
     exact = replace(shot, precision="float")
-    paths = _render(exact, folder, progress, Frame.colour_only)
-    size = write_video(path, _read_srgb(paths), fps)
-    for frame in paths:
-        frame.unlink()
-    if not any(folder.iterdir()):
-        folder.rmdir()
+    with locks.exclusive(files.make_folder(folder)):
+        paths = _render(exact, folder, progress, Frame.colour_only)
+        size = write_video(path, _read_srgb(paths), fps)
+        for frame in paths:
+            frame.unlink()
+        if not any(folder.iterdir()):
+            folder.rmdir()
     return size
 
 
@@ -122,13 +124,14 @@ def working_folder(path: str | Path) -> Path:
 
 def _render(
     shot: Shot,
-    folder: str | Path,
+    folder: Path,
     progress: Callable[[int, int, bool], None],
     select: Callable[[Frame], Frame],
 ) -> list[Path]:
-    root = files.make_folder(folder)
+    for left in filter(locks.is_partial, folder.glob(".frame_*.tmp")):
+        left.unlink(missing_ok=True)  # of a process that was killed
     total = len(shot.camera_to_world)
-    paths = [frame_path(root, i) for i in range(total)]
+    paths = [frame_path(folder, i) for i in range(total)]
     files.check_writable(paths[0])
     for i, (path, pose) in enumerate(zip(paths, shot.camera_to_world, strict=True)):
         seed = (shot.seed + i) % 2**32

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import toy_loop as toy
 
-from mi_nerfattack.attack.schedule import Schedule
+from mi_nerfattack.attack.schedule import Schedule, has_settled
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, GridLayout
 
@@ -83,6 +83,25 @@ def test_rates_fall_when_nothing_more_is_gained_or_time_is_short():
     assert not long.is_over([*settled, 0.0, 0.0])
     assert long.is_over([*settled, 0.0, 0.0, 0.0])
     assert long.rate([0.5] * 70) == 1.0  # stuck from the first is not converged
+
+
+def test_a_search_settles_at_its_first_fifth_without_gain(rng):
+    """By the definition, prefix by prefix."""
+    for share in (0.3, 0.6, 0.9):
+        moves = np.where(rng.random(120) < share, 0, rng.random(120) - 0.7)
+        objectives = np.cumsum(moves).tolist()
+
+        def is_settled(done: int, values=objectives) -> bool:
+            least = [min(values[: k + 1]) for k in range(done)]
+            gain = least[0] - least[-1]
+            return gain > 0 and least[-1 - done // 5] - least[-1] < 0.02 * gain
+
+        first = next((k for k in range(10, 121) if is_settled(k)), 750)
+        schedule = Schedule(1000, 0.01)
+        rates = [schedule.rate(objectives[:k]) for k in range(121)]
+        assert rates[:first] == [1.0] * min(first, 121)
+        assert all(rate < 1 for rate in rates[first:])
+        assert has_settled(objectives) == is_settled(120)
 
 
 def test_statistics_of_a_texture_that_is_known():

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import tempfile
 
 import pytest
+from helpers.faults import signalled
 from helpers.page_reader import PageReader
 
 from mi_nerfattack import cli
@@ -108,6 +111,30 @@ def test_drives_alone_come_back(swept, command, tmp_path):
     assert set(found["cells"][0]["largest_difference"].values()) == {0}
     cost = json.loads((folder_of(out, cell) / "metrics.json").read_text())["cost"]
     assert cost["processes"] == 2  # the attack's, and this one
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_replay_goes_on(swept, command, tmp_path, monkeypatch, number):
+    """Where it has a folder of its own; else nothing is left."""
+    folder, _, cell = swept
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    words = folder, 0, "--json"
+    with signalled("cells", number, at=12):
+        assert command(*words)[0] == 130
+    assert not list(tmp_path.iterdir())
+    if number == signal.SIGTERM:
+        return
+    out = tmp_path / "out"
+    with signalled("cells", number, at=12):
+        assert command(*words, "-o", out)[0] == 130
+    kept = {p: p.stat().st_mtime_ns for p in out.rglob("drives/*")}
+    assert kept
+    code, told = command(*words, "-o", out)
+    assert code == 0
+    assert set(json.loads(told)["largest_difference"].values()) == {0}
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
+    cost = json.loads((folder_of(out, cell) / "metrics.json").read_text())["cost"]
+    assert cost["processes"] == 2
 
 
 def test_the_sweep_on_one_page(swept, tmp_path):

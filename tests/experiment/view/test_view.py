@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import socket
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.faults import signalled
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack import cli
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.errors import InputError, SetupError
+from mi_nerfattack.experiment.view import scene
 from mi_nerfattack.experiment.view import viewer as module
 from mi_nerfattack.experiment.view.frames import FULL, FrameSource, heat
 from mi_nerfattack.experiment.view.points import (
@@ -236,6 +239,26 @@ def test_a_drive_that_there_is_not(viewed):
 def test_a_page_needs_a_name(found_run, capsys):
     assert cli.main(["view", str(found_run), "-o", "page.png"]) == 2
     assert "page.png; name an .html file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_viewer(
+    found_run, contents, tmp_path, capsys, monkeypatch, number
+):
+    """While it serves, as is meant; while a page is computed, without a page."""
+
+    def send(self, patience_s: float) -> None:
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(Viewer, "turn", send)
+    monkeypatch.setattr(scene, "read_contents", lambda *_: contents)
+    assert cli.main(["view", str(found_run), "--port", "0"]) == 0
+    assert capsys.readouterr().out.endswith("Ended\n")
+    page = tmp_path / "page.html"
+    with signalled("frames", number):
+        assert cli.main(["view", str(found_run), "-o", str(page)]) == 130
+    assert "mi-nerfattack: interrupted" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_port_that_is_taken():

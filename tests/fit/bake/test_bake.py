@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import signal
 
 import drjit as dr
 import numpy as np
 import pytest
+from helpers.faults import signalled
 from helpers.small_fields import homogeneous, small_ngp
 
 from mi_nerfattack import cli
@@ -70,16 +72,40 @@ def test_sky_behind_is_that_of_the_field(field):
     np.testing.assert_allclose(*pair, atol=1e-6)
 
 
-def test_the_command_writes_field_and_report(field, tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def words(field, tmp_path, monkeypatch) -> list[str]:
+    """The command, in a folder with what it needs."""
     monkeypatch.chdir(tmp_path)
     field.lower, field.upper = np.array([-1.0, -1, 0.4]), np.array([1.0, 1, 2.4])
     save_field("field.safetensors", field)
     routes = {"line": {"goal": 0, "points_m": [[-1.6, 0.1], [0.2, 0.1]]}}
     routes["line"] |= {"lane_width_m": 3.5, "speed_ms": 5.0}
     (tmp_path / "routes.json").write_text(json.dumps(routes))
-    words = "bake field.safetensors --routes routes.json -o b.safetensors --views 4"
-    size = ["--width", "32", "--height", "20", "--cone", "0.1"]
-    assert cli.main([*words.split(), *size, "--json"]) == 0
+    line = "bake field.safetensors --routes routes.json -o b.safetensors --views 4"
+    return [*line.split(), "--width", "32", "--height", "20", "--cone", "0.1"]
+
+
+@pytest.mark.parametrize(
+    ("stage", "number", "left"),
+    [
+        ("baking", signal.SIGINT, []),
+        ("comparing", signal.SIGTERM, ["b.safetensors"]),
+    ],
+)
+def test_an_interrupted_bake_leaves_a_whole_file_or_none(
+    words, tmp_path, capsys, stage, number, left
+):
+    with signalled(stage, number):
+        assert cli.main(words) == 130
+    assert "mi-nerfattack: interrupted" in capsys.readouterr().err
+    found = sorted(path.name for path in tmp_path.iterdir())
+    assert found == [*left, "field.safetensors", "routes.json"]
+    for name in left:
+        load_field(name)
+
+
+def test_the_command_writes_field_and_report(words, tmp_path, capsys):
+    assert cli.main([*words, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["psnr_db"] >= facts["psnr_least_db"] > 10
     baked = load_field("b.safetensors")

@@ -1,0 +1,1 @@
+"""Thousands of iterations of one attack, watched for growth and drift."""
