@@ -12,6 +12,7 @@ from bench.commands.matrix import BenchMatrix
 from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
 from bench.commands.overlay import BenchOverlay
+from bench.commands.phone import BenchPhone
 from bench.commands.poses import BenchPoses
 from bench.commands.quality import BenchQuality
 from bench.commands.scaling import BenchScaling
@@ -48,6 +49,7 @@ COMMANDS = {
     "matrix": BenchMatrix,
     "overlay": BenchOverlay,
     "poses": BenchPoses,
+    "phone": BenchPhone,
     "imports": BenchImports,
     "frames": BenchFrames,
     "gpu": BenchGpu,

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Any
 
 import tyro
 
 from mi_nerfattack.commands.shared.result import Result
 
-if TYPE_CHECKING:
-    import numpy as np
+_PLACED, _ROTATION_DEG, _POSITION = 0.96, 1.0, 0.01
+_LOSS_DB = 0.7
 
 
 @dataclass(frozen=True)
@@ -21,13 +23,23 @@ class BenchPoses:
     Both are brought together by a similarity of the cameras' places. Prints photographs
     placed, and medians of rotation and position, the latter as a share of the greatest
     distance between two cameras. Exit code 1 unless 96 % are placed, within 1 degree
-    and 1 %.
+    and 1 %, and with --steps the field of our poses is within 0.7 dB of the other.
     """
 
     folder: tyro.conf.Positional[Path]
     """Posed photographs, as `fit` reads them; `$NERFATTACK_DATA/fox`, for one."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder for photographs, poses and fields, where the same command goes on; of
+    other options, another. By default nothing is kept."""
+    mixed: bool = False
+    """Turn and zoom the photographs: of five in a row, one stays, two are held sideways
+    and EXIF data say so, one is zoomed in by 1.5, one lies on its side."""
     long_edge: int = 1600
     """Look for features at most at this size, pixels."""
+    steps: int | None = None
+    """Fit small fields to poses given and found, with so many steps each."""
+    fit_long_edge: int = 480
+    """Of the photographs that are fitted to, pixels."""
     seed: int = 0
     """Of the random choices."""
     json: bool = False
@@ -35,71 +47,33 @@ class BenchPoses:
 
     def run(self) -> Result:
         """Estimate, compare and print."""
-        import tempfile
-
-        import numpy as np
-
-        from mi_nerfattack.capture.photographs.estimate import (
-            PoseOptions,
-            estimate_poses,
-        )
+        from bench.photographs import compare_fits, compare_poses, place
+        from mi_nerfattack import variant
         from mi_nerfattack.capture.transforms import read_images
-        from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.io import files
 
+        variant.ensure()
         given = read_images(self.folder, skip_missing=True)
-        names = [f"{i:04d}.png" for i in range(len(given))]
-        with tempfile.TemporaryDirectory() as work, StageBars() as bars:
-            source, output = Path(work) / "photographs", Path(work) / "out"
-            source.mkdir()
-            for name, image in zip(names, given.images, strict=True):
-                files.write_image(source / name, image[..., :3])
-            result = estimate_poses(
-                source,
-                output,
-                PoseOptions(long_edge_px=self.long_edge, seed=self.seed),
-                lambda stage, done, total: bars.show(
-                    stage, done, total, f"{done} of {total}"
-                ),
-            )
-        placed = [names.index(name) for name in result.placed]
-        turns, shares = pose_errors(
-            result.found.camera_to_world, given.camera_to_world[placed]
-        )
-        found = {
-            "photographs": len(names),
-            "placed": len(placed),
-            "rotation_deg": float(np.median(turns)),
-            "position_share": float(np.median(shares)),
-            "reprojection_error_px": result.error_px,
-        }
-        good = found["rotation_deg"] <= 1 and found["position_share"] <= 0.01
-        good = good and len(placed) >= 0.96 * len(names)
+        with contextlib.ExitStack() as stack:
+            work = self.output
+            if work is None:
+                work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            place(given, work, self.mixed, self.long_edge, self.seed)
+            found: dict[str, Any] = dict(compare_poses(work))
+            if self.steps is not None:
+                found |= compare_fits(work, self.steps, self.fit_long_edge)
 
         def show() -> None:
             for name, value in found.items():
                 print(f"{name}: {value:.5g}")
 
-        return Result(found, show, int(not good))
+        return Result(found, show, int(not _is_good(found)))
 
 
-def pose_errors(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compare poses (n, 4, 4) after a similarity of their places.
-
-    Returns:
-        rotations that remain, degrees, and distances by the greatest one between two
-        given places, (n,) each.
-    """
-    import numpy as np
-    from scipy.spatial.distance import pdist
-    from scipy.spatial.transform import Rotation
-
-    eyes, wanted = found[:, :3, 3], given[:, :3, 3]
-    centred, target = eyes - eyes.mean(0), wanted - wanted.mean(0)
-    turn = Rotation.align_vectors(target, centred)[0]
-    turned = turn.apply(centred)
-    scale = (turned * target).sum() / (turned**2).sum()
-    apart = np.linalg.norm(scale * turned - target, axis=1) / pdist(wanted).max()
-    left = turn * Rotation.from_matrix(found[:, :3, :3])
-    left = left.inv() * Rotation.from_matrix(given[:, :3, :3])
-    return np.degrees(left.magnitude()), apart
+def _is_good(found: dict[str, Any]) -> bool:
+    good = found["placed"] >= _PLACED * found["photographs"]
+    good = good and found["rotation_deg"] <= _ROTATION_DEG
+    good = good and found["position_share"] <= _POSITION
+    best = max(
+        found.get(f"{side}_psnr_db", 0.0) for side in ("given", "given_as_it_came")
+    )
+    return good and best - found.get("found_psnr_db", 0.0) <= _LOSS_DB

@@ -1,0 +1,1 @@
+"""A made phone video of the bundled room, through the whole chain."""
