@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8
@@ -24,7 +26,9 @@ from mi_nerfattack.vehicle.route.route import Route, load_routes
 _LATERAL_SD, _BEYOND = 0.25, 3 / 7
 _BESIDE_SHARE = 0.4
 _HEADING_SD_DEG, _ANY_HEADING_SHARE = 15.0, 0.3
-_OTHER_HEIGHT_SHARE, _HEIGHT_RANGE, _PITCH_SD_DEG = 0.3, (0.8, 3.0), 6.0
+_OTHER_HEIGHT_SHARE, _PITCH_SD_DEG = 0.3, 6.0
+_HEIGHTS = 4 / 7, 15 / 7  # in heights of the camera: 0.8 to 3 m, of 1.4 m
+_ROUNDS = 20  # of draws in place of views from within things
 
 
 def drive_poses(
@@ -37,7 +41,8 @@ def drive_poses(
     offset normal with standard deviation 0.9 m, cut at the lane's edges, or for 40 % of
     the poses uniform up to 1.5 m beside the lane; heading normal around the route's
     with 15 degrees, or for 30 % uniform over all headings. Another 30 % sit at a height
-    uniform in 0.8 to 3 m with the pitch scattered by 6 degrees, the rest as mounted.
+    uniform in 0.8 to 3 m, of a camera 1.4 m high and others in proportion, with the
+    pitch scattered by 6 degrees, the rest as mounted.
 
     Args:
         routes: at least one.
@@ -73,7 +78,8 @@ def drive_poses(
         rng.normal(0, np.radians(_HEADING_SD_DEG), n),
     )
     is_other = rng.uniform(size=n) < _OTHER_HEIGHT_SHARE
-    height = np.where(is_other, rng.uniform(*_HEIGHT_RANGE, n), mount.height_m)
+    low, high = (factor * mount.height_m for factor in _HEIGHTS)
+    height = np.where(is_other, rng.uniform(low, high, n), mount.height_m)
     pitch = mount.pitch_deg + is_other * rng.normal(0, _PITCH_SD_DEG, n)
     poses = []
     for i in range(n):
@@ -87,6 +93,34 @@ def drive_poses(
     return np.stack(poses)
 
 
+def _free_poses(
+    scene: Any, routes: Sequence[Route], n: int, seed: int, mount: CameraMount | None
+) -> np.ndarray:
+    """Draw poses; those from which something hides the lane's middle, anew."""
+    poses, turn = drive_poses(routes, n, seed, mount), 0
+    while (hidden := _is_hidden(scene, routes, poses)).any():
+        turn += 1
+        if turn > _ROUNDS:
+            raise InputError(
+                f"views: {hidden.sum()} of {n} are within things that stand beside the "
+                "lane; is the mount of the camera that of the car?"
+            )
+        poses[hidden] = drive_poses(routes, n, seed + turn, mount)[hidden]
+    return poses
+
+
+def _is_hidden(scene: Any, routes: Sequence[Route], poses: np.ndarray) -> np.ndarray:
+    """Tell whether something stands between cameras and the lane beside them, (n,)."""
+    middle = np.concatenate([route.points for route in routes])
+    eyes = poses[:, :3, 3]
+    away = eyes[:, None, :2] - middle
+    near = np.square(away).sum(2).argmin(1)
+    start = np.column_stack([middle[near], eyes[:, 2]])
+    ray = mi.Ray3f(mi.Point3f(start.T), mi.Vector3f((eyes - start).T))
+    ray.maxt = 1.0
+    return np.array(scene.ray_test(ray))
+
+
 def capture_scene(
     scene_path: str | Path,
     routes_path: str | Path,
@@ -96,8 +130,12 @@ def capture_scene(
     spp: int,
     seed: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    mount: CameraMount | None = None,
 ) -> Path:
     """Write posed sRGB images of a driving scene, for fitting a field.
+
+    A view from where something stands between the camera and the lane's middle, as
+    within furniture, is drawn anew.
 
     Writes `images/0000.png`..., `depth.safetensors` (tensor `depth`, (n, height,
     width), metres, see `View.depth`) and, last, `transforms.json`.
@@ -111,15 +149,20 @@ def capture_scene(
         spp: samples per pixel.
         seed: of poses and samples.
         progress: called with (views done, n) after each view.
+        mount: the driving camera; None for the default mount.
 
     Returns:
         Path of `transforms.json`.
+
+    Raises:
+        InputError: the scene has no integrator, or leaves no free place for a view.
     """
     require_colour()
-    poses = drive_poses(load_routes(routes_path), n, seed)
+    routes = load_routes(routes_path)
     scene = load_scene(scene_path)
     if scene.integrator() is None:
         raise InputError(f"{scene_path}: has no integrator; add one, for instance path")
+    poses = _free_poses(scene, routes, n, seed, mount)
     path = begin_posed(out_folder)
     root = path.parent
     names = [f"images/{i:04d}.png" for i in range(n)]

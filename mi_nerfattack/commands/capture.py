@@ -37,6 +37,12 @@ class SceneArguments:
     """Of a view, pixels."""
     fov_deg: float = 90.0
     """Horizontal field of view."""
+    height_m: float = 1.4
+    """Of the car's camera above the road, metres."""
+    forward_m: float = 0.5
+    """Of the car's camera before what its routes are of, metres."""
+    pitch_deg: float = 6.0
+    """Of the car's camera, downwards."""
     spp: int = 16
     """Samples per pixel."""
 
@@ -44,7 +50,7 @@ class SceneArguments:
         """Render and write; return the path of the `transforms.json`."""
         from mi_nerfattack import variant
         from mi_nerfattack.capture.scene import capture_scene
-        from mi_nerfattack.render.camera.intrinsics import from_fov
+        from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
         from mi_nerfattack.report.plots.place import routes_picture
         from mi_nerfattack.vehicle.route.route import load_routes
 
@@ -55,6 +61,7 @@ class SceneArguments:
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: {getattr(self, name)}; at least 1")
         camera = from_fov(self.width, self.height, self.fov_deg)
+        mount = CameraMount(self.height_m, self.forward_m, self.pitch_deg)
         path = capture_scene(
             scene,
             self.routes,
@@ -64,11 +71,12 @@ class SceneArguments:
             self.spp,
             seed,
             bars.counter("rendering views"),
+            mount,
         )
         show = bars.counter("drawing the place")
         show(0, 1)
         picture = path.parent / "place.png"
-        routes_picture(picture, scene, load_routes(self.routes), camera)
+        routes_picture(picture, scene, load_routes(self.routes), camera, mount)
         show(1, 1)
         bars.say(f"{picture}: scene, routes and lanes from above; look at it first")
         return path

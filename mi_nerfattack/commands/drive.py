@@ -66,6 +66,9 @@ class DriveCommand:
     """SN<serial>.conf of the ZED; the only one of its settings by default."""
     zed_mode: str | None = None
     """VGA (default), HD720, HD1080, HD2K."""
+    overlay: str | None = None
+    """Finished run of attack: its box stands in every frame that the policy gets and
+    the log has, by the tracked pose, before all else."""
     tracker: str | None = None
     """vicon:HOST[:PORT], this computer's address in the tracker's network, or
     motioncapture:KIND:HOST; with --on-block replay:FILE, too. To be given."""
@@ -213,6 +216,8 @@ def _statement(config: DriveConfig, route: Route, settings: DriveSettings) -> st
         f"{ages.loop_s:g} s",
         f"Camera     {where}",
     ]
+    if config.overlay is not None:
+        lines.append(f"Overlay    the attacked box of {config.overlay}")
     if not config.simulated:
         lines += [
             f"Tracker    {config.tracker} from {config.tracker_sender or 'any'}, body "

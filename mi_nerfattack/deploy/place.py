@@ -79,28 +79,27 @@ def bundled_place(name: str = "intersection") -> Place:
     """Return a bundled scene with its routes, objects and car.
 
     Args:
-        name: "intersection", with the full-size car; or "room", with the small car on
-            its square track, which has no field.
+        name: "intersection", with the full-size car and a hydrant; or "room", with the
+            small car on its square track and a cube.
     """
     from mi_nerfattack.scenes import bundled
 
     if name not in _CARS:
         raise InputError(f"place: {name!r}; one of {', '.join(_CARS)}")
-    car, mount = _CARS[name]
-    field = "intersection/field.safetensors"
+    car, mount, thing = _CARS[name]
     return Place(
         scene=bundled(f"{name}/scene.xml"),
-        field=bundled(field) if name == "intersection" else None,
+        field=bundled(f"{name}/field.safetensors"),
         routes=bundled(f"{name}/routes.json"),
-        objects=(bundled("hydrant/field.safetensors"),),
+        objects=(bundled(f"{thing}/field.safetensors"),),
         camera=from_fov(200, 66, 90.0),
         mount=mount,
         car=car,
     )
 
 
-#: Cars of the bundled places, and where their cameras are.
+#: Cars of the bundled places, where their cameras are, and what stands there.
 _CARS = {
-    "intersection": (CAR, CameraMount()),
-    "room": (SMALL_CAR, CameraMount(height_m=0.2, forward_m=0.3, pitch_deg=10.0)),
+    "intersection": (CAR, CameraMount(), "hydrant"),
+    "room": (SMALL_CAR, CameraMount(0.2, forward_m=0.3, pitch_deg=10.0), "cube"),
 }

@@ -128,6 +128,18 @@ class PilotNet(nn.Module):
         return network.eval()
 
 
+def stored_unit(path: str | Path) -> str | None:
+    """Return the unit of the control that a file of `PilotNet.save` gives.
+
+    Returns:
+        "rad/s" or "rad"; None of a file that cannot be read, which `load` explains.
+    """
+    try:
+        return files.read_safetensors(path, [])[1].get("unit", "rad/s")
+    except InputError:
+        return None
+
+
 def load_checked(module: nn.Module, tensors: dict[str, np.ndarray], owner: str) -> None:
     """Copy tensors into a module after checking each of them.
 

@@ -18,7 +18,7 @@ from mi_nerfattack.policy.exported.load import load_exported, load_torchscript
 from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal, NoGoal, OneHotGoal
 from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
-from mi_nerfattack.policy.pilotnet import PilotNet
+from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
 from mi_nerfattack.policy.preprocess import (
     AbstractTransform,
     Crop,
@@ -178,8 +178,7 @@ class AbstractNetworkSection(AbstractPolicySection):
         goal: AbstractGoal | None = None,
     ) -> TorchPolicy:
         """Join network, goal and preprocessing."""
-        batch = self.batch or batch
-        if batch not in (None, 1):
+        if (batch := self.batch or batch) not in (None, 1):
             raise InputError(
                 f"{self.source}: takes exactly {batch} images at a time; export it "
                 "with a free batch size, or for one image"
@@ -221,10 +220,14 @@ class PilotNetSection(AbstractNetworkSection):
 
     kind: Literal["pilotnet"] = "pilotnet"
 
+    def unit(self) -> str | None:
+        """Return the unit of the control; None if it is converted or unknown."""
+        return stored_unit(self.file.file) if self.control_scale == 1 else None
+
     def build(self) -> AbstractPolicy:
         """Load the network."""
-        module = PilotNet.load(self.file.file)
-        return self._policy(module, goal=IntegerGoal(module.goals))
+        net = PilotNet.load(self.file.file)
+        return self._policy(net, goal=IntegerGoal(net.goals))
 
 
 class ModuleSection(AbstractNetworkSection):

@@ -268,12 +268,11 @@ class Scenario(Section):
                         f"{label}: {name} drives a car with wheels, whose control is "
                         "not that of a custom vehicle; take mitsuba",
                     )
-        if model in STEERED and isinstance(self.policy, PilotNetSection):
-            refuse(
-                "vehicle.model",
-                f"{model} takes a steering angle in radians, PilotNet gives a heading "
-                "rate in rad/s; use dubins, or a policy of another kind",
-            )
+        if isinstance(self.policy, PilotNetSection) and model != "custom":
+            given, taken = self.policy.unit(), "rad" if model in STEERED else "rad/s"
+            if given not in (None, taken):
+                told = f"takes {taken}, and {self.policy.source} gives {given}"
+                refuse("vehicle.model", f"{model} {told}; take another of them")
         return self
 
     def _check_placed(self) -> None:

@@ -44,8 +44,8 @@ class Preset:
     collecting: CollectSettings = field(default_factory=CollectSettings)
 
 
-#: Beside the small car's track, in its scale.
-_ROOM_ROADSIDE = Roadside(((0.2, 0.5),), gap_m=(0.05, 0.6), clearance_m=0.05)
+#: Beside the small car's track, in its scale: cubes of 0.15 to 0.35 m.
+_ROOM_ROADSIDE = Roadside(((0.15, 0.35),), gap_m=(0.05, 0.6), clearance_m=0.05)
 
 #: The small car's track: a tenth of the lengths of the intersection.
 _ROOM = CollectSettings(

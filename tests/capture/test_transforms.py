@@ -378,6 +378,32 @@ def test_capture_scene(tmp_path):
     assert not path.exists()
 
 
+def test_no_view_is_taken_from_within_what_stands_beside_the_lane(tmp_path):
+    """A block along the left side from 0.4 m on, where views reach 0.56 m."""
+    scene = """<scene version="3.0.0"><integrator type="path"/>
+    <emitter type="constant"/><shape type="cube"><transform name="to_world">
+    <scale x="30" y="1" z="{height}"/><translate y="1.4"/></transform></shape>
+    </scene>"""
+    points = straight_route().points.tolist()
+    route = {"goal": 0, "lane_width_m": 0.6, "speed_ms": 1.0, "points_m": points}
+    (tmp_path / "routes.json").write_text(json.dumps({"straight": route}))
+    for name, height in (("low", 0.01), ("high", 2)):
+        (tmp_path / f"{name}.xml").write_text(scene.format(height=height))
+        path = capture_scene(
+            tmp_path / f"{name}.xml",
+            tmp_path / "routes.json",
+            tmp_path / name,
+            80,
+            from_fov(2, 1, 90.0),
+            1,
+            seed=0,
+            mount=CameraMount(0.2, 0.0, 10.0),
+        )
+        eyes = read_transforms(path).camera_to_world[:, :3, 3]
+        assert 0.2 * 4 / 7 <= eyes[:, 2].min() and eyes[:, 2].max() <= 0.2 * 15 / 7
+        assert (eyes[:, 1] > 0.4).any() == (name == "low")
+
+
 class TestCameras:
     @pytest.mark.parametrize(
         ("cameras", "message"),

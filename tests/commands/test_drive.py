@@ -7,7 +7,9 @@ import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 
+import numpy as np
 import pytest
+from helpers.boxes import COLOURS, made_box
 from helpers.driving_stand_ins import (
     SETTINGS,
     Bench,
@@ -17,12 +19,14 @@ from helpers.driving_stand_ins import (
     StandInPilot,
     StandInTracker,
 )
+from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.cli import main
 from mi_nerfattack.commands.drive import _arm, _check, _drive
 from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.robot.devices import AbstractEnable
 from mi_nerfattack.robot.drive import rig as rigs
 from mi_nerfattack.robot.drive.config import read_config
@@ -49,6 +53,35 @@ def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
     assert "camera     ready" in told and "Armed" not in told
     assert "enable     ready" in told
     assert "at 1.5 m/s, cut from 3.0 by --max-speed-ms" in told
+
+
+def test_an_attacked_box_stands_in_what_the_policy_sees(
+    tmp_path, variant, capsys, monkeypatch
+):
+    """In the corner ahead, its back towards the car; the log has it, too."""
+    pytest.importorskip("cv2")
+    turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    pose = Pose(turned, np.array([1.7, -1.6, 0.0]), 0.3)
+    monkeypatch.setattr(rigs, "read_box", lambda run: (made_box(pose=pose), None))
+    log = tmp_path / "drive.mcap"
+    words = ["--overlay", "runs/found", "--duration-s", "0.3", "--log", str(log)]
+    assert main([*SIMULATED, *words]) == 0
+    assert "Overlay    the attacked box of runs/found" in capsys.readouterr().out
+    recording = open_recording(log, None, CameraMount())
+    image = recording.image(0).astype(int)
+    seen = np.abs(image - COLOURS["back"]).max(-1) < 40
+    rows, columns = np.nonzero(seen)
+    assert seen.sum() > 100 and abs(columns.mean() - 100) < 5
+    assert 7 < rows.min() and rows.max() < 30  # half of it above the horizon
+
+
+@pytest.mark.slow
+def test_the_rooms_policy_stays_in_its_lane(tmp_path, variant, capsys):
+    log = str(tmp_path / "drive.mcap")
+    words = ["drive", "--policy", "bundled:room.toml", "--simulated", "--spp", "1"]
+    assert main([*words, "--duration-s", "24", "--log", log, "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["laps"] > 2 and figures["largest_error_m"] < 0.152
 
 
 def test_a_drive_as_json(tmp_path, variant, capsys):

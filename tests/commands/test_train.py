@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,11 @@ from mi_nerfattack.commands.train import Train
 from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.io import files
 from mi_nerfattack.rollout.drive import departure_limit
+from mi_nerfattack.scenes import bundled
 from mi_nerfattack.training.presets import find_preset
 from mi_nerfattack.vehicle.route.route import load_routes
+
+SCENE, ROUTES = (str(bundled(f"room/{name}")) for name in ("scene.xml", "routes.json"))
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -27,7 +31,7 @@ def run_train(tmp_path, *arguments: str) -> int:
     [
         (["--preset", "desktop"], "preset: 'desktop'; one of laptop"),
         (["--frames", "moon", "3"], "environment: 'moon'; one of surrogate"),
-        (["--preset", "room"], "no field; make one with 'mi-nerfattack fit'"),
+        (["--scene", SCENE, "--routes", ROUTES], "no field; make one with"),
         (["--skies", "dusk"], "sky: 'dusk'"),
         (["--more", "{empty}"], "no frames in it"),
         (["--workers", "0"], "workers: 0"),
@@ -59,9 +63,9 @@ def test_what_cannot_be_written_is_told_before_the_first_frame(tmp_path, capsys,
 
 
 def test_frames_of_rounds_that_are_not_done_need_no_environment():
-    """The preset's rounds have surrogate frames, and the room has no field."""
+    """The preset's rounds have surrogate frames, and this room has no field."""
     train = Train(Path("o"), Path("d"), frames={"mitsuba": 8}, dagger_rounds=0)
-    preset, room = train._preset(), bundled_place("room")
+    preset, room = train._preset(), replace(bundled_place("room"), field=None)
     settings = train._settings(preset)
     assert [site.name for site in train._sites(preset, room, settings)] == ["mitsuba"]
 

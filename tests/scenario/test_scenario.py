@@ -10,6 +10,7 @@ from helpers.scenario_text import write_named_files
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import differences
+from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.scenario.named_file import resolve
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
@@ -202,6 +203,21 @@ def test_a_wrong_object_is_one_problem(write):
     with pytest.raises(InputError, match=r"objects.0.position_m: [^\n]*$") as caught:
         load_scenario(write(text))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "rad"])
+def test_a_vehicle_takes_pilotnets_unit_or_a_factor_to_its_own(write, tmp_path, unit):
+    PilotNet(goals=1, max_control=0.4, unit=unit).save(tmp_path / "policy.safetensors")
+    steered = '[vehicle]\nmodel = "ackermann"\n[attack]'
+    turned = MINIMAL.replace("[attack]", steered)
+    fits, fits_not = (turned, MINIMAL) if unit == "rad" else (MINIMAL, turned)
+    assert load_scenario(write(fits))[0].policy.unit() == unit
+    with pytest.raises(InputError, match=f"vehicle.model: .* gives {unit}; take ano"):
+        load_scenario(write(fits_not))
+    scaled = fits_not.replace(
+        '"policy.safetensors"', '"policy.safetensors"\ncontrol_scale = 2'
+    )
+    load_scenario(write(scaled))
 
 
 def test_missing_file(tmp_path):

@@ -123,11 +123,11 @@ class PolicyOptions:
                     "--kind, --trust-code, --weights-file, --goal, --goals, "
                     "--control-scale, --column"
                 )
-            values = read_toml(policy).get("policy")
+            found, path = read_toml(policy)
+            values = found.get("policy")
             if not isinstance(values, dict):
                 raise InputError(f"{policy}: has no section [policy]")
-            name, folder = f"{policy}: policy", Path(policy).parent
-            return read_section(name, PolicySection, values, folder)
+            return read_section(f"{policy}: policy", PolicySection, values, path.parent)
         chosen = policy or BUNDLED_POLICY
         values = {
             "url" if chosen.startswith(("http://", "https://")) else "file": chosen,

@@ -45,15 +45,15 @@ class PolicyFile:
 
         if not is_toml(policy):
             return cls()
-        values, folder = read_toml(policy), Path(policy).parent
+        values, path = read_toml(policy)
         if "scene" in values:
-            scenario, _ = load_scenario(policy)
+            scenario, _ = load_scenario(path)
             return cls(scenario.camera.build(), scenario.vehicle, scenario)
         found: dict[str, Any] = {}
         for key, kind in (("camera", CameraSection), ("vehicle", VehicleSection)):
             if key in values:
                 name = f"{policy}: {key}"
-                found[key] = read_section(name, kind, values[key], folder)
+                found[key] = read_section(name, kind, values[key], path.parent)
         camera = found.get("camera")
         return cls(camera and camera.build(), found.get("vehicle"))
 
@@ -99,8 +99,10 @@ def is_toml(policy: str | None) -> TypeGuard[str]:
     return policy is not None and policy.lower().endswith(".toml")
 
 
-def read_toml(policy: str) -> dict[str, Any]:
-    """Read a policy's TOML file."""
+def read_toml(policy: str) -> tuple[dict[str, Any], Path]:
+    """Read a policy's TOML file, bundled or not, and return where it is."""
     from mi_nerfattack.io import files
+    from mi_nerfattack.scenario.named_file import resolve
 
-    return files.read_toml(Path(policy))
+    path = resolve(policy, "")
+    return files.read_toml(path), path

@@ -32,6 +32,7 @@ _PATHS = (
     "zed_calibration",
     "key",
     "camera_file",
+    "overlay",
 )
 _RECORDINGS = {"camera": "video:", "tracker": "replay:"}  # before a path
 _OUT_OF_RANGE = 2.0  # of the largest steering: a control beyond it is nonsense
@@ -54,6 +55,7 @@ class DriveConfig(Section):
         camera: see `robot.camera.open`.
         camera_file: TOML file with the section [camera] of training.
         zed_calibration, zed_mode: of a ZED.
+        overlay: finished run of `attack` whose box is pasted into every frame.
         tracker: see `robot.tracker.open`; none by default, for it listens in a network.
         tracker_sender: address of VICON's computer, the first that sends by default.
         rotation: VICON's convention.
@@ -84,6 +86,7 @@ class DriveConfig(Section):
     camera_file: str | None = None
     zed_calibration: str | None = None
     zed_mode: str = "VGA"
+    overlay: str | None = None
     tracker: str | None = None
     tracker_sender: str | None = None
     rotation: Literal["euler", "rotation-vector"] = "euler"

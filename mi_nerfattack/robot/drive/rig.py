@@ -12,8 +12,15 @@ from mi_nerfattack.deploy.place import bundled_place
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.robot.attacked import read_box
 from mi_nerfattack.robot.camera.open import ZedOptions, open_camera
-from mi_nerfattack.robot.devices import AbstractPilot, AbstractTracker, Clock
+from mi_nerfattack.robot.camera.overlaid import OverlaidCamera
+from mi_nerfattack.robot.devices import (
+    AbstractCamera,
+    AbstractPilot,
+    AbstractTracker,
+    Clock,
+)
 from mi_nerfattack.robot.drive.config import PERIOD_S, REMOTE, DriveConfig
 from mi_nerfattack.robot.drive.loop import Devices
 from mi_nerfattack.robot.drive.pilot import (
@@ -32,6 +39,7 @@ from mi_nerfattack.robot.drive.room import (
 )
 from mi_nerfattack.robot.drive.safety.enable import JoystickEnable
 from mi_nerfattack.robot.drive.safety.watchdog import suspended_clock
+from mi_nerfattack.robot.overlay import Overlay
 from mi_nerfattack.robot.remote.pilot import RemotePilot
 from mi_nerfattack.robot.remote.sealed import Endpoint, read_key
 from mi_nerfattack.robot.tracker.open import open_tracker
@@ -130,6 +138,7 @@ def _real(
         config.tracker, mount, config.rotation, config.tracker_sender, clock
     )
     stack.callback(tracker.close)
+    seen = _overlaid(config, seen, tracker, mount)
     enable = JoystickEnable(config.enable, config.button, clock, config.silence_s)
     stack.callback(enable.close)
     pilot = _pilot(config, route, trained.policy, tracker, clock)
@@ -138,6 +147,20 @@ def _real(
     stack.callback(motor.close)
     devices = Devices(seen, tracker, motor, pilot, enable)
     return Rig(devices, clock, time.sleep, suspended_clock, trained.mount)
+
+
+def _overlaid(
+    config: DriveConfig,
+    camera: AbstractCamera,
+    tracker: AbstractTracker,
+    mount: CameraMount,
+) -> AbstractCamera:
+    """Return the camera with the attacked box in its frames, if there is one."""
+    if config.overlay is None:
+        return camera
+    box, _ = read_box(Path(config.overlay))
+    overlay = Overlay(box, camera.camera, keyed=False)
+    return OverlaidCamera(camera, overlay, tracker, config.body, mount)
 
 
 def _pilot(
@@ -188,9 +211,10 @@ def _simulated(
     room = SimulatedRoom(config.car, route.pose_at(0.0))
     tracker, camera = SimulatedTracker(room), simulated_camera(room, place, config.spp)
     stack.callback(camera.close)
+    seen = _overlaid(config, camera, tracker, place.mount)
     control = _control(config, route, trained.policy, tracker)
     pilot = SimulatedPilot(control, room)
     motor, enable = SimulatedMotor(room), SimulatedEnable(room)
     stack.callback(motor.close)
-    devices = Devices(camera, tracker, motor, pilot, enable)
+    devices = Devices(seen, tracker, motor, pilot, enable)
     return Rig(devices, room.clock, room.sleep, room.clock, place.mount)
