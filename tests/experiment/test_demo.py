@@ -3,10 +3,29 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 
 import pytest
+from helpers.faults import signalled
+
+from mi_nerfattack import cli, scenes
+from mi_nerfattack.io import files
+
+
+@pytest.mark.usefixtures("variant")
+def test_an_interrupted_demo_is_an_attack_that_can_go_on(
+    scenario_folder, tmp_path, monkeypatch, capsys
+):
+    path, output = scenario_folder / "scenario.toml", tmp_path / "run"
+    monkeypatch.setattr(scenes, "bundled", lambda name: path)
+    with signalled("surrogate: optimisation", signal.SIGTERM, at=10):  # of 24
+        assert cli.main(["demo", "-o", str(output), "--anyway"]) == 130
+    assert "mi-nerfattack: interrupted" in capsys.readouterr().err
+    kept, _ = files.read_safetensors(output / "checkpoint.safetensors")
+    assert len(kept["history"]) == 1
+    assert (output / "scenario.toml").is_file()
 
 
 @pytest.mark.slow

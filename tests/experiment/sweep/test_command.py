@@ -7,12 +7,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers.faults import full_disk
 
 from mi_nerfattack import cli
 from mi_nerfattack.commands.sweep import Sweep
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep import sweep as module
 from mi_nerfattack.experiment.sweep.forecast import sentences
+from mi_nerfattack.io import locks
 from mi_nerfattack.system import workers
 from mi_nerfattack.system.ray_tasks import RayTasks
 from mi_nerfattack.system.slurm import SlurmJobs
@@ -37,6 +39,14 @@ name = "gradient"
 [[methods]]
 name = "blocks"
 set.attack.method = "blocks"
+"""
+ONE = """\
+scenario = "scenario.toml"
+anyway = true
+[[methods]]
+name = "gradient"
+set.attack.max_iterations = 2
+set.baseline.textures = 1
 """
 ALOFT = """\
 [[objects]]
@@ -121,6 +131,24 @@ def test_cells_are_done_and_failures_told(command, tmp_path, monkeypatch):
     assert not found["failed"]
     code, out, _ = command(rest, "--check", "--no-drives")
     assert out.splitlines()[0] == "4 cells, 4 complete"
+
+
+def test_what_a_full_disk_left_goes_on(command, tmp_path, monkeypatch):
+    """Full while the attack goes on, while its cell is finished, and for the table."""
+    monkeypatch.setattr(Sweep, "_workers", lambda self: InThisProcess())
+    out, before = tmp_path / "out", {}
+    for name in ("checkpoint", "metrics", "results", "summary"):
+        with full_disk(name, at=2 if name == "results" else 1):
+            code, _, err = command(ONE)
+        assert code == 2 and "no space left on the disk" in err
+        assert not any(locks.is_partial(path) for path in out.rglob(".*"))
+        kept = {p: p.stat().st_mtime_ns for p in out.rglob("drives/*")}
+        assert kept.items() >= before.items()
+        before = kept
+    code, told, _ = command(ONE, "--json")
+    found = json.loads(told)
+    assert code == 0 and found["complete"] == 1 and not found["failed"]
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("drives/*")} == before
 
 
 def test_as_many_workers_as_cores_allow(monkeypatch):

@@ -17,7 +17,7 @@ from mi_nerfattack import cli
 from mi_nerfattack.evaluation.metrics import metrics_document
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
-from mi_nerfattack.io import files
+from mi_nerfattack.io import files, locks
 from mi_nerfattack.rollout.drive import Lane
 
 CRITERIA = """\
@@ -116,6 +116,16 @@ def test_a_campaign(run, criteria, recordings, tmp_path, capsys):
     assert (out / "summary.txt").read_text() in told
     names = {"metrics.json", "summary.txt", "comparison.png", "overhead.png"}
     assert {path.name for path in out.iterdir()} == names
+
+
+def test_a_second_process_is_refused(run, criteria, recordings, tmp_path, capsys):
+    output = tmp_path / "out"
+    output.mkdir()
+    plain, _ = recordings
+    with locks.exclusive(output):
+        code, _, err = call(capsys, run, criteria, "--own", plain, "-o", output)
+    assert code == 2 and "another process works in it" in err
+    assert not list(output.iterdir())
 
 
 def test_what_was_judged_stays(run, criteria, recordings, tmp_path, capsys):
