@@ -290,4 +290,10 @@ def _use_one_thread() -> None:
 def _failed(error: Exception) -> Told:
     if isinstance(error, NerfAttackError):
         return "error", str(error)
+    if isinstance(error, MemoryError):
+        why = f": {error}" * bool(str(error))
+        return "error", (
+            f"a worker process had not enough memory{why}; use fewer workers, finished "
+            "pieces are kept"
+        )
     return "bug", "".join(traceback.format_exception(error))

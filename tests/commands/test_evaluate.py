@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.faults import full_disk, kill
+from helpers.faults import full_disk, kill, short_of_memory
 from helpers.painted_place import ROUTES, make_place, with_policy
 from helpers.roadside import PaintedEnvironment, small_grid
 
@@ -90,6 +90,7 @@ def card_of(place: list[str], drives: str) -> dict:
     return files.read_json(path)
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_continues(place, tmp_path):
     setup = (
         "import pytest\n"
@@ -102,6 +103,16 @@ def test_a_killed_evaluation_continues(place, tmp_path):
     found = card_of(place, "kept")
     assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
     assert found == card_of(place, "whole")
+
+
+def test_too_little_memory_keeps_whole_drives(place, capsys):
+    with short_of_memory("driving", at=200):
+        assert cli.main([*place, "--drives", "kept"]) == 2
+    assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
+    kept = {p: p.stat().st_mtime_ns for p in Path("kept").rglob("run_*")}
+    assert len(kept) == 2
+    assert card_of(place, "kept") == card_of(place, "whole")
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items())
 
 
 def test_a_full_disk_keeps_whole_drives(place, capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import film_scenes as scenes
-from helpers.faults import kill
+from helpers.faults import kill, short_of_memory
 from PIL import Image
 
 from mi_nerfattack import cli
@@ -306,6 +306,14 @@ def test_full_disk_keeps_whole_frames(run, monkeypatch, output):
     names = {path.name for path in Path().rglob("*") if path.is_file()}
     names -= {"scene.xml", "path.json", "routes.json"}
     assert names == {"frame_0000.exr", "frame_0001.exr"}
+
+
+def test_too_little_memory_keeps_whole_frames(run):
+    with short_of_memory("rendering", at=2):
+        code, _, err = run("scene.xml --path path.json -o out")
+    assert code == 2 and "not enough memory: 249 TiB" in err
+    assert "2 of 3 frames are in out; the same command" in err
+    assert len(list(Path("out").iterdir())) == 2
 
 
 @pytest.mark.parametrize("output", ["out", "a.mp4"])

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import mitsuba as mi
 import pytest
 from helpers import attack_jobs
+from helpers.faults import full_disk, kill, signalled
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.experiment.retrain.solvable import drive_expert
 from mi_nerfattack.experiment.transfer.found import read_found
-from mi_nerfattack.io import files
+from mi_nerfattack.io import files, locks
 from mi_nerfattack.policy.pilotnet import PilotNet
 from mi_nerfattack.scenario.scenario import load_scenario
 from mi_nerfattack.training.collect import find_shards
@@ -57,11 +59,15 @@ def changed(run: Path, folder: Path, *changes: tuple[str, str]) -> Path:
     return folder
 
 
-def retrain(folder: Path, *arguments: object) -> int:
+def words_of(folder: Path, *arguments: object) -> list[str]:
     words = ["retrain", "-o", folder / "new.safetensors", "--data", folder / "data"]
     words += ["--workers", 1, "--epochs", 1, "--runs", 1, "--starts", 1]
     words += [*arguments, "--environments", "surrogate"]
-    return cli.main([str(word) for word in words])
+    return [str(word) for word in words]
+
+
+def retrain(folder: Path, *arguments: object) -> int:
+    return cli.main(words_of(folder, *arguments))
 
 
 def test_a_policy_is_tuned_on_old_and_new_frames(run, tmp_path, capsys):
@@ -160,6 +166,63 @@ def check_table(about: dict, folder: Path, *more: str) -> None:
         assert before["cross_track_mean_m"] != after["cross_track_mean_m"]
         ratio = after["cross_track_mean_m"] / before["cross_track_mean_m"]
         assert row["clean_ratio"] == pytest.approx(ratio)
+
+
+FRAMES = ("--frames", "surrogate", 64, "--exposures-ev", 0)
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory) -> Path:
+    """What a retraining writes that nothing disturbs."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert retrain(folder, run, *FRAMES) == 0
+    return folder
+
+
+def check_goes_on(run: Path, folder: Path, whole: Path) -> None:
+    """The same command keeps frames and drives, and ends in the same figures."""
+    kept = [*folder.rglob("shard_*"), *folder.rglob("start_*")]
+    times = {path: path.stat().st_mtime_ns for path in kept}
+    assert retrain(folder, run, *FRAMES) == 0
+    assert not any(locks.is_partial(path) for path in (folder / "data").rglob(".*"))
+    assert times and all(path.stat().st_mtime_ns == times[path] for path in kept)
+    for name in ("new.safetensors", "new-retrain.json"):
+        assert (folder / name).read_bytes() == (whole / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_what_a_full_disk_left_goes_on(run, whole, tmp_path, capsys):
+    for name in (
+        "start_",
+        "shard",
+        "checkpoint",
+        "new.safe",
+        "new.json",
+        "new-retrain",
+    ):
+        with full_disk(name):
+            assert retrain(tmp_path, run, *FRAMES) == 2
+        assert "no space left on the disk" in capsys.readouterr().err
+        assert not any(locks.is_partial(path) for path in tmp_path.rglob(".*"))
+    check_goes_on(run, tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_what_a_killed_process_left_goes_on(run, whole, tmp_path):
+    for name in ("shard", "checkpoint", "new.safe"):
+        kill(words_of(tmp_path, run, *FRAMES), tmp_path, name)
+    check_goes_on(run, tmp_path, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_was_interrupted_goes_on(run, whole, tmp_path, capsys, number):
+    frames = "round_0, surrogate"
+    for stage in ("before, old", frames, "training 0", "card", "after, old"):
+        with signalled(stage, number):
+            assert retrain(tmp_path, run, *FRAMES) == 130
+        assert "mi-nerfattack: interrupted" in capsys.readouterr().err
+    check_goes_on(run, tmp_path, whole)
 
 
 def test_the_expert_decides_what_can_be_driven(run, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.faults import full_disk, kill
+from helpers.faults import full_disk, kill, short_of_memory
 
 from mi_nerfattack import cli
 from mi_nerfattack.io import files, locks
@@ -60,6 +60,22 @@ def test_what_a_full_disk_left_goes_on(verb, found_run, whole, tmp_path, capsys)
         assert not any(locks.is_partial(path) for path in output.rglob(".*"))
         assert drives(output).items() >= before.items()
         before = drives(output)
+    assert finished(verb, found_run, output) == whole[verb]
+    assert drives(output).items() >= before.items()
+
+
+@pytest.mark.parametrize(
+    ("verb", "stage"), [("transfer", "driving"), ("refine", "searching")]
+)
+def test_too_little_memory_keeps_what_is_done(
+    verb, stage, found_run, whole, tmp_path, capsys
+):
+    output = tmp_path / "out"
+    with short_of_memory(stage, at=6):
+        assert cli.main(command(verb, found_run, output)) == 2
+    assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
+    before = drives(output)
+    assert before or (output / "search.safetensors").is_file()
     assert finished(verb, found_run, output) == whole[verb]
     assert drives(output).items() >= before.items()
 

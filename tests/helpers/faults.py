@@ -7,8 +7,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -86,13 +86,27 @@ main({[str(word) for word in words]!r})
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
+def signalled(stage: str, number: int, at: int = 1) -> AbstractContextManager[None]:
+    """Send a signal to this process when a stage of a command has got on."""
+    return disturbed(stage, lambda: signal.raise_signal(number), at)
+
+
+def short_of_memory(stage: str, at: int = 1) -> AbstractContextManager[None]:
+    """Let there be too little memory when a stage of a command has got on."""
+
+    def fail() -> None:
+        raise MemoryError("249 TiB")
+
+    return disturbed(stage, fail, at)
+
+
 @contextmanager
-def signalled(stage: str, number: int, at: int = 1) -> Iterator[None]:
-    """Send a signal to this process when a stage of a command has got on.
+def disturbed(stage: str, disturb: Callable[[], None], at: int) -> Iterator[None]:
+    """Do something when a stage of a command has got on.
 
     Args:
         stage: its bar's name.
-        number: of the signal.
+        disturb: what.
         at: how often the bar has been drawn.
     """
     show, left = StageBars.show, at
@@ -102,7 +116,7 @@ def signalled(stage: str, number: int, at: int = 1) -> Iterator[None]:
         show(self, name, *state, **more)
         left -= name == stage
         if left == 0:
-            signal.raise_signal(number)
+            disturb()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StageBars, "show", send)

@@ -180,6 +180,13 @@ def test_an_error_in_a_worker_is_the_callers():
         Processes(1).run(Piece(None), range(8), lambda units: None)
 
 
+def test_too_little_memory_of_a_worker_is_told_in_a_line():
+    told = workers._failed(MemoryError("249 TiB"))  # by the worker
+    error = workers.failure(2, told)
+    assert isinstance(error, InputError) and "\n" not in str(error)
+    assert "not enough memory: 249 TiB; use fewer workers" in str(error)
+
+
 @pytest.mark.parametrize("count", [0, 1000, 1.5])
 def test_number_of_workers_is_checked(count):
     with pytest.raises(InputError, match="workers"):

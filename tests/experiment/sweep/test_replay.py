@@ -113,19 +113,17 @@ def test_drives_alone_come_back(swept, command, tmp_path):
     assert cost["processes"] == 2  # the attack's, and this one
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_replay_goes_on(swept, command, tmp_path, monkeypatch, number):
-    """Where it has a folder of its own; else nothing is left."""
-    folder, _, cell = swept
+def test_an_interrupted_replay_leaves_nothing(swept, command, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    words = folder, 0, "--json"
-    with signalled("cells", number, at=12):
-        assert command(*words)[0] == 130
+    with signalled("cells", signal.SIGTERM, at=12):
+        assert command(swept[0], 0)[0] == 130
     assert not list(tmp_path.iterdir())
-    if number == signal.SIGTERM:
-        return
-    out = tmp_path / "out"
-    with signalled("cells", number, at=12):
+
+
+def test_an_interrupted_replay_goes_on_in_its_folder(swept, command, tmp_path):
+    folder, _, cell = swept
+    words, out = (folder, 0, "--json"), tmp_path / "out"
+    with signalled("cells", signal.SIGINT, at=12):
         assert command(*words, "-o", out)[0] == 130
     kept = {p: p.stat().st_mtime_ns for p in out.rglob("drives/*")}
     assert kept
