@@ -40,9 +40,12 @@ class BenchMethods:
         table = read_table((self.folder or self.tuning) / RESULTS)
         words = ["python -m bench methods TUNING"]
         words += [] if self.folder is None else ["FOLDER"]
-        names = "tuning.toml", "methods.toml"
-        grids = [files.read_toml(ROOT / "scenes" / name) for name in names]
-        text = page(summary, table, tuning, *grids, results.stamp({}, words))
+        grid, compared = (
+            files.read_toml(ROOT / "scenes" / name)
+            for name in ("tuning.toml", "methods.toml")
+        )
+        made = results.stamp({}, words)
+        text = page(summary, table, tuning, grid, compared, made)
         results.copy_files([RESULTS], self.tuning, self.output / "tuning")
         if self.folder is not None:
             files.write_json(self.output / SUMMARY, summary)
