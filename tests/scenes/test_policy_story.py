@@ -1,51 +1,66 @@
-"""The bundled policy, its record, its card and the manifest tell one story."""
+"""Bundled policies, their records, their cards and the manifest tell one story."""
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
 from mi_nerfattack.fields import load_field
 from mi_nerfattack.io import files
 from mi_nerfattack.scenes import bundled, manifest
-from mi_nerfattack.training.record import read_record
+from mi_nerfattack.training.record import TrainingRecord, read_record
 
-POLICY = "policy/pilotnet.safetensors"
 FILES = manifest.load()
-RECORD = read_record(bundled("policy/pilotnet.json"))
-CARD = files.read_json(bundled("policy/pilotnet.card.json"))
+#: Policies by name: where they were trained, and objects of other folders.
+POLICIES = {
+    "policy/pilotnet": ("intersection", {"car", "cube", "hydrant"}),
+    "room/policy": ("room", {"cube"}),
+}
+every_policy = pytest.mark.parametrize("name", POLICIES)
 
 
-def test_the_policy_is_that_of_record_and_card() -> None:
-    assert RECORD is not None
-    assert CARD["policy_section"]["file_sha256"] == FILES[POLICY]["sha256"]
-    for name in (POLICY, "policy/pilotnet.json"):
-        assert FILES[name]["command"] == RECORD.command
-        assert FILES[name]["seed"] == RECORD.seed
-    assert CARD["training"]["command"] == RECORD.command
-    assert sum(RECORD.data.values()) == int(
-        re.search(r"(\d+) frames", FILES[POLICY]["note"])[1]
+def record_and_card(name: str) -> tuple[TrainingRecord, dict[str, Any]]:
+    record = read_record(bundled(f"{name}.json"))
+    assert record is not None
+    return record, files.read_json(bundled(f"{name}.card.json"))
+
+
+@every_policy
+def test_the_policy_is_that_of_record_and_card(name: str) -> None:
+    (record, card), policy = record_and_card(name), f"{name}.safetensors"
+    assert card["policy_section"]["file_sha256"] == FILES[policy]["sha256"]
+    for file in (policy, f"{name}.json"):
+        assert FILES[file]["command"] == record.command
+        assert FILES[file]["seed"] == record.seed
+    assert card["training"]["command"] == record.command
+    assert sum(record.data.values()) == int(
+        re.search(r"(\d+) frames", FILES[policy]["note"])[1]
     )
 
 
-def test_the_record_is_of_the_files_that_are_bundled() -> None:
-    assert RECORD is not None
+@every_policy
+def test_the_record_is_of_the_files_that_are_bundled(name: str) -> None:
+    place, objects = POLICIES[name]
+    record, _ = record_and_card(name)
     bundled_sums = {
-        name.removeprefix("intersection/"): entry["sha256"]
-        for name, entry in FILES.items()
+        file.removeprefix(f"{place}/"): entry["sha256"] for file, entry in FILES.items()
     }
-    for name, digest in RECORD.checksums.items():
-        assert bundled_sums[name.removeprefix("intersection/")] == digest, name
-    objects = {name for name in RECORD.checksums if name.startswith(("car", "cube"))}
-    assert objects == {"car/field.safetensors", "cube/field.safetensors"}
+    for file, digest in record.checksums.items():
+        assert bundled_sums[file.removeprefix(f"{place}/")] == digest, file
+    folders = {file.partition("/")[0] for file in record.checksums}
+    assert folders & {"car", "cube", "hydrant"} == objects
 
 
-def test_the_card_is_of_the_command_in_the_manifest() -> None:
-    for name in ("policy/pilotnet.card.json", "policy/pilotnet.png"):
-        assert FILES[name]["command"] == CARD["command"]
-        assert FILES[name]["seed"] == CARD["settings"]["seed"]
-    assert {"car/field.safetensors", "cube/field.safetensors"} < set(CARD["place"])
+@every_policy
+def test_the_card_is_of_the_command_in_the_manifest(name: str) -> None:
+    _, card = record_and_card(name)
+    for file in (f"{name}.card.json", f"{name}.png"):
+        assert FILES[file]["command"] == card["command"]
+        assert FILES[file]["seed"] == card["settings"]["seed"]
+    found = {file.partition("/")[0] for file in card["place"]}
+    assert found >= POLICIES[name][1] - {"hydrant"}
 
 
 @pytest.mark.parametrize(
