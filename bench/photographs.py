@@ -52,7 +52,7 @@ def place(
                 files.write_image(photographs / name, image)
             cameras.append(camera)
             poses.append(pose)
-        stored = [f"../photographs/{name}" for name in names]
+        stored = [f"../posed/images/{name}" for name in names]  # upright, if placed
         files.make_folder(work / "given")
         write_poses(work / "given/transforms.json", stored, cameras, np.stack(poses))
     if not (work / "posed/transforms.json").is_file():
@@ -127,30 +127,29 @@ def compare_poses(work: Path) -> dict[str, float]:
         photographs and those placed, medians and maxima of `pose_errors`, the mean
         reprojection error, and the greatest relative error of a focal length.
     """
-    given, found = read_images(work / "given"), read_images(work / "posed")
-    index = placed_of(given, found)
-    turns, shares = pose_errors(found.camera_to_world, given.camera_to_world[index])
-    focal = [
-        abs(found.camera_of(k).fx / given.camera_of(i).fx - 1)
-        for k, i in enumerate(index)
-    ]
+    given, found = _both(work)
+    turns, shares = pose_errors(found.camera_to_world, given.camera_to_world)
+    focal = [found.camera_of(i).fx / given.camera_of(i).fx for i in range(len(found))]
     table = files.read_json(work / "posed/capture.json")
     return {
-        "photographs": len(given),
-        "placed": len(index),
+        "photographs": table["photographs"],
+        "placed": table["placed"],
         "rotation_deg": float(np.median(turns)),
         "rotation_most_deg": float(turns.max()),
         "position_share": float(np.median(shares)),
         "position_most_share": float(shares.max()),
-        "focal_most_share": float(max(focal)),
+        "focal_most_share": float(np.abs(np.array(focal) - 1).max()),
         "reprojection_error_px": table["reprojection_error_px"],
     }
 
 
-def placed_of(given: PosedImages, found: PosedImages) -> list[int]:
-    """Return the indices of the photographs that were placed."""
-    names = [Path(name).name for name in given.names]
-    return [names.index(Path(name).name) for name in found.names]
+def _both(work: Path) -> tuple[PosedImages, PosedImages]:
+    """Return the photographs that were placed, with the poses given and found."""
+    given = read_images(work / "given", skip_missing=True)
+    found = read_images(work / "posed")
+    ours = [Path(name).name for name in found.names]
+    assert ours == [Path(name).name for name in given.names]
+    return given, found
 
 
 def compare_fits(work: Path, steps: int, long_edge: int) -> dict[str, float]:
@@ -163,11 +162,10 @@ def compare_fits(work: Path, steps: int, long_edge: int) -> dict[str, float]:
     Returns:
         mean PSNR of the held-out views, dB, and of which there are how many.
     """
-    given, found = read_images(work / "given"), read_images(work / "posed")
-    index = placed_of(given, found)
-    poses = given.camera_to_world[index]
-    names = [f"../../{given.names[i].removeprefix('../')}" for i in index]
-    cameras = [given.camera_of(i) for i in index]
+    given, found = _both(work)
+    poses = given.camera_to_world
+    names = [f"../{name}" for name in given.names]
+    cameras = [given.camera_of(i) for i in range(len(given))]
     extra: dict[str, str] = {}
     for side in ("given_as_it_came", "given"):
         folder = files.make_folder(work / "fitted" / side)
