@@ -10,7 +10,7 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 from helpers import attack_jobs
-from helpers.faults import full_disk, kill, signalled
+from helpers.faults import full_disk, kill, short_of_memory, signalled
 
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.job import Job
@@ -204,6 +204,15 @@ def test_what_a_full_disk_left_goes_on(run, whole, tmp_path, capsys):
             assert retrain(tmp_path, run, *FRAMES) == 2
         assert "no space left on the disk" in capsys.readouterr().err
         assert not any(locks.is_partial(path) for path in tmp_path.rglob(".*"))
+    check_goes_on(run, tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_too_little_memory_keeps_what_is_done(run, whole, tmp_path, capsys):
+    for stage in ("round_0, surrogate", "training 0", "card", "after, old"):
+        with short_of_memory(stage):
+            assert retrain(tmp_path, run, *FRAMES) == 2
+        assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
     check_goes_on(run, tmp_path, whole)
 
 

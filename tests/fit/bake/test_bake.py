@@ -8,7 +8,7 @@ import signal
 import drjit as dr
 import numpy as np
 import pytest
-from helpers.faults import signalled
+from helpers.faults import short_of_memory, signalled
 from helpers.small_fields import homogeneous, small_ngp
 
 from mi_nerfattack import cli
@@ -102,6 +102,14 @@ def test_an_interrupted_bake_leaves_a_whole_file_or_none(
     assert found == [*left, "field.safetensors", "routes.json"]
     for name in left:
         load_field(name)
+
+
+def test_too_little_memory_leaves_no_bake(words, tmp_path, capsys):
+    with short_of_memory("baking"):
+        assert cli.main(words) == 2
+    assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
+    found = sorted(path.name for path in tmp_path.iterdir())
+    assert found == ["field.safetensors", "routes.json"]
 
 
 def test_the_command_writes_field_and_report(words, tmp_path, capsys):
