@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mi_nerfattack.render.camera.intrinsics import Camera
 
 KINDS = ("as it is", "turned (EXIF 6)", "zoomed", "turned (EXIF 8)", "on its side")
 """What becomes of photographs 0, 5, 10, ... of a mixed set, of 1, 6, 11, ..., etc."""
+POINTS = "points.safetensors"
 _ZOOM = 1.5
 _FOCAL_MM = 4.0
 _ON_SIDE = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -155,36 +157,36 @@ def _both(work: Path) -> tuple[PosedImages, PosedImages]:
 def compare_fits(work: Path, steps: int, long_edge: int) -> dict[str, float]:
     """Fit fields to the poses given and to those found, with equal steps.
 
-    All see the photographs that were placed, and hold the same out. The poses given
-    have no points, which tell a smaller box: they are fitted to as they came, and in
-    the box of the points found.
+    All see the photographs that were placed, and hold the same out. Sparse points tell
+    another box than poses alone, so both are fitted to in either: in the `cube` around
+    what the cameras look at, and in the box of the `points` found.
 
     Returns:
         mean PSNR of the held-out views, dB, and of which there are how many.
     """
     given, found = _both(work)
-    poses = given.camera_to_world
-    names = [f"../{name}" for name in given.names]
-    cameras = [given.camera_of(i) for i in range(len(given))]
-    extra: dict[str, str] = {}
-    for side in ("given_as_it_came", "given"):
-        folder = files.make_folder(work / "fitted" / side)
-        if side == "given" and found.points is not None:
-            moved = move(found.points, found.camera_to_world, poses)
-            tensors = {"points": moved.astype(np.float32)}
-            files.write_safetensors(folder / "points.safetensors", tensors)
-            extra = {"points_file": "points.safetensors"}
-        write_poses(folder / "transforms.json", names, cameras, poses, extra)
-    result = {}
-    for side in ("given_as_it_came", "given", "found"):
-        output = work / f"{side}-{steps}.safetensors"
+    assert found.points is not None
+    points = {"found": found.points}
+    poses = {"found": found.camera_to_world, "given": given.camera_to_world}
+    points["given"] = move(found.points, *poses.values())
+    result: dict[str, float] = {}
+    for side, box in itertools.product(poses, ("cube", "points")):
+        name = f"{side}_{box}"
+        output = work / f"{name}-{steps}.safetensors"
         if not output.is_file():
-            folder = work / ("posed" if side == "found" else f"fitted/{side}")
+            folder = files.make_folder(work / "fitted" / name)
+            extra = {"points_file": POINTS} if box == "points" else {}
+            tensors = {"points": points[side].astype(np.float32)}
+            files.write_safetensors(folder / POINTS, tensors)
+            of = found if side == "found" else given
+            cameras = [of.camera_of(i) for i in range(len(of))]
+            names = [f"../../posed/{image}" for image in found.names]
+            write_poses(folder / "transforms.json", names, cameras, poses[side], extra)
             words = ["fit", str(folder), "-o", str(output), "--network", "small"]
             words += ["--long-edge", str(long_edge), "--steps", str(steps), "--resume"]
             run_command(words)
         scores = files.read_json(output.with_suffix(".report") / "metrics.json")
-        result[f"{side}_psnr_db"] = scores["psnr_heldout_db"]
+        result[f"{name}_psnr_db"] = scores["psnr_heldout_db"]
         result["held_out"] = len(scores["per_view"])
     return result
 
