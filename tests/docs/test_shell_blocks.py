@@ -47,6 +47,7 @@ SKIPPED = {
     "report.md": INPUT,
     "retrain.md": INPUT,
     "robot.md": "takes a run, a camera, a tracker or a car",
+    "room.md": LONG,
     "sweep.md": USAGE,
     "training.md": LONG,
     "transfer.md": INPUT,
