@@ -175,7 +175,9 @@ def triptych(
             axis.set_xlim(left, right)
             axis.set_ylim(bottom, top)
             axis.set_aspect("equal")
-            axis.set_title(f"({chr(97 + k)}) {panel.title}", loc="left")
+            size = 12 if len(panels) <= 3 else 9  # points: beside each other
+            title = f"({chr(97 + k)}) {panel.title}"
+            axis.set_title(title, loc="left", fontsize=size)
             axis.set_xlabel("x (m)")
         axes[0].set_ylabel("y (m)")
         drives = [drive for panel in panels for drive in panel.drives]
