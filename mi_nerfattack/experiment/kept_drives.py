@@ -29,7 +29,7 @@ from mi_nerfattack.scenario.world import Appearance, World
 FORMAT = "mi_nerfattack attack drive 4"
 SHARED_FORMAT = "mi_nerfattack shared drive 1"
 #: Parts of a scenario that say how it is searched, not how it is driven.
-_OF_SEARCH = ("name", "attack", "baseline", "objective", "scene.bricks", "drive.runs")
+OF_SEARCH = ("name", "attack", "baseline", "objective", "scene.bricks", "drive.runs")
 
 
 class DriveRecord(Record):
@@ -199,7 +199,7 @@ class SharedDrives:
         """
         scenario = world.scenario
         named = scenario.identity()
-        decisive = {k: v for k, v in named.items() if not is_within(k, _OF_SEARCH)}
+        decisive = {k: v for k, v in named.items() if not is_within(k, OF_SEARCH)}
         if label == SURROGATE:
             own, needed = scenario.attack, {}
             decisive |= {"jitter": f"{own.jitter}", "attached": f"{own.attached}"}

@@ -19,6 +19,7 @@ from mi_nerfattack.deploy.registry import environment_versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.identity import short_digest
 from mi_nerfattack.evaluation.work import DriveRecord
+from mi_nerfattack.experiment.kept_drives import OF_SEARCH
 from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.io import files
@@ -41,8 +42,7 @@ FORMAT = "mi_nerfattack transfer drive 1"
 CASES = (NO_OBJECT, OWN, BEST_RANDOM, ATTACK)
 _REMEDY = "choose another folder with -o, or remove this file"
 #: Parts of a scenario that no drive depends on.
-_INERT = ("name", "seed", "attack", "baseline", "objective", "deployment")
-_INERT += ("drive.runs", "scene.bricks")
+_INERT = (*OF_SEARCH, "seed", "deployment")
 #: Parts that only drives in the surrogate depend on.
 _OF_SURROGATE = ("field", "composite", "step_m", "stop", "to_world")
 
