@@ -6,6 +6,7 @@ import sys
 
 from bench.commands.circle import BenchCircle
 from bench.commands.experts import BenchExperts
+from bench.commands.gaps import BenchGaps
 from bench.commands.gpu import BenchFrames, BenchGpu
 from bench.commands.imports import BenchImports
 from bench.commands.matrix import BenchMatrix
@@ -49,6 +50,7 @@ COMMANDS = {
     "matrix": BenchMatrix,
     "overlay": BenchOverlay,
     "poses": BenchPoses,
+    "gaps": BenchGaps,
     "phone": BenchPhone,
     "imports": BenchImports,
     "frames": BenchFrames,

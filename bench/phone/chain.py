@@ -14,7 +14,7 @@ from bench.phone.film import FAMILY, MARKER_M
 from bench.phone.walk import phone
 from bench.photographs import pose_errors, similarity
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
-from mi_nerfattack.capture.posed_images import held_out
+from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.fields import load_field
 from mi_nerfattack.fit.scores import FieldRenderer, compare, reference
@@ -34,15 +34,13 @@ def capture(folder: Path, seed: int) -> dict[str, Any]:
         words = ["capture", str(folder / "film.mp4"), "-o", str(posed)]
         words += ["--marker-m", str(MARKER_M), "--marker-family", FAMILY]
         run_command([*words, "--markers-flat", "--seed", str(seed)])
-    found, table = read_images(posed), files.read_json(posed / "capture.json")
-    truth = np.array(files.read_json(folder / "truth.json")["camera_to_world"])
-    numbers = [re.findall(r"\d+", Path(name).name)[0] for name in found.names]
-    given = truth[np.array(numbers, int)]
+    found, given = placed_and_true(folder)
+    table = files.read_json(posed / "capture.json")
     poses = found.camera_to_world
     turns, shares = pose_errors(poses, given)
     extent = pdist(given[:, :3, 3]).max()
     return {
-        "frames": len(truth),
+        "frames": len(files.read_json(folder / "truth.json")["camera_to_world"]),
         "chosen": table["photographs"],
         "placed": table["placed"],
         "markers": len(table["scale"]["markers"]),
@@ -54,6 +52,14 @@ def capture(folder: Path, seed: int) -> dict[str, Any]:
         "height_m": float((poses[:, 2, 3] - given[:, 2, 3]).mean()),
         "focal_error": found.camera.fx / phone().fx - 1,
     }
+
+
+def placed_and_true(folder: Path) -> tuple[PosedImages, np.ndarray]:
+    """Return the frames that were placed, and their true poses (n, 4, 4)."""
+    found = read_images(folder / "posed")
+    truth = np.array(files.read_json(folder / "truth.json")["camera_to_world"])
+    numbers = [re.findall(r"\d+", Path(name).name)[0] for name in found.names]
+    return found, truth[np.array(numbers, int)]
 
 
 def fit(folder: Path, steps: int) -> dict[str, Any]:

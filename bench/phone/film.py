@@ -15,6 +15,7 @@ from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import write_video
+from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.system.extras import load_extra
 
@@ -31,12 +32,13 @@ _TEXEL_M, _MARKER_TEXEL_M, _PATHS = 0.012, 0.002, 64
 
 
 def light_room(
-    folder: Path, rays: int, progress: Callable[[str, int, int], None]
+    folder: Path, camera: Camera, rays: int, progress: Callable[[str, int, int], None]
 ) -> LitRoom:
     """Load the bundled room with markers, and light it.
 
     Args:
         folder: that keeps the light.
+        camera: intrinsics.
         rays: through each pixel of a frame.
         progress: called with stage, done and total.
     """
@@ -47,7 +49,7 @@ def light_room(
         "room": (others, _TEXEL_M),
         "markers": (list(markers.values()), _MARKER_TEXEL_M),
     }
-    return LitRoom(lit(folder, scene, groups, _PATHS, progress), phone(), rays)
+    return LitRoom(lit(folder, scene, groups, _PATHS, progress), camera, rays)
 
 
 def marker_corners(number: int) -> np.ndarray:
@@ -111,7 +113,7 @@ def shoot(
     truth = {"fps": fps, "camera_to_world": middle, "exposure": exposure}
     files.write_json(folder / "truth.json", truth)
     paths = [stills / f"{i:05d}.png" for i in range(len(times))]
-    lit_room = light_room(folder, rays, progress)
+    lit_room = light_room(folder, phone(), rays, progress)
     open_s = (np.arange(rays) + 0.5) / rays * SHUTTER_S
     for i, (time, path) in enumerate(zip(times, paths, strict=True)):
         progress("film", i, len(times))

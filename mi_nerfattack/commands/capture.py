@@ -193,7 +193,12 @@ class PhotographArguments:
 
     def tell(self, result: PoseEstimate, picture: Path) -> None:
         """Print what was found."""
-        from mi_nerfattack.capture.photographs.quality import FEW_PLACED, retake
+        from mi_nerfattack.capture.coverage import FAR_DEG
+        from mi_nerfattack.capture.photographs.quality import (
+            FEW_PLACED,
+            median_gap,
+            retake,
+        )
 
         total = len(result.placed) + len(result.left_out)
         print(
@@ -204,6 +209,12 @@ class PhotographArguments:
             print(
                 "Few were placed: take more between those far apart, each part of the "
                 "scene in three or more, with texture, sharp, of nothing that moves."
+            )
+        gap = median_gap(result.qualities)
+        if gap is not None and gap > FAR_DEG:
+            print(
+                f"They stand {gap:.0f} degrees apart, as seen from what they show: a "
+                f"field needs {FAR_DEG:.0f} or less. Take more between them."
             )
         again = retake(result.qualities)
         for name, why in list(again.items())[:_SHOWN]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -150,6 +151,8 @@ class Fit:
         depth = read_depth(self.folder, images)
         lower, upper = find_bounds(images, depth, self.bounds)
         with StageBars() as bars:
+            for line in _told_before(images):
+                bars.say(line)
             result = fit_ngp(
                 images,
                 lower,
@@ -171,4 +174,27 @@ class Fit:
             checkpoint,
             depth,
             self.against,
+        )
+
+
+def _told_before(images: PosedImages) -> Iterator[str]:
+    """Say what speaks against a fit before hours are spent on it."""
+    import numpy as np
+
+    from mi_nerfattack.capture.coverage import FAR_DEG, view_gaps
+    from mi_nerfattack.capture.posed_images import held_out
+
+    if images.points is None or len(images) < 2:
+        return
+    skipped = held_out(len(images))
+    fitted = np.ones(len(images), bool)
+    fitted[skipped] = False
+    cameras = [images.camera_of(i) for i in range(len(images))]
+    gaps = view_gaps(cameras, images.camera_to_world, images.points, fitted)
+    gap = float(np.median(gaps[skipped]))
+    if gap > FAR_DEG:
+        yield (
+            f"warning: the views stand {gap:.0f} degrees apart, as seen from what they "
+            f"show. More than {FAR_DEG:.0f} leave a field that is good in its views "
+            "and foggy between them: take more photographs between these"
         )

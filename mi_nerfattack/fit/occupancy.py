@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.capture.coverage import nearest_points
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
@@ -17,6 +18,7 @@ _MIN_OPACITY = 0.01  # of a step; cells that reach less are empty
 _FADING = 0.8  # share of the density of a cell that survives a visit
 _VISITS = 1 << 16  # cells an update looks at
 _BORDER = 0.05  # of the image, beyond which a camera still sees a cell
+_CLEAR = 0.8  # of the way to the nearest sparse points is empty
 _COARSE = 2  # cells whose visibility is decided together, along each axis
 
 
@@ -120,7 +122,9 @@ def seen_cells(
     """Mark the cells of a grid over a box that several cameras look at.
 
     What a single camera sees can be given any depth, and what none sees any colour:
-    density there would only hide the rest from other views.
+    density there would only hide the rest from other views. So it would close to a
+    camera, where a fit begins with fog that is thrown away slowly, if at all: where
+    sparse points tell how near to a camera things begin, cells around it are left out.
 
     Args:
         images: the posed images.
@@ -142,12 +146,23 @@ def seen_cells(
     points = np.stack(grid, axis=-1).reshape(-1, 3).astype(np.float32)
     radius = 0.5 * float(np.linalg.norm((upper - lower) / coarse))
     count = np.zeros(len(points), np.int32)
-    for index in indices:
+    clear = np.ones(len(points), bool)
+    for index, near in zip(indices, _nearest(images, indices), strict=True):
         count += _in_view(images, int(index), points, radius)
-    seen = (count >= min(cameras, len(indices))).reshape(coarse)
+        eye = images.camera_to_world[index, :3, 3].astype(np.float32)
+        clear &= ((points - eye) ** 2).sum(1) >= (_CLEAR * near) ** 2
+    seen = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):
         seen = np.repeat(seen, _COARSE, axis)
     return np.ascontiguousarray(seen[: shape[0], : shape[1], : shape[2]])
+
+
+def _nearest(images: PosedImages, indices: np.ndarray) -> np.ndarray:
+    """Return how near to each camera sparse points begin, metres; 0 if unknown."""
+    if images.points is None:
+        return np.zeros(len(indices))
+    cameras = [images.camera_of(int(i)) for i in indices]
+    return nearest_points(cameras, images.camera_to_world[indices], images.points)
 
 
 def _in_view(

@@ -108,7 +108,7 @@ class Overlay:
         return result
 
     def _thrice(self, values: np.ndarray) -> np.ndarray:
-        """Return values (h, w) for three channels; NumPy multiplies these far faster."""
+        """Return values (h, w) thrice; NumPy multiplies whole channels far faster."""
         return self._cv2.merge([values] * 3)
 
     def _add(

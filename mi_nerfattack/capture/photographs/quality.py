@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from mi_nerfattack.capture.colmap.reconstruct import Structure
+from mi_nerfattack.capture.coverage import FAR_DEG, view_gaps
 from mi_nerfattack.capture.photographs.frames import measure_sharpness
 from mi_nerfattack.io import files
 
@@ -33,6 +34,8 @@ class Quality:
         points: of the reconstruction that it shows; 0 if it was not placed.
         error_px: mean reprojection error of these; None if it was not placed.
         sharpness: variance of the Laplacian by the median of its neighbours'.
+        gap_deg: how far the next view of the same is, see `view_gaps`; None if it was
+            not placed.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Quality:
     points: int
     error_px: float | None
     sharpness: float
+    gap_deg: float | None = None
 
     def faults(self) -> list[str]:
         """Say why to take it again; nothing if it is good."""
@@ -57,6 +61,10 @@ class Quality:
                     f"few points ({self.points})",
                     self.placed and self.points < _FEW_POINTS,
                 ),
+                (
+                    f"far from the others ({self.gap_deg or 0:.0f} degrees)",
+                    self.gap_deg is not None and self.gap_deg > FAR_DEG,
+                ),
             )
             if is_so
         ]
@@ -71,21 +79,19 @@ def assess(folder: Path, names: Sequence[str], found: Structure) -> tuple[Qualit
         found: what came of them.
     """
     sharpness = np.array([_sharpness_of(folder / name) for name in names])
-    seen = dict(
-        zip(
-            found.names,
-            zip(found.points_seen, found.errors_px, strict=True),
-            strict=True,
-        )
-    )
+    gaps = view_gaps(found.cameras, found.camera_to_world, found.points).tolist()
+    of_each = zip(found.points_seen, found.errors_px, gaps, strict=True)
+    seen = dict(zip(found.names, of_each, strict=True))
     result = []
     for i, name in enumerate(names):
         near = sharpness[max(0, i - _NEIGHBOURS) : i + _NEIGHBOURS + 1]
         median = float(np.median(near))
-        points, error = seen.get(name, (0, None))
+        points, error, gap = seen.get(name, (0, None, None))
         relative = float(sharpness[i]) / median if median > 0 else 1.0
         features = found.features.get(name, 0)
-        result.append(Quality(name, name in seen, features, points, error, relative))
+        result.append(
+            Quality(name, name in seen, features, points, error, relative, gap)
+        )
     return tuple(result)
 
 
@@ -101,6 +107,12 @@ def retake(qualities: Sequence[Quality]) -> dict[str, str]:
     return {name: ", ".join(why) for name, why in faults.items() if why}
 
 
+def median_gap(qualities: Sequence[Quality]) -> float | None:
+    """Return the median gap of the photographs that were placed, degrees."""
+    gaps = [quality.gap_deg for quality in qualities if quality.gap_deg is not None]
+    return float(np.median(gaps)) if gaps else None
+
+
 def quality_table(
     found: Structure, qualities: Sequence[Quality], scale: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -113,6 +125,7 @@ def quality_table(
         "reprojection_error_px": found.error_px,
         "cameras": len(set(found.cameras)),
         "points": len(found.points),
+        "gap_deg": median_gap(qualities),
         "scale": dict(scale),
         "retake": retake(qualities),
         "frames": [asdict(quality) for quality in qualities],

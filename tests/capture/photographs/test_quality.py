@@ -29,7 +29,7 @@ def taken(tmp_path):
         image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
         files.write_image(tmp_path / name, image)
     placed = [i for i in range(COUNT) if i != LOST]
-    poses = [look_at([np.cos(i / 3), np.sin(i / 3), 1.0], [0, 0, 0]) for i in placed]
+    poses = [look_at([np.cos(i / 12), np.sin(i / 12), 1.0], [0, 0, 0]) for i in placed]
     found = Structure(
         tuple(names[i] for i in placed),
         np.stack(poses),

@@ -256,6 +256,10 @@ def test_cells_that_cameras_see():
     both = seen_cells(images, np.arange(2), low, high, shape)
     assert at(both, 5, 0, 0) and not at(both, 5, -8, 0)  # the second alone
     assert not at(both, 0.5, 9, 0)
+    points = np.random.default_rng(0).uniform([5, -2, -2], [7, 2, 2], (300, 3))
+    clear = seen_cells(replace(images, points=points), np.array([0]), low, high, shape)
+    assert at(first, 3, 0, 0) and not at(clear, 3, 0, 0)  # points begin at 5 m
+    assert at(clear, 5, 0, 0) and at(clear, 3, 3, 3)
 
 
 def test_cells_at_the_rim_of_a_distorted_image_are_seen():

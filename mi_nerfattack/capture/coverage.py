@@ -1,0 +1,96 @@
+"""What sparse points tell of views: how far apart they stand, and what is near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mi_nerfattack.render.camera.intrinsics import Camera
+
+FAR_DEG = 12.0
+"""Gap (see `view_gaps`) from which a field is much worse between views than in them."""
+_POINTS = 500  # of a view, at most
+_ENOUGH = 100  # points of a view that tell where they begin
+_OUTLIERS_PERCENT = 1.0
+
+
+def view_gaps(
+    cameras: Sequence[Camera],
+    camera_to_world: np.ndarray,
+    points: np.ndarray,
+    others: np.ndarray | None = None,
+) -> np.ndarray:
+    """Tell how far each view is from the next one that shows the same.
+
+    At a point, the angle between the rays of two views tells how much of what one shows
+    of its surroundings the other has seen, too. Of the points in a picture, the median
+    of the angles to the nearest other view that has the point in its picture; 180 where
+    none has, and for a view without points. Occlusion and distortion are left out.
+
+    Args:
+        cameras: n intrinsics.
+        camera_to_world: (n, 4, 4), OpenCV axes.
+        points: (m, 3), what the views show, sparse.
+        others: (n,), bool: the views to be near to; None for all.
+
+    Returns:
+        (n,), degrees.
+    """
+    eyes = camera_to_world[:, :3, 3]
+    shown = _shown(cameras, camera_to_world, points)
+    usable = np.ones(len(cameras), bool) if others is None else others
+    return np.array([_gap(i, eyes, shown, usable, points) for i in range(len(cameras))])
+
+
+def nearest_points(
+    cameras: Sequence[Camera], camera_to_world: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Tell how near to each camera the points in its picture begin.
+
+    Args:
+        cameras: n intrinsics.
+        camera_to_world: (n, 4, 4), OpenCV axes.
+        points: (m, 3), what the views show, sparse.
+
+    Returns:
+        (n,), metres: 99 % of the points in a picture are farther away, as structure
+        from motion has outliers; 0 where there are fewer than 100.
+    """
+    shown = _shown(cameras, camera_to_world, points)
+    found = np.zeros(len(cameras))
+    for i in np.flatnonzero(shown.sum(1) >= _ENOUGH):
+        away = np.linalg.norm(points[shown[i]] - camera_to_world[i, :3, 3], axis=1)
+        found[i] = np.percentile(away, _OUTLIERS_PERCENT)
+    return found
+
+
+def _shown(
+    cameras: Sequence[Camera], camera_to_world: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Tell which points (m, 3) each pinhole's picture has, (n, m)."""
+    found = []
+    for camera, pose in zip(cameras, camera_to_world, strict=True):
+        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+        u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+        inside = (u >= 0) & (u < camera.width * z) & (v >= 0) & (v < camera.height * z)
+        found.append((z > 0) & inside)
+    return np.stack(found)
+
+
+def _gap(
+    view: int,
+    eyes: np.ndarray,
+    shown: np.ndarray,
+    usable: np.ndarray,
+    points: np.ndarray,
+) -> float:
+    seen = np.flatnonzero(shown[view])
+    if not len(seen):
+        return 180.0
+    seen = seen[:: -(-len(seen) // _POINTS)]
+    rays = eyes[:, None] - points[seen]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    cosine = np.where(shown[:, seen] & usable[:, None], (rays * rays[view]).sum(2), -1)
+    cosine[view] = -1
+    return float(np.median(np.degrees(np.arccos(np.clip(cosine.max(0), -1, 1)))))
