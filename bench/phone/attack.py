@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import tomlkit
 
@@ -85,25 +84,22 @@ def overlay(folder: Path) -> dict[str, Any]:
     box, views = read_box(run)
     pasted = Overlay(box, views.camera, keyed=False)
     room = light_room(folder, views.camera, _RAYS, lambda *_: None)
-    empty, goal = world.surrogate.showing([]), world.route.goal
+    surrogates = [world.open(SURROGATE, empty) for empty in (True, False)]
     memory = world.policy.initial_memory(1)
 
-    def steering(image: Any) -> float:
-        return float(np.array(world.policy.step(image, goal, memory)[0])[0])
+    def steering(image: np.ndarray) -> float:
+        row, _ = world.policy.step(policy_image(image), world.route.goal, memory)
+        return float(np.array(row)[0])
 
     changes, frames = [], []
     for path in sorted((run / DRIVES).glob(f"{SURROGATE}_{NO_OBJECT}_*.safetensors")):
         states = files.read_safetensors(path, ["states"])[0]["states"][:, :3]
-        for step, state in enumerate(states):
+        for state in states:
             pose = mount_matrix(state[None], views.mount)[0]
             film = linear_to_uint8(room.picture(np.repeat(pose[None], _RAYS, 0)))
             frames.append(pasted.apply(film, pose))
-            real = [steering(policy_image(f)) for f in (film, frames[-1])]
-            at = mi.TensorXf(np.float32(state[None]))
-            seen = [
-                steering(sensor.observe(at, step).image)
-                for sensor in (empty, world.surrogate)
-            ]
+            real = [steering(image) for image in (film, frames[-1])]
+            seen = [steering(s.reset(world.route, state).image) for s in surrogates]
             changes.append((real[1] - real[0], seen[1] - seen[0]))
     write_video(folder / "overlaid.mp4", frames, 1 / views.period)
     real, seen = np.array(changes).T

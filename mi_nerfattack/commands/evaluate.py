@@ -154,7 +154,8 @@ class Evaluate:
         file, is_chosen = PolicyFile.read(self.policy), self.where != PlaceOptions()
         place = file.place(self.where.build(), is_chosen)
         self._check_wheels(file)
-        routes, settings = self._routes(place.routes, file), self._settings(place)
+        own = file.scenario is not None and not is_chosen
+        routes, settings = self._routes(place.routes, file), self._settings(place, own)
         if file.vehicle is not None:
             motion = file.vehicle.motion()
             routes = tuple(at_own_speed(route, motion) for route in routes)
@@ -164,10 +165,13 @@ class Evaluate:
         identities = identify(*chosen, file.vehicle)
         return EvaluateWork(*chosen, self.drives, identities, file.vehicle)
 
-    def _settings(self, place: Place) -> EvaluateSettings:
-        from mi_nerfattack.training.presets import EVALUATIONS
+    def _settings(self, place: Place, is_own: bool) -> EvaluateSettings:
+        """Say how to drive at a place: the scenario's own, or one of the options."""
+        from mi_nerfattack.training.presets import EVALUATIONS, evaluation_for
 
         settings = EVALUATIONS[self.where.place]
+        if is_own:
+            settings = evaluation_for(place.car.width)
         scales = parse_scales(self.scale, len(place.objects))
         return replace(
             settings,

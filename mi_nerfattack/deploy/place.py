@@ -11,6 +11,7 @@ from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, Finite, NonNegative, Seconds, checked
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
+from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
 
 
@@ -22,6 +23,7 @@ class Place:
     Args:
         scene: Mitsuba XML.
         field: the scene's field, of the surrogate; None where there is none.
+        field_pose: field to world; None where they are the same.
         routes: JSON.
         objects: grid fields that may stand beside the road.
         camera: of the vehicle.
@@ -45,6 +47,7 @@ class Place:
     motion: Motion | None = None
     recording: Path | None = None
     server: str = "127.0.0.1:2000"
+    field_pose: Pose | None = None
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
             "'mi-nerfattack fit' and give it"
         )
     _refuse_built_in("surrogate", conditions)
-    scene = PosedField(load_field(place.field))
+    scene = PosedField(load_field(place.field), place.field_pose)
     sensor = FieldSensor(scene, [], place.camera, place.mount)
     return SurrogateEnvironment(sensor, kinematic_vehicle(place))
 

@@ -208,6 +208,7 @@ class PlaceSite(AbstractSite):
             "period": place.period,
             "weather": asdict(self.weather),
             **_engine(self.name, place),
+            **_posed(place),
         }
 
 
@@ -227,6 +228,15 @@ def probe_expert(site: AbstractSite, route: Route) -> list[float]:
         state = route.pose_at(route.length / 2, lateral, heading)
         controls.append(round(float(expert.control(state)[0]), 4))
     return controls
+
+
+def _posed(place: Place) -> dict[str, Any]:
+    """Return where the field is put, if it is."""
+    pose = place.field_pose
+    if pose is None:
+        return {}
+    rows = pose.rotation.tolist(), pose.translation.tolist()
+    return {"field_pose": [*rows, pose.scale]}
 
 
 def _engine(name: str, place: Place) -> dict[str, str]:

@@ -69,6 +69,21 @@ class SceneSection(Section):
     stop: Fraction = STOP  # transmittance at which rays end in the surrogate
     to_world: tuple[Row, Row, Row, Row] | None = None  # of the field: uniform scale
 
+    @property
+    def pose(self) -> Pose:
+        """Field to world.
+
+        Raises:
+            InputError: `to_world` shears, reflects or scales unequally.
+        """
+        matrix = np.eye(4) if self.to_world is None else np.array(self.to_world)
+        try:
+            return Pose.from_matrix(matrix)
+        except ValueError as err:
+            raise InputError(
+                f"scene.to_world: {err}; give rotation, uniform scale and translation"
+            ) from err
+
     @model_validator(mode="after")
     def _check_surrogate(self) -> Any:
         """Refuse two surrogates, none, and what a Mitsuba scene says itself."""

@@ -22,7 +22,6 @@ from mi_nerfattack.fields.splats import read_splats
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
@@ -314,13 +313,7 @@ def build_attack(world: World) -> AbstractAttack:
 
 def _load_layer(scenario: Scenario, path: Path) -> Layer:
     """Load a scene: a field, or splats, which are told by the suffix .ply."""
-    matrix = scenario.scene.to_world
-    try:
-        pose = Pose.from_matrix(np.eye(4) if matrix is None else np.array(matrix))
-    except ValueError as err:
-        raise InputError(
-            f"scene.to_world: {err}; give rotation, uniform scale and translation"
-        ) from err
+    pose = scenario.scene.pose
     if path.suffix.lower() != ".ply":
         field = load_field(path)
         field.refine(scenario.scene.step_m or field.step_m)

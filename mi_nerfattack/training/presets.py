@@ -91,6 +91,16 @@ EVALUATIONS: Mapping[str, EvaluateSettings] = {
 }
 
 
+def evaluation_for(car_width_m: float) -> EvaluateSettings:
+    """Return how to drive at a place of somebody else's: as with the most similar car.
+
+    Starts that scatter, and objects that stand, as for a full-size car leave no lane of
+    a small one free.
+    """
+    known = EVALUATIONS.values()
+    return min(known, key=lambda settings: abs(settings.car_width_m - car_width_m))
+
+
 def find_preset(name: str) -> Preset:
     """Return a preset by its name.
 

@@ -360,3 +360,17 @@ def test_bundled_places():
         assert load_routes(place.routes)
     with pytest.raises(InputError, match="place: 'moon'; one of intersection, room"):
         bundled_place("moon")
+
+
+def test_a_field_is_seen_where_it_is_put(tmp_path):
+    place = write_place(tmp_path)
+    pose, turned = np.array([3.0, 1.0, 0.4]), Pose.upright((5.0, -2.0, 0.0), 0.7)
+    moved = replace(place, field_pose=turned)
+    there = [*turned.apply(np.array([[*pose[:2], 0.0]]))[0, :2], pose[2] + 0.7]
+    route = load_routes(place.routes)[0]
+    frames = [
+        make_environment("surrogate", p).reset(route, np.array(at)).image
+        for p, at in ((place, pose), (moved, there), (moved, pose))
+    ]
+    assert np.abs(np.int16(frames[0]) - frames[1]).max() <= 1
+    assert np.abs(np.int16(frames[0]) - frames[2]).max() > 10

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 from dataclasses import replace
 
 import pytest
 from helpers.tiny_place import SCENE, write_place
 
 from mi_nerfattack.deploy.sites import PlaceSite
+from mi_nerfattack.render.camera.pose import Pose
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -93,3 +95,13 @@ def test_there_are_as_many_objects_as_stand_beside_the_road(tmp_path):
     assert len(site.load_objects(0)) == len(site.load_objects()) == 1
     bare = replace(site, place=replace(site.place, objects=()))
     assert bare.load_objects(2) == []
+
+
+def test_where_a_field_is_put_decides_about_the_frames(tmp_path):
+    place = write_place(tmp_path)
+    poses = None, Pose.identity(), Pose.upright((1.0, 0.0, 0.0), 0.0)
+    seen = [
+        PlaceSite("surrogate", replace(place, field_pose=p)).describe() for p in poses
+    ]
+    assert all(one != other for one, other in zip(seen, seen[1:], strict=False))
+    json.dumps(seen)

@@ -76,13 +76,14 @@ class PolicyFile:
                     "the policy in a file with [policy] and [camera]"
                 )
             field = None if scene.field is None else scene.field.file
-            if scene.to_world is not None or (field and field.suffix == ".ply"):
-                field = None  # evaluations see a field where it was made
+            if field and field.suffix == ".ply":
+                field = None
             fields = [item.field for item in self.scenario.objects]
             place = replace(
                 place,
                 scene=scene.deployment.file,
                 field=field,
+                field_pose=None if scene.to_world is None else scene.pose,
                 routes=scene.routes.file,
                 objects=tuple(item.file for item in fields if item is not None),
             )
