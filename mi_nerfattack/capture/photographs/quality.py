@@ -18,6 +18,7 @@ from mi_nerfattack.io import files
 _SMALL_PX = 800  # longer edge at which sharpness is measured
 _NEIGHBOURS = 5  # on either side, by name, that sharpness is compared with
 _BLURRED = 0.3  # of the neighbours' median sharpness
+_ALONE_DEG = 2 * FAR_DEG
 _FEW_FEATURES, _FEW_POINTS = 200, 50
 FEW_PLACED = 0.8
 """Share of placed photographs below which a set deserves advice."""
@@ -62,8 +63,9 @@ class Quality:
                     self.placed and self.points < _FEW_POINTS,
                 ),
                 (
-                    f"far from the others ({self.gap_deg or 0:.0f} degrees)",
-                    self.gap_deg is not None and self.gap_deg > FAR_DEG,
+                    f"alone, {self.gap_deg or 0:.0f} degrees from the next view: "
+                    "take more beside it",
+                    self.gap_deg is not None and self.gap_deg > _ALONE_DEG,
                 ),
             )
             if is_so
