@@ -122,9 +122,9 @@ def seen_cells(
     """Mark the cells of a grid over a box that several cameras look at.
 
     What a single camera sees can be given any depth, and what none sees any colour:
-    density there would only hide the rest from other views. So it would close to a
+    density there would only hide the rest from other views. So it would close before a
     camera, where a fit begins with fog that is thrown away slowly, if at all: where
-    sparse points tell how near to a camera things begin, cells around it are left out.
+    sparse points tell how near to a camera things begin, cells between are left out.
 
     Args:
         images: the posed images.
@@ -150,7 +150,8 @@ def seen_cells(
     for index, near in zip(indices, _nearest(images, indices), strict=True):
         count += _in_view(images, int(index), points, radius)
         eye = images.camera_to_world[index, :3, 3].astype(np.float32)
-        clear &= ((points - eye) ** 2).sum(1) >= (_CLEAR * near) ** 2
+        before = ((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2
+        clear &= ~(before & _in_view(images, int(index), points, 0.0, 0.0))
     seen = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):
         seen = np.repeat(seen, _COARSE, axis)
@@ -166,14 +167,18 @@ def _nearest(images: PosedImages, indices: np.ndarray) -> np.ndarray:
 
 
 def _in_view(
-    images: PosedImages, index: int, points: np.ndarray, radius: float
+    images: PosedImages,
+    index: int,
+    points: np.ndarray,
+    radius: float,
+    border: float = _BORDER,
 ) -> np.ndarray:
     """Tell which points a camera sees, or balls about them touch its pyramid."""
     camera, pose = images.camera_of(index), images.camera_to_world[index]
     offset = points - pose[:3, 3].astype(np.float32)
     x, y, z = (offset @ pose[:3, :3].astype(np.float32)).T
     left, right, top, bottom = _edges(camera)
-    room = 1 + 2 * _BORDER
+    room = 1 + 2 * border
     near = z > -radius
     depth = np.maximum(z, 0)
     return (

@@ -262,6 +262,19 @@ def test_cells_that_cameras_see():
     assert at(clear, 5, 0, 0) and at(clear, 3, 3, 3)
 
 
+def test_the_road_beneath_a_camera_is_seen_from_behind():
+    eyes = [[x, 0.0, 0.0] for x in (0.0, -4.0, -8.0)]
+    poses = np.stack([look_at(eye, np.add(eye, [1, 0, 0])) for eye in eyes])
+    road = np.random.default_rng(0).uniform([-9, -1, -1.8], [9, 1, -1.7], (4000, 3))
+    blank = np.zeros((3, 16, 16, 3), np.uint8)
+    camera, names = from_fov(16, 16, 90.0), ("first", "second", "third")
+    images = PosedImages(blank, poses, camera, names, points=road)
+    low, high = np.full(3, -10.0), np.full(3, 10.0)
+    seen = seen_cells(images, np.arange(3), low, high, (40, 40, 40))
+    beneath, before = ((21, 20, 16), (22, 20, 20))  # of the first camera, half metres
+    assert seen[beneath] and not seen[before]
+
+
 def test_cells_at_the_rim_of_a_distorted_image_are_seen():
     # barrel: the border, 1 / f from the axis, shows what lies farther out
     lens = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, k1=-0.2)
