@@ -19,6 +19,7 @@ _FADING = 0.8  # share of the density of a cell that survives a visit
 _VISITS = 1 << 16  # cells an update looks at
 _BORDER = 0.05  # of the image, beyond which a camera still sees a cell
 _CLEAR = 0.8  # of the way to the nearest sparse points is empty
+_BACK = 0.15  # of this way: where the pyramid that is empty begins, behind the camera
 _COARSE = 2  # cells whose visibility is decided together, along each axis
 
 
@@ -151,7 +152,8 @@ def seen_cells(
         count += _in_view(images, int(index), points, radius)
         eye = images.camera_to_world[index, :3, 3].astype(np.float32)
         before = ((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2
-        clear &= ~(before & _in_view(images, int(index), points, 0.0, 0.0))
+        back = _BACK * near
+        clear &= ~(before & _in_view(images, int(index), points, 0.0, 0.0, back))
     seen = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):
         seen = np.repeat(seen, _COARSE, axis)
@@ -172,11 +174,13 @@ def _in_view(
     points: np.ndarray,
     radius: float,
     border: float = _BORDER,
+    back: float = 0.0,
 ) -> np.ndarray:
-    """Tell which points a camera sees, or balls about them touch its pyramid."""
+    """Tell which points a camera so far back sees, or balls about touch its pyramid."""
     camera, pose = images.camera_of(index), images.camera_to_world[index]
     offset = points - pose[:3, 3].astype(np.float32)
     x, y, z = (offset @ pose[:3, :3].astype(np.float32)).T
+    z = z + np.float32(back)
     left, right, top, bottom = _edges(camera)
     room = 1 + 2 * border
     near = z > -radius
