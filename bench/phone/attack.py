@@ -26,6 +26,7 @@ from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import build_world
 
 _RAYS = 4  # through a pixel of the film that is overlaid
+_STEP_M = 0.03  # of the march: half the time of the fit's own, 0.4 dB less
 _SCENARIO = ROOM.parents[1] / "room.toml"
 
 
@@ -44,6 +45,7 @@ def write_scenario(folder: Path, field: Path) -> Path:
     table = tomlkit.parse(files.read_text(_SCENARIO))
     scene: Any = table["scene"]
     scene["field"], scene["to_world"] = str(field.resolve()), matrix.tolist()
+    scene["step_m"] = _STEP_M
     path = folder / "room.toml"
     files.write_text(path, tomlkit.dumps(table))
     return path

@@ -169,7 +169,10 @@ def _retraining(retrained: Table) -> str:
     )
     text = (
         "Drives of both policies from the same starts, which no run has seen. Those "
-        "without\nobjects are the same for all attacks of a route: the mean alone."
+        "without\nobjects are the same for all attacks of a route: the mean alone. "
+        "A first retraining, with a\nfifth of the frames, "
+        "[missed the aim](../retrain.md#what-it-came-to); this one was settled\n"
+        "[after it](../../scenes/held_out.toml)."
     )
     header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
     return section("Before and after retraining", text, header, rows)

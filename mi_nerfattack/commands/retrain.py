@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from mi_nerfattack.system.workers import AbstractWorkers
     from mi_nerfattack.training.settings import ImitationSettings
 
-#: New frames by environment, a tenth of the preset laptop of 'train'.
-FRAMES = {"surrogate": 384, "mitsuba": 640}
+#: New frames by environment, half of the preset laptop of 'train'.
+FRAMES = {"surrogate": 2048, "mitsuba": 3072}
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Retrain:
     held_out: tuple[Path, ...] = ()
     """Runs on the same policy to drive before and after, and not to train on."""
     frames: dict[str, int] | None = None
-    """New frames by environment; surrogate 384 mitsuba 640 by default, a tenth of the
+    """New frames by environment; surrogate 2048 mitsuba 3072 by default, half of the
     preset laptop of 'train'."""
     skies: tuple[str, ...] = ("day",)
     """Times of day of rendered frames; others than day need a sunsky emitter."""
@@ -60,7 +60,7 @@ class Retrain:
     """Exposures of rendered frames, in powers of two."""
     spp: int = 4
     """Samples per pixel of path-traced frames."""
-    epochs: int = 4
+    epochs: int = 8
     """Passes over all frames."""
     batch: int = 64
     """Images a training step."""
