@@ -11,9 +11,8 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomlkit
@@ -23,7 +22,6 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.ranges import Count, Finite, Fraction, NonNegative, Positive, Whole
-from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.march import STOP
 from mi_nerfattack.scenario.attack import AttackSection
@@ -42,7 +40,7 @@ from mi_nerfattack.scenario.policy import (
     build_differentiable,
 )
 from mi_nerfattack.scenario.section import Section, problems, refuse
-from mi_nerfattack.scenario.vehicle import DubinsSection, VehicleSection
+from mi_nerfattack.scenario.vehicle import CameraSection, DubinsSection, VehicleSection
 from mi_nerfattack.vehicle.route.route import Route
 
 #: Returns the name of a file without its folder, and the SHA-256 of its content.
@@ -112,46 +110,6 @@ class ObjectSection(Section):
         """Where it stands."""
         assert self.position_m is not None  # checked by Scenario
         return Pose.upright(self.position_m, np.radians(self.yaw_deg), self.scale)
-
-
-class CameraSection(Section):
-    """The camera on the vehicle."""
-
-    width: Count = 200
-    height: Count = 66
-    fov_x_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
-    fx: Positive | None = None  # pixels; in place of fov_x_deg
-    fy: Positive | None = None  # fx
-    cx: Finite | None = None  # pixels from the image's corner, not its first pixel's
-    cy: Finite | None = None  # centre; the middle
-    k1: Finite = 0.0  # distortion as OpenCV's
-    k2: Finite = 0.0
-    p1: Finite = 0.0
-    p2: Finite = 0.0
-    height_m: Positive = 1.4
-    forward_m: Finite = 0.5
-    pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
-    later: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-
-    def build(self) -> tuple[Camera, CameraMount]:
-        """Make intrinsics and mount."""
-        camera = from_fov(self.width, self.height, self.fov_x_deg)
-        lens = {k: getattr(self, k) for k in self.later} | {"fy": self.fy or self.fx}
-        camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
-        return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
-
-    @model_validator(mode="after")
-    def _check_lens(self) -> Any:
-        """Refuse two focal lengths, half of one, and distortion without an inverse."""
-        if self.fx and self.fov_x_deg != self.defaults()["fov_x_deg"]:
-            refuse("fx", "stands beside fov_x_deg; give one of them")
-        if self.fy and not self.fx:
-            refuse("fy", "stands without fx; give both, or fov_x_deg")
-        try:
-            self.build()
-        except InputError as error:
-            refuse("k1", str(error))
-        return self
 
 
 class DriveSection(Section):

@@ -1,17 +1,19 @@
-"""The section ``[vehicle]``: its model, one section each, and its time step."""
+"""The sections ``[vehicle]``, one for each model, and ``[camera]``, mounted on it."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from mi_nerfattack.deploy.car import CAR, Car
 from mi_nerfattack.deploy.kinematic import Motion
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Count, Finite, Positive, Whole
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, from_fov
 from mi_nerfattack.scenario.named_file import AnyCode
 from mi_nerfattack.scenario.section import Kinds, Section, Trust, refuse
 from mi_nerfattack.vehicle.ackermann_rate import RateLimitedAckermann
@@ -38,6 +40,46 @@ _STABLE_RATIO = {"euler": 2.0, "rk4": 2.78, "implicit_midpoint": float("inf")}
 TRIALS = 3
 
 SteerAngle = Annotated[float, Field(gt=0, lt=90)]
+
+
+class CameraSection(Section):
+    """The camera on the vehicle."""
+
+    width: Count = 200
+    height: Count = 66
+    fov_x_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    fx: Positive | None = None  # pixels; in place of fov_x_deg
+    fy: Positive | None = None  # fx
+    cx: Finite | None = None  # pixels from the image's corner, not its first pixel's
+    cy: Finite | None = None  # centre; the middle
+    k1: Finite = 0.0  # distortion as OpenCV's
+    k2: Finite = 0.0
+    p1: Finite = 0.0
+    p2: Finite = 0.0
+    height_m: Positive = 1.4
+    forward_m: Finite = 0.5
+    pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 6.0
+    later: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+    def build(self) -> tuple[Camera, CameraMount]:
+        """Make intrinsics and mount."""
+        camera = from_fov(self.width, self.height, self.fov_x_deg)
+        lens = {k: getattr(self, k) for k in self.later} | {"fy": self.fy or self.fx}
+        camera = replace(camera, **{k: v for k, v in lens.items() if v is not None})
+        return camera, CameraMount(self.height_m, self.forward_m, self.pitch_deg)
+
+    @model_validator(mode="after")
+    def _check_lens(self) -> Any:
+        """Refuse two focal lengths, half of one, and distortion without an inverse."""
+        if self.fx and self.fov_x_deg != self.defaults()["fov_x_deg"]:
+            refuse("fx", "stands beside fov_x_deg; give one of them")
+        if self.fy and not self.fx:
+            refuse("fy", "stands without fx; give both, or fov_x_deg")
+        try:
+            self.build()
+        except InputError as error:
+            refuse("k1", str(error))
+        return self
 
 
 class AbstractVehicleSection(Section):

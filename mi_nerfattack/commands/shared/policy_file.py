@@ -39,9 +39,9 @@ class PolicyFile:
         Raises:
             InputError: a section is not usable.
         """
-        from mi_nerfattack.scenario.scenario import CameraSection, load_scenario
+        from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.scenario.section import read_section
-        from mi_nerfattack.scenario.vehicle import VehicleSection
+        from mi_nerfattack.scenario.vehicle import CameraSection, VehicleSection
 
         if not is_toml(policy):
             return cls()
