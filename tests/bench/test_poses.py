@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from capture.photographs.test_estimate import CAMERA, corner_photograph, corner_poses
+from helpers.corner import CAMERA, corner_photograph, corner_poses
 from helpers.posed_folders import write_transforms
 from scipy.spatial.transform import Rotation
 

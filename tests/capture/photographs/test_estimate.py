@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.corner import CAMERA, aligned, corner_photograph, corner_poses
 from PIL import ExifTags, Image
 
 from mi_nerfattack import cli
@@ -23,66 +23,13 @@ from mi_nerfattack.capture.photographs.staging import (
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.io import files
-from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
+from mi_nerfattack.render.camera.intrinsics import Camera, from_fov
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-CAMERA = from_fov(240, 180, 60.0)
 COUNT = 8
 LEFT_HALF = np.zeros((180, 240), np.uint8)
 LEFT_HALF[:, 120:] = 255
-
-
-def noise(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Grey noise with detail at several scales, in [0, 1]."""
-    total = np.zeros_like(x)
-    for level in range(1, 6):
-        table = rng.random((64, 64))
-        u, v = x * 1.3 * 2**level, y * 1.3 * 2**level
-        i, j = np.floor(u).astype(int), np.floor(v).astype(int)
-        a, b = u - i, v - j
-        at = lambda di, dj, t=table, i=i, j=j: t[(i + di) % 64, (j + dj) % 64]  # noqa: E731
-        total += (1 - a) * ((1 - b) * at(0, 0) + b * at(0, 1)) / 2**level
-        total += a * ((1 - b) * at(1, 0) + b * at(1, 1)) / 2**level
-    return np.clip((total - 0.2) / 0.6, 0, 1)
-
-
-def corner_photograph(pose: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Trace a floor z = 0 and two walls x = 3, y = 3, seen from inside."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    local = [x, y, np.ones_like(u)]
-    ray = np.stack(local, -1) @ pose[:3, :3].T
-    eye = pose[:3, 3]
-    with np.errstate(divide="ignore"):
-        t = (np.array([3.0, 3.0, 0.0]) - eye) / ray
-    t = np.where(t > 1e-9, t, np.inf)
-    face = t.argmin(-1)
-    point = eye + t.min(-1)[..., None] * ray
-    rng = np.random.default_rng(5)
-    grey = np.zeros(u.shape)
-    for axis in range(3):
-        a, b = np.delete(np.arange(3), axis)
-        grey += (face == axis) * noise(rng, point[..., a], point[..., b])
-    return np.repeat(np.round(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def corner_poses(count: int = COUNT) -> np.ndarray:
-    angle = np.linspace(-0.5, 0.5, count)
-    eyes = np.stack(
-        [2 - 4 * np.cos(angle + 0.785), 2 - 4 * np.sin(angle + 0.785), 1.6 + angle], 1
-    )
-    return np.stack([look_at(eye, np.array([2.2, 2.2, 1.2])) for eye in eyes])
-
-
-def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a similarity of points (n, 3); return it applied, and its rotation."""
-    centre, target = found.mean(0), given.mean(0)
-    u, s, vt = np.linalg.svd((given - target).T @ (found - centre))
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ sign @ vt
-    scale = np.trace(np.diag(s) @ sign) / ((found - centre) ** 2).sum()
-    return scale * (found - centre) @ turn.T + target, turn
 
 
 @pytest.fixture(scope="module")
@@ -203,45 +150,6 @@ class TestCorner:
         assert written.items() <= told.items() and told["placed"] == COUNT
         assert told["transforms"] == f"{output}/transforms.json"
         assert len(told["farthest"]) == 2 and told["distance"] > 0
-
-
-LENS = replace(CAMERA, cx=140.0)  # of 240 px: 20 beside the middle
-
-
-def placed_by(poses: np.ndarray, folder: Path) -> Camera:
-    """Return the camera that is found of photographs by `LENS`."""
-    pytest.importorskip("pycolmap")
-    (folder / "photographs").mkdir()
-    for i, pose in enumerate(poses):
-        path = folder / "photographs" / f"{i:02}.png"
-        files.write_image(path, corner_photograph(pose, LENS))
-    options = PoseOptions(lens="SIMPLE_PINHOLE")
-    silent = lambda *_: None  # noqa: E731
-    result = estimate_poses(folder / "photographs", folder / "out", options, silent)
-    assert len(result.placed) == len(poses)
-    return result.cameras[0]
-
-
-@pytest.mark.slow
-def test_many_photographs_tell_where_a_lens_sits(tmp_path):
-    """Until it is found beside the middle, cameras seem turned, by 5.5 degrees."""
-    poses = corner_poses(20)
-    for pose, angle in zip(poses, np.linspace(-0.8, 0.8, len(poses)), strict=True):
-        turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        pose[:3, :2] = pose[:3, :2] @ turn
-    assert placed_by(poses, tmp_path).cx == pytest.approx(LENS.cx, abs=3)
-    found = read_images(tmp_path / "out").camera_to_world
-    _, turn = aligned(found[:, :3, 3], poses[:, :3, 3])
-    cosine = ((turn @ found[:, :3, 2, None])[..., 0] * poses[:, :3, 2]).sum(1)
-    assert np.degrees(np.arccos(cosine.min())) < 2.5
-
-
-@pytest.mark.slow
-def test_a_camera_that_goes_where_it_looks_leaves_the_lens_in_the_middle(tmp_path):
-    """Nothing tells a lens beside the middle from a camera that looks aside."""
-    eyes = np.linspace([-0.5, -0.5, 1.6], [1.0, 1.0, 1.4], 20)
-    poses = np.stack([look_at(eye, np.array([3.0, 3.0, 17 / 15])) for eye in eyes])
-    assert placed_by(poses, tmp_path).cx == 120
 
 
 class TestUnusable:

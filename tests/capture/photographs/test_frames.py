@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.corner import corner_photograph, corner_poses
 from scipy import ndimage
 
 from mi_nerfattack import cli
@@ -220,8 +221,6 @@ class TestCommand:
     @pytest.mark.slow
     def test_a_film_is_placed(self, tmp_path, capsys):
         pytest.importorskip("pycolmap")
-        from capture.photographs.test_estimate import corner_photograph, corner_poses
-
         frames = [corner_photograph(pose) for pose in corner_poses(60)]
         write_video(tmp_path / "walk.mp4", frames, 30.0)
         arguments = [str(tmp_path / "walk.mp4"), "-o", str(tmp_path / "out")]
