@@ -151,9 +151,10 @@ def seen_cells(
     for index, near in zip(indices, _nearest(images, indices), strict=True):
         count += _in_view(images, int(index), points, radius)
         eye = images.camera_to_world[index, :3, 3].astype(np.float32)
-        before = ((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2
+        before = np.nonzero(((points - eye) ** 2).sum(1) < (_CLEAR * near) ** 2)[0]
         back = _BACK * near
-        clear &= ~(before & _in_view(images, int(index), points, 0.0, 0.0, back))
+        open_to = _in_view(images, int(index), points[before], 0.0, 0.0, back)
+        clear[before[open_to]] = False
     seen = (clear & (count >= min(cameras, len(indices)))).reshape(coarse)
     for axis in range(3):
         seen = np.repeat(seen, _COARSE, axis)

@@ -25,8 +25,8 @@ POINTS = "points.npy"
 PARTS = ("cameras", "images", "points3D")  # of a model; the last may be missing
 LEAST_IMAGES = 3
 
-_CENTRED = 20  # photographs of a camera that may tell its principal point
-_CENTRED_SD = 0.005  # of the longer edge, at most: how surely they tell it
+_MANY = 20  # photographs of a camera that may tell its principal point
+_TOLD_SD = 0.005  # of the longer edge, at most: how surely they tell it
 _LEAST_TRACK = 3  # images that see a point which counts
 _OVERLAP = 10  # sequential: neighbours, and neighbours at distances 2^k, k < overlap
 _BLOCK = 10  # exhaustive: photographs a side of the squares of pairs that are logged
@@ -160,7 +160,7 @@ def _reconstruct(
     found = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
     if found is None:
         return None
-    found = _centred(pycolmap, found)
+    found = _with_principal_points(pycolmap, found)
     with pycolmap.Database.open(database) as table:
         features = {
             image.name: table.num_keypoints_for_image(image.image_id)
@@ -205,20 +205,20 @@ def _map(pycolmap: Any, database: Path, folder: Path, task: dict[str, Any]) -> A
     )
 
 
-def _centred(pycolmap: Any, model: Any) -> Any:
+def _with_principal_points(pycolmap: Any, model: Any) -> Any:
     """Return the model with principal points where photographs tell of them.
 
     COLMAP leaves them in the middle of the image, and a lens that sits beside it seems
     a turn of the camera. They are let go once all else is known, of cameras with many
-    photographs; where one of them is not told to `_CENTRED_SD` of the longer edge, as
+    photographs; where one of them is not told to `_TOLD_SD` of the longer edge, as
     when a camera looks and moves one way, all stay where they were.
     """
     images = model.reg_image_ids()
     placed = Counter(model.images[i].camera_id for i in images)
-    many = [camera for camera, count in placed.items() if count >= _CENTRED]
+    many = [camera for camera, count in placed.items() if count >= _MANY]
     if not many:
         return model
-    model, before = pycolmap.Reconstruction(model), model
+    moved = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point, options.print_summary = True, False
     config = pycolmap.BundleAdjustmentConfig()
@@ -227,22 +227,27 @@ def _centred(pycolmap: Any, model: Any) -> Any:
     for camera in placed.keys() - set(many):
         config.set_constant_cam_intrinsics(camera)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, moved)
     adjuster.solve()
-    model.update_point_3d_errors()
-    error_px = model.compute_mean_reprojection_error()
+    moved.update_point_3d_errors()
     told = pycolmap.estimate_ba_covariance(
-        pycolmap.BACovarianceOptions(), model, adjuster
+        pycolmap.BACovarianceOptions(), moved, adjuster
     )
-    for camera in (model.cameras[i] for i in many):
-        spread = None if told is None else told.get_other_params_cov(camera.params)
-        if spread is None:
-            return before
-        at = camera.principal_point_idxs()
-        sd = error_px * np.sqrt(np.diag(spread)[list(at)].max())
-        if not sd <= _CENTRED_SD * max(camera.width, camera.height):
-            return before
+    error_px = moved.compute_mean_reprojection_error()
+    cameras = (moved.cameras[i] for i in many)
+    if told and all(_is_told(told, camera, error_px) for camera in cameras):
+        return moved
     return model
+
+
+def _is_told(told: Any, camera: Any, error_px: float) -> bool:
+    """Whether a covariance, of errors of 1 px, tells a camera's principal point."""
+    covariance = told.get_other_params_cov(camera.params)
+    if covariance is None:
+        return False
+    variances = np.diag(covariance)[list(camera.principal_point_idxs())]
+    most = _TOLD_SD * max(camera.width, camera.height)
+    return bool(error_px * np.sqrt(variances.max()) <= most)
 
 
 def _summary(model: Any) -> dict[str, Any]:
