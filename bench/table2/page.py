@@ -49,7 +49,7 @@ the line, the most that it could be; in brackets the mean. Scenes, policies and 
 periods differ: compare within a row, not between the rows."""
 _RETRAIN = (
     "mi-nerfattack retrain FOLDER/cells/* -o retrained.safetensors --data DATA "
-    "--more FRAMES  # those of the bundled policy's training"
+    "--more FRAMES  # which: docs/retrain.md"
 )
 _REPLAY = "mi-nerfattack replay docs/table2 --rows 10  # any row comes back"
 _BUDGETS = """\
@@ -169,10 +169,9 @@ def _retraining(retrained: Table) -> str:
     )
     text = (
         "Drives of both policies from the same starts, which no run has seen. Those "
-        "without\nobjects are the same for all attacks of a route: the mean alone. "
-        "A first retraining, with a\nfifth of the frames, "
-        "[missed the aim](../retrain.md#what-it-came-to); this one was settled\n"
-        "[after it](../../scenes/held_out.toml)."
+        "without\nobjects are the same for all attacks of a route: the mean alone.\n"
+        "How it was retrained, how a first retraining missed the aim, and what became "
+        "of attacks\nheld out: [retraining](../retrain.md#what-it-came-to)."
     )
     header = ["environment", "route", *(stage.replace("_", " ") for stage in stages)]
     return section("Before and after retraining", text, header, rows)
