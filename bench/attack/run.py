@@ -128,7 +128,7 @@ class Bench:
         scene = _scene()
         NGPData.of(scene).write(self.scene)
         camera = from_fov(*Settings().sizes[0], FOV_DEG)
-        save_field(self.baked, bake(scene, _routes(), camera, MOUNT))
+        save_field(self.baked, bake(PosedField(scene), _routes(), camera, MOUNT))
         item = load_grid(bundled("hydrant/field.safetensors"))
         ObjectData.of(PosedField(item, OBJECT_POSE)).write(self.item)
 
@@ -223,8 +223,8 @@ class Bench:
     def _bake_psnr_db(self, size: tuple[int, int]) -> float:
         """Return the mean PSNR of the bricks against the field."""
         camera = from_fov(*size, FOV_DEG)
-        parts = _scene(), load_field(self.baked), _routes(), camera, MOUNT
-        views = score_bake(*parts, spacing_m=_SCORE_EVERY_M)
+        pair = PosedField(_scene()), PosedField(load_field(self.baked))
+        views = score_bake(*pair, _routes(), camera, MOUNT, spacing_m=_SCORE_EVERY_M)
         return statistics.fmean(view.psnr_db for view in views)
 
     def _ours(self, job: Job, *baked: str) -> Worker:

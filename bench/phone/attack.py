@@ -75,9 +75,9 @@ def overlay(folder: Path) -> dict[str, Any]:
     with the cube pasted by pose, and by the surrogate without and with the cube.
 
     Returns:
-        number of frames and of those whose steering the surrogate changes by more than
-        a hundredth of its largest change; correlation of the changes, their standard
-        deviations, radians; and the largest of each.
+        number of overlaid frames and of those whose steering the surrogate changes by
+        more than a hundredth of its largest change; correlation of the changes, their
+        standard deviations, radians; and the largest of each.
     """
     run = folder / "run"
     (found,) = read_found([run])
@@ -106,7 +106,7 @@ def overlay(folder: Path) -> dict[str, Any]:
     write_video(folder / "overlaid.mp4", frames, 1 / views.period)
     real, seen = np.array(changes).T
     return {
-        "frames": len(seen),
+        "overlaid": len(seen),
         "changed": int((np.abs(seen) > 0.01 * np.abs(seen).max()).sum()),
         "correlation": float(np.corrcoef(real, seen)[0, 1]),
         "film_sd_rad": float(real.std()),

@@ -5,27 +5,30 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from mi_nerfattack.commands.shared.result import Result
 
+if TYPE_CHECKING:
+    from mi_nerfattack.scenario.scenario import Scenario
+
 
 @dataclass(frozen=True)
 class Bake:
-    """Bake a scene's field along its routes, for faster attacks and drives.
+    """Bake a scenario's field along its routes, for faster attacks and drives.
 
-    The file takes the field's place in a scenario. It shows nearly what the field
-    shows; FILE.report beside it says how nearly.
+    The field is that of [scene], at its to_world, as the scenario's camera sees it from
+    all routes of its file. The bricks stand in the scenario as scene.bricks, or in the
+    field's place. They show nearly what the field shows; FILE.report beside them says
+    how nearly.
     """
 
-    field: tyro.conf.Positional[Path]
-    """Field file of the scene, as fit writes it."""
-    routes: Path
-    """Routes file (.json), in the field's frame; all its routes are used."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Field file to write (.safetensors)."""
+    scenario: tyro.conf.Positional[Path]
+    """Scenario file (.toml)."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Field file to write (.safetensors); the scenario's scene.bricks by default."""
     cone: float = 1 / 64
     """Edge of a brick's parts over the distance to the nearest route; half takes up to
     six times the memory."""
@@ -33,12 +36,6 @@ class Bake:
     """Passes of the refinement."""
     views: int = 100
     """Views of a pass."""
-    width: int = 200
-    """Of a view, pixels."""
-    height: int = 66
-    """Of a view, pixels."""
-    fov_deg: float = 90.0
-    """Horizontal field of view."""
     seed: int = 0
     """Of poses and samples."""
     json: bool = False
@@ -49,30 +46,29 @@ class Bake:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import report_folder
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.errors import InputError
-        from mi_nerfattack.fields import NGPField, load_field, save_field
+        from mi_nerfattack.fields import load_field, save_field
         from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
         from mi_nerfattack.fit.bake.scores import score_bake
-        from mi_nerfattack.render.camera.intrinsics import from_fov
+        from mi_nerfattack.render.posed import PosedField
         from mi_nerfattack.report.pages.bake import (
             bake_summary,
             bake_verdict,
             write_bake_report,
         )
         from mi_nerfattack.report.pages.fit import finite
+        from mi_nerfattack.scenario.scenario import load_scenario
         from mi_nerfattack.vehicle.route.route import load_routes
 
-        self._check()
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
-        camera = from_fov(self.width, self.height, self.fov_deg)
-        routes = load_routes(self.routes)
+        scenario, _ = load_scenario(self.scenario)
+        file, output = self._files(scenario)
+        camera, mount = scenario.camera.build()
+        routes = load_routes(scenario.scene.routes.file)
         variant.ensure()
-        field = load_field(self.field)
-        if not isinstance(field, NGPField):
-            raise InputError(
-                f"{self.field}: is a {field.kind}; only an ngp_field is baked"
-            )
-        plan = plan_bricks(field, routes, options)
+        field = load_field(file)
+        field.refine(scenario.scene.step_m or field.step_m)
+        scene = PosedField(field, scenario.scene.pose)
+        plan = plan_bricks(scene, routes, options)
         with StageBars() as bars:
             bars.say(
                 f"{len(plan.subdivisions)} bricks: {plan.file_mb:.0f} MB, "
@@ -80,34 +76,42 @@ class Bake:
             )
             started = time.perf_counter()
             counter = bars.counter("baking", "pass ")
-            baked = bake(field, routes, camera, None, options, plan, counter)
+            baked = bake(scene, routes, camera, mount, options, plan, counter)
             seconds = time.perf_counter() - started
-            save_field(self.output, baked)
+            save_field(output, baked)
+            pair = scene, PosedField(baked, scene.pose)
             score = bars.counter("comparing", "view ")
-            views = score_bake(field, baked, routes, camera, progress=score)
+            views = score_bake(*pair, routes, camera, mount, progress=score)
         facts = {
-            "field": self.field.name,
+            "field": file.name,
             "bricks": len(plan.subdivisions),
             "vertices_mb": round(plan.file_mb, 1),
             **asdict(options),
             "bake_s": round(seconds, 1),
         }
-        title = f"Bake of {self.field.name}"
-        page = write_bake_report(report_folder(self.output), views, facts, title)
-        told = f"{bake_verdict(views)}\nWrote {self.output} and {page}."
+        title = f"Bake of {file.name}"
+        page = write_bake_report(report_folder(output), views, facts, title)
+        told = f"{bake_verdict(views)}\nWrote {output} and {page}."
         return Result(finite(facts | bake_summary(views)), lambda: print(told))
 
-    def _check(self) -> None:
-        """Refuse what would fail after the bake."""
+    def _files(self, scenario: Scenario) -> tuple[Path, Path]:
+        """Return field and output; refuse what would fail after the bake."""
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.fit.scores import MIN_EDGE_PX
 
-        check_output(self.output)
-        if self.output.resolve() == self.field.resolve():
-            raise InputError(f"--output: {self.output} is the field itself")
-        if min(self.width, self.height) < MIN_EDGE_PX:
+        scene, camera = scenario.scene, scenario.camera
+        if scene.field is None:
+            raise InputError(f"{self.scenario}: scene.field is missing; name the field")
+        named = None if scene.bricks is None else scene.bricks.file
+        if (output := self.output or named) is None:
+            raise InputError(f"--output: give it, or scene.bricks in {self.scenario}")
+        check_output(output)
+        if output.resolve() == scene.field.file.resolve():
+            raise InputError(f"--output: {output} is the field itself")
+        if min(camera.width, camera.height) < MIN_EDGE_PX:
             raise InputError(
-                f"--width, --height: {self.width} x {self.height}; SSIM takes at least "
-                f"{MIN_EDGE_PX} px each way"
+                f"{self.scenario}: camera of {camera.width} x {camera.height}; SSIM "
+                f"takes at least {MIN_EDGE_PX} px each way"
             )
+        return scene.field.file, output

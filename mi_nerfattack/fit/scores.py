@@ -73,12 +73,15 @@ class FieldRenderer:
     """Renders a field from any pose; one kernel for all views of one size.
 
     Args:
-        field: the field.
+        field: the field, or one at a pose in the cameras' world.
         over_white: put white behind it in place of its own background.
     """
 
-    def __init__(self, field: AbstractField, over_white: bool = False) -> None:
-        self._posed, self._over_white = PosedField(field), over_white
+    def __init__(
+        self, field: AbstractField | PosedField, over_white: bool = False
+    ) -> None:
+        self._posed = field if isinstance(field, PosedField) else PosedField(field)
+        self._over_white = over_white
 
     def render(self, camera: Camera, camera_to_world: np.ndarray) -> Rendering:
         """Render one view.
@@ -126,6 +129,7 @@ class FieldRenderer:
         d = generate_rays(camera, *pose_arrays(camera_to_world), 1)[1].numpy()
         known = np.where(np.isfinite(depth), depth, np.nan)
         point = camera_to_world[:3, 3] + (d * known.ravel()).T
+        point = self._posed.pose.to_local(point)
         inside = ((point > field.lower) & (point < field.upper)).all(1)
         if not inside.any():
             return float("nan")

@@ -20,7 +20,7 @@ VERBS = {
     "capture": ["capture", ROOM / "scene.xml", "--routes", ROOM / "routes.json", "-o"],
     "photographs": ["capture", SCENES, "-o"],
     "fit": ["fit", "absent", "-o"],
-    "bake": ["bake", "absent", "--routes", "absent", "-o"],
+    "bake": ["bake", SCENES / "demo.toml", "-o"],
     "asset": ["asset", "absent", "-o"],
     "render": ["render", "absent", "-o"],
     "train": ["train", "--data", "absent", "-o"],

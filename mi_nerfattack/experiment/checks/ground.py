@@ -84,7 +84,7 @@ def box_findings(world: World) -> Iterator[str]:
     inside = np.column_stack(
         [points, np.full(len(points), world.surrogate.mount.height_m)]
     )
-    local = (inside - pose.translation) @ pose.rotation / pose.scale
+    local = pose.to_local(inside)
     out = np.any((local < field.lower) | (local > field.upper), axis=1)
     if out.any():
         size = pose.scale * (field.upper - field.lower)

@@ -69,7 +69,7 @@ class Solid:
     def is_solid(self, points: np.ndarray) -> np.ndarray:
         """Tell which points (n, 3) of the world are solid."""
         pose, field = self.posed.placed, self.posed.field
-        local = (points - pose.translation) @ pose.rotation / pose.scale
+        local = pose.to_local(points)
         within = ((local >= field.lower) & (local <= field.upper)).all(1)
         return within & _is_solid(self.posed, upload_rows(mi.Point3f, local))
 

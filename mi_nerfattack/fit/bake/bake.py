@@ -38,7 +38,9 @@ from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.render.walk import Segment, Walk
 from mi_nerfattack.vehicle.route.route import Route
 
-_SPACING_M = 1.0  # between the places on routes that distances are measured from
+#: Between the places on routes that distances are measured from, in widths of a lane:
+#: 1 m where it is 3.5 m wide.
+_SPACING = 2 / 7
 _RAYS_AT_ONCE = 1 << 21  # whose memory is little beside that of the vertices
 _FAINT = 1e-3  # sum of weights below which a vertex is hardly moved
 _WORDS_BAKING = 7  # of a vertex: before, after, and five sums
@@ -89,19 +91,19 @@ class BakePlan:
 
 
 def plan_bricks(
-    field: NGPField, routes: Sequence[Route], options: BakeOptions | None = None
+    scene: PosedField, routes: Sequence[Route], options: BakeOptions | None = None
 ) -> BakePlan:
     """Find the bricks of a field, before any memory is taken for them.
 
     Args:
-        field: the field, in the routes' frame.
+        scene: an :class:`NGPField` at its pose in the routes' frame.
         routes: at least one.
         options: None for the defaults.
 
     Raises:
-        InputError: no cell of the field has density.
+        InputError: the field is no `NGPField`, or no cell of it has density.
     """
-    options = options or BakeOptions()
+    options, field, pose = options or BakeOptions(), _ngp(scene), scene.pose
     octants = field.occupancy.octants
     if octants is None:
         octants = dense_octants(field)
@@ -109,10 +111,10 @@ def plan_bricks(
     if not cells.any():
         raise InputError("bake: the field is empty; fit it again")
     size = (field.upper - field.lower) / cells.shape
-    centre = field.lower + (np.argwhere(cells) + 0.5) * size
+    centre = pose.apply(field.lower + (np.argwhere(cells) + 0.5) * size)
     places = np.concatenate([_places(route) for route in routes])
     distance, index = KDTree(places).query(centre[:, :2])
-    wanted = size.max() / (options.cone * np.maximum(distance, 1e-6))
+    wanted = pose.scale * size.max() / (options.cone * np.maximum(distance, 1e-6))
     subdivisions = 2 ** np.ceil(np.log2(np.clip(wanted, 1, FINEST))).astype(int)
     subdivisions[octants[cells] == 0] = 1  # hardly ever looked at
     if (count := vertex_count(subdivisions)) > MOST_VERTICES:
@@ -125,7 +127,7 @@ def plan_bricks(
 
 
 def bake(
-    field: NGPField,
+    scene: PosedField,
     routes: Sequence[Route],
     camera: Camera,
     mount: CameraMount | None = None,
@@ -142,7 +144,7 @@ def bake(
     surfaces become what the surfaces need, and views are averaged.
 
     Args:
-        field: the field, in the routes' frame.
+        scene: an :class:`NGPField` at its pose in the routes' frame.
         routes: at least one.
         camera: of the poses.
         mount: of the camera on the vehicle; None for the default mount.
@@ -154,7 +156,7 @@ def bake(
     samples' least squares, each row divided by its sum.
     """
     options, mount = options or BakeOptions(), mount or CameraMount()
-    plan = plan or plan_bricks(field, routes, options)
+    plan, field = plan or plan_bricks(scene, routes, options), _ngp(scene)
     codes = Codes.of(field.step_m)
     with dr.suspend_grad():
         baked = BrickField(
@@ -162,7 +164,7 @@ def bake(
             field.upper,
             plan.occupancy,
             plan.subdivisions,
-            _first_vertices(field, plan, codes, mount.height_m),
+            _first_vertices(scene, plan, codes, mount.height_m),
             codes,
             field.tensors()["sky"],
             field.step_m,
@@ -173,9 +175,18 @@ def bake(
         for step in range(options.passes):
             seed = options.seed * 1000 + step
             poses = drive_poses(routes, options.views, seed, mount)
-            _refine(baked, PosedField(field), camera, poses, seed)
+            _refine(baked, scene, camera, poses, seed)
             progress(step + 1, options.passes)
     return baked
+
+
+def _ngp(scene: PosedField) -> NGPField:
+    if not isinstance(scene.field, NGPField):
+        raise InputError(
+            f"bake: the field is a {scene.field.kind}; only an ngp_field is baked, as "
+            "fit writes it"
+        )
+    return scene.field
 
 
 def _provenance(options: BakeOptions) -> dict[str, str]:
@@ -184,20 +195,23 @@ def _provenance(options: BakeOptions) -> dict[str, str]:
 
 def _places(route: Route) -> np.ndarray:
     """Return places along a route, (n, 2), metres."""
-    arcs = np.linspace(0, route.length, 2 + int(route.length / _SPACING_M))
+    spacing = _SPACING * route.lane_width_m
+    arcs = np.linspace(0, route.length, 2 + int(route.length / spacing))
     return route.pose_at(arcs)[:, :2]
 
 
 def _first_vertices(
-    field: NGPField, plan: BakePlan, codes: Codes, height_m: float
+    scene: PosedField, plan: BakePlan, codes: Codes, height_m: float
 ) -> np.ndarray:
     """Return what vertices (m,) begin with, as words."""
+    field, pose = _ngp(scene), scene.pose
     cells = np.argwhere(plan.occupancy.cells)
     starts = brick_starts(plan.subdivisions)
     count, starts = int(starts[-1]), starts[:-1].astype(np.uint32)
     size = (field.upper - field.lower) / plan.occupancy.shape
     eyes = np.hstack([plan.nearest, np.full((len(cells), 1), height_m)])
-    heading = field.lower + (cells + 0.5) * size - eyes
+    heading = pose.apply(field.lower + (cells + 0.5) * size) - eyes
+    heading = heading @ pose.rotation  # into the field's frame
     heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
     words = dr.zeros(mi.UInt32, count)
     for n in np.unique(plan.subdivisions):
@@ -245,6 +259,7 @@ def _refine(
     pairs = zip(unpack_word(baked.vertices), moves, strict=True)
     baked.vertices = pack_word([now + rate * move for now, move in pairs])
     dr.make_opaque(baked.vertices)
+    dr.sync_thread()  # progress tells of what is done
 
 
 @dr.syntax

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fit.scores import FieldRenderer, Rendering, compare
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
 
-LATERALS_M = (-1.0, 0.0, 1.0)
+LATERALS = (-2 / 7, 0.0, 2 / 7)  # in widths of a lane: 1 m of 3.5 m
+_SPACING = 8 / 7  # likewise: 4 m
 _SURE = 0.9  # opacity from which depths are compared
 
 
@@ -41,36 +42,38 @@ class BakedView:
 
 
 def score_bake(
-    field: AbstractField,
-    baked: AbstractField,
+    scene: PosedField,
+    baked: PosedField,
     routes: Sequence[Route],
     camera: Camera,
     mount: CameraMount | None = None,
-    spacing_m: float = 4.0,
+    spacing_m: float | None = None,
     keep: int = 4,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[BakedView]:
-    """Compare bricks with their field on the routes and 1 m beside, on either side.
+    """Compare bricks with their field on the routes and beside, on either side.
+
+    Beside is 1 m where a lane is 3.5 m wide, and in proportion.
 
     Args:
-        field: in the routes' frame.
-        baked: likewise.
+        scene: the field at its pose in the routes' frame.
+        baked: the bricks at theirs.
         routes: at least one.
         camera: intrinsics.
         mount: of the camera on the vehicle; None for the default mount.
-        spacing_m: arc length between two views, about.
+        spacing_m: arc length between two views, about; None for 4 m, likewise.
         keep: views of least PSNR whose pictures are kept.
         progress: called with (views done, all) after each.
 
     Returns:
         a score a view, route by route.
     """
-    eyes = FieldRenderer(field), FieldRenderer(baked)
+    eyes = FieldRenderer(scene), FieldRenderer(baked)
     places = [
-        (route, float(arc), lateral)
+        (route, float(arc), lateral * route.lane_width_m)
         for route in routes
-        for arc in _arcs(route, spacing_m)
-        for lateral in LATERALS_M
+        for arc in _arcs(route, spacing_m or _SPACING * route.lane_width_m)
+        for lateral in LATERALS
     ]
     views: list[BakedView] = []
     for route, arc, lateral in places:

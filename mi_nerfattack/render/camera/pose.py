@@ -70,6 +70,10 @@ class Pose:
         """Turn points (..., 3) of the field into points of the world, metres."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def to_local(self, points: np.ndarray) -> np.ndarray:
+        """Turn points (..., 3) of the world, metres, into points of the field."""
+        return (points - self.translation) @ self.rotation / self.scale
+
     @property
     def yaw(self) -> float:
         """Angle about the world's z axis from its x axis to the field's, radians."""

@@ -76,7 +76,7 @@ def bake_verdict(views: Sequence[BakedView]) -> str:
     depth = found["depth_m"]
     far = "" if depth is None else f"; depths differ by {100 * depth:.1f} cm"
     return (
-        f"On {len(views)} views along the routes and 1 m beside, the bricks are "
+        f"On {len(views)} views along the routes and beside, the bricks are "
         f"{found['psnr_db']:.1f} dB from the field on average and "
         f"{found['psnr_least_db']:.1f} dB at worst (SSIM {found['ssim']:.3f}){far}."
     )
@@ -85,7 +85,7 @@ def bake_verdict(views: Sequence[BakedView]) -> str:
 def _pair(view: BakedView) -> ViewPair:
     assert view.pictures is not None
     wanted, shown = view.pictures
-    title = f"{view.route}, {view.arc_m:.1f} m, {view.lateral_m:+g} m beside"
+    title = f"{view.route}, {view.arc_m:.1f} m, {view.lateral_m:+.2g} m beside"
     title = f"{title}: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
     known = np.where(wanted.opacity > 0.5, wanted.depth, np.inf)
     return ViewPair(title, wanted.image, shown.image, shown.opacity, shown.depth, known)

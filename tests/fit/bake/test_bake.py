@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 
 import drjit as dr
@@ -17,12 +18,32 @@ from mi_nerfattack.fields import NGPField, Occupancy, load_field, save_field
 from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
 from mi_nerfattack.fit.bake.scores import score_bake
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 ROUTE = Route("line", 0, np.array([[-1.6, 0.1], [0.2, 0.1]]))
 CAMERA, MOUNT = from_fov(40, 24, 80.0), CameraMount(0.4, 0.0, 10.0)
+POSE = Pose.upright((7.0, -3.0, 0.0), 2.0, 2.0)
+ROWS = np.hstack([2 * POSE.rotation, POSE.translation[:, None]]).tolist()
+SCENARIO = f"""
+name = "line"
+objects = [{{ id = "cube", field = "absent", position_m = [0, 0, 0] }}]
+policy = {{ file = "absent.pt2" }}
+camera = {{ width = 32, height = 20, height_m = 0.8, forward_m = 0.0, pitch_deg = 10 }}
+[scene]
+field = "field.safetensors"
+bricks = "b.safetensors"
+to_world = {[*ROWS, [0, 0, 0, 1]]}
+deployment = "absent"
+routes = "routes.json"
+route = "line"
+"""
+
+
+GIVEN = ["field.safetensors", "routes.json", "scenario.toml"]
 
 
 @pytest.fixture
@@ -38,7 +59,7 @@ def field(rng) -> NGPField:
 
 
 def test_parts_are_finer_near_the_route(field):
-    plan = plan_bricks(field, [ROUTE], BakeOptions(cone=0.3))
+    plan = plan_bricks(PosedField(field), [ROUTE], BakeOptions(cone=0.3))
     centre = -1 + 2 * (np.argwhere(plan.occupancy.cells) + 0.5) / (6, 5, 4)
     x = np.clip(centre[:, 0], -1.6, 0.2)
     distance = np.hypot(centre[:, 0] - x, centre[:, 1] - 0.1)
@@ -54,9 +75,10 @@ def test_refinement_brings_bricks_to_the_field(field):
     least = []
     for passes in (0, 2):
         options = BakeOptions(cone=0.05, passes=passes, views=20)
-        baked = bake(field, [ROUTE], CAMERA, MOUNT, options)
+        baked = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
         assert (baked.step_m, baked.cone) == (field.step_m, field.cone)
-        views = score_bake(field, baked, [ROUTE], CAMERA, MOUNT, spacing_m=0.5, keep=2)
+        pair = PosedField(field), PosedField(baked)
+        views = score_bake(*pair, [ROUTE], CAMERA, MOUNT, spacing_m=0.5, keep=2)
         assert sum(view.pictures is not None for view in views) == 2
         seen = min(views, key=lambda view: view.psnr_db)
         assert seen.pictures is not None and seen.pictures[0].image.std() > 0.02
@@ -65,8 +87,23 @@ def test_refinement_brings_bricks_to_the_field(field):
     assert least[1] > 28
 
 
+def test_a_pose_moves_the_bricks_with_the_field(field):
+    wide = Route("wide", 0, POSE.apply(np.insert(ROUTE.points, 2, 0, 1))[:, :2], 7.0)
+    high = CameraMount(0.8, 0.0, 10.0)
+    options = BakeOptions(cone=0.3, views=4)
+    here = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
+    there = bake(PosedField(field, POSE), [wide], CAMERA, high, options)
+    np.testing.assert_array_equal(there.subdivisions, here.subdivisions)
+    words = [baked.vertices.numpy() for baked in (here, there)]
+    assert np.mean(words[0] == words[1]) > 0.9
+    views = score_bake(
+        PosedField(field, POSE), PosedField(there, POSE), [wide], CAMERA, high, 1.0
+    )
+    assert min(view.psnr_db for view in views) > 25
+
+
 def test_sky_behind_is_that_of_the_field(field):
-    baked = bake(field, [ROUTE], CAMERA, MOUNT, BakeOptions(passes=0))
+    baked = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, BakeOptions(passes=0))
     towards = dr.normalize(type(field.unit(0))([0.3, -1], [0.2, 0.5], [1.0, 0.1]))
     pair = [np.array(item.background(towards)) for item in (baked, field)]
     np.testing.assert_allclose(*pair, atol=1e-6)
@@ -76,13 +113,12 @@ def test_sky_behind_is_that_of_the_field(field):
 def words(field, tmp_path, monkeypatch) -> list[str]:
     """The command, in a folder with what it needs."""
     monkeypatch.chdir(tmp_path)
-    field.lower, field.upper = np.array([-1.0, -1, 0.4]), np.array([1.0, 1, 2.4])
     save_field("field.safetensors", field)
-    routes = {"line": {"goal": 0, "points_m": [[-1.6, 0.1], [0.2, 0.1]]}}
-    routes["line"] |= {"lane_width_m": 3.5, "speed_ms": 5.0}
-    (tmp_path / "routes.json").write_text(json.dumps(routes))
-    line = "bake field.safetensors --routes routes.json -o b.safetensors --views 4"
-    return [*line.split(), "--width", "32", "--height", "20", "--cone", "0.1"]
+    points = POSE.apply(np.insert(ROUTE.points, 2, 0, 1))[:, :2].tolist()
+    route = {"goal": 0, "points_m": points, "lane_width_m": 7.0, "speed_ms": 5.0}
+    (tmp_path / "routes.json").write_text(json.dumps({"line": route}))
+    (tmp_path / "scenario.toml").write_text(SCENARIO)
+    return "bake scenario.toml --views 4 --cone 0.1".split()
 
 
 @pytest.mark.parametrize(
@@ -99,7 +135,7 @@ def test_an_interrupted_bake_leaves_a_whole_file_or_none(
         assert cli.main(words) == 130
     assert "mi-nerfattack: interrupted" in capsys.readouterr().err
     found = sorted(path.name for path in tmp_path.iterdir())
-    assert found == [*left, "field.safetensors", "routes.json"]
+    assert found == [*left, *GIVEN]
     for name in left:
         load_field(name)
 
@@ -109,7 +145,7 @@ def test_too_little_memory_leaves_no_bake(words, tmp_path, capsys):
         assert cli.main(words) == 2
     assert "error: not enough memory: 249 TiB" in capsys.readouterr().err
     found = sorted(path.name for path in tmp_path.iterdir())
-    assert found == ["field.safetensors", "routes.json"]
+    assert found == GIVEN
 
 
 def test_the_command_writes_field_and_report(words, tmp_path, capsys):
@@ -124,16 +160,26 @@ def test_the_command_writes_field_and_report(words, tmp_path, capsys):
     assert names == {"report.html", "metrics.json", "worst.png", "depth.png"}
 
 
-def test_what_cannot_be_baked(field, tmp_path, capsys):
-    save_field(tmp_path / "grid.safetensors", homogeneous())
-    routes = tmp_path / "routes.json"
-    point = {"goal": 0, "points_m": [[0, 0], [1, 0]], "lane_width_m": 3, "speed_ms": 5}
-    routes.write_text(json.dumps({"line": point}))
-    words = ["--routes", str(routes), "-o", str(tmp_path / "b.safetensors")]
-    assert cli.main(["bake", str(tmp_path / "grid.safetensors"), *words]) == 2
-    assert "is a grid_field; only an ngp_field is baked" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("line", "instead", "message"),
+    [
+        ('bricks = "b.safetensors"', "", "--output: give it, or scene.bricks in"),
+        ('bricks = "b', 'bricks = "field', "--output: .* is the field itself"),
+        ("width = 32", "width = 6", "camera of 6 x 20; SSIM takes at least"),
+    ],
+)
+def test_what_a_scenario_must_say(words, tmp_path, capsys, line, instead, message):
+    assert line in SCENARIO
+    (tmp_path / "scenario.toml").write_text(SCENARIO.replace(line, instead))
+    assert cli.main(words) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_what_cannot_be_baked(field):
+    with pytest.raises(InputError, match="is a grid_field; only an ngp_field is"):
+        plan_bricks(PosedField(homogeneous()), [ROUTE])
     field.occupy(Occupancy(np.zeros((2, 2, 2), bool)))
     with pytest.raises(InputError, match="bake: the field is empty"):
-        plan_bricks(field, [ROUTE])
+        plan_bricks(PosedField(field), [ROUTE])
     with pytest.raises(InputError, match="cone: 0"):
         BakeOptions(cone=0)
