@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
+from weakref import WeakKeyDictionary
 
+import numpy as np
 from pydantic import Field, PlainValidator, SerializeAsAny, TypeAdapter, ValidationInfo
 
-from mi_nerfattack.deploy.built_in import make_built_in
+from mi_nerfattack.deploy.built_in import BuiltInObject, make_built_in
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.ranges import Count, Finite, NonNegative
+from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.scenario.named_file import File
 from mi_nerfattack.scenario.section import Kinds, Section
 
 #: What the environment of attacks is called, and the deployment without a name.
 SURROGATE, DEPLOYMENT = "surrogate", "deployment"
+#: What was built in last of a field, by its content: seconds each, and the same in all
+#: environments and conditions.
+_BUILT: WeakKeyDictionary[GridField, dict[bytes, BuiltInObject]] = WeakKeyDictionary()
+_LOOKS = 4  # of a field that are kept
 
 Label = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
 Sky = Literal["day", "morning", "noon", "evening", "overcast"]
@@ -156,12 +164,26 @@ class Deployment:
             grids = [
                 (p.field, p.placed) for p in objects if isinstance(p.field, GridField)
             ]
-            built_in = tuple(make_built_in(*item) for item in grids)
+            built_in = tuple(_built_in(*item) for item in grids)
             conditions = replace(self.conditions, built_in=built_in)
             return make_environment(self.environment, self.place, conditions)
         environment = make_environment(self.environment, self.place, self.conditions)
         environment.show(objects)
         return environment
+
+
+def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
+    """Build in an object, or what was built in of a field with the same content."""
+    content = hashlib.sha256()
+    arrays = [value.numpy() for value in field.parameters().values()]
+    for values in (*arrays, *field.occupancy_tensors().values()):
+        content.update(np.ascontiguousarray(values).data)
+    looks, key = _BUILT.setdefault(field, {}), content.digest()
+    found = looks.pop(key, None) or make_built_in(field, pose)
+    looks[key] = found
+    while len(looks) > _LOOKS:
+        del looks[next(iter(looks))]
+    return replace(found, pose=pose)
 
 
 def deployments(

@@ -7,11 +7,16 @@ import math
 import numpy as np
 import pytest
 from helpers.scenario_text import HEAD, write_named_files
+from helpers.small_fields import homogeneous
 
+from mi_nerfattack.deploy.built_in import make_built_in
 from mi_nerfattack.deploy.car import CAR
 from mi_nerfattack.deploy.place import Conditions, bundled_place
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.scenario.deployment import deployments, labelled
+from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenario import deployment
+from mi_nerfattack.scenario.deployment import Deployment, deployments, labelled
 from mi_nerfattack.scenario.scenario import load_scenario, portable_text
 from mi_nerfattack.scenario.vehicle import AckermannSection
 
@@ -122,3 +127,43 @@ def test_the_car_with_wheels_is_the_vehicles_size(load):
     sizes = np.array([small.track, small.wheel_radius, small.length])
     full = np.array([CAR.track, CAR.wheel_radius, CAR.length])
     assert np.allclose(sizes / full, 0.3 / 1.8)
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_look_is_built_in_once(monkeypatch):
+    baked, opened = [], []
+
+    def make(field, pose):
+        baked.append(pose)
+        return make_built_in(field, pose)
+
+    monkeypatch.setattr(deployment, "make_built_in", make)
+    monkeypatch.setattr(
+        deployment,
+        "make_environment",
+        lambda name, place, conditions: opened.append(conditions.built_in),
+    )
+    field, there = homogeneous(400.0), Pose.upright((5.0, 1.0, 1.0), 0.5)
+    texture = field.texture.numpy().copy()
+    target = Deployment("mitsuba", bundled_place("intersection"), Conditions(), True)
+    target.open([PosedField(field)])
+    target.open([PosedField(field, there)])
+    assert len(baked) == 1 and opened[1][0].pose.yaw == pytest.approx(0.5)
+    field.set_parameter("texture", 2 * texture)
+    target.open([PosedField(field)])
+    field.set_parameter("texture", texture)
+    target.open([PosedField(field)])
+    field.set_parameter("density", field.parameters()["density"].numpy() / 2)
+    target.open([PosedField(field)])
+    assert len(baked) == 3
+    images = [item.image for (item,) in opened]
+    assert np.array_equal(images[0], images[3])
+    assert not np.array_equal(images[0], images[2])
+    (alone,) = opened[3]
+    fresh = make_built_in(homogeneous(400.0), Pose.identity())
+    np.testing.assert_array_equal(alone.image, fresh.image)
+    for _ in range(9):
+        texture = texture + 0.1
+        field.set_parameter("texture", texture)
+        target.open([PosedField(field)])
+    assert len(deployment._BUILT[field]) == 4
