@@ -46,7 +46,7 @@ class Bake:
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import report_folder
         from mi_nerfattack.commands.shared.progress import StageBars
-        from mi_nerfattack.fields import load_field, save_field
+        from mi_nerfattack.fields import save_field
         from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
         from mi_nerfattack.fit.bake.scores import score_bake
         from mi_nerfattack.render.posed import PosedField
@@ -57,6 +57,7 @@ class Bake:
         )
         from mi_nerfattack.report.pages.fit import finite
         from mi_nerfattack.scenario.scenario import load_scenario
+        from mi_nerfattack.scenario.world import load_posed
         from mi_nerfattack.vehicle.route.route import load_routes
 
         options = BakeOptions(self.cone, self.passes, self.views, self.seed)
@@ -65,9 +66,7 @@ class Bake:
         camera, mount = scenario.camera.build()
         routes = load_routes(scenario.scene.routes.file)
         variant.ensure()
-        field = load_field(file)
-        field.refine(scenario.scene.step_m or field.step_m)
-        scene = PosedField(field, scenario.scene.pose)
+        scene = load_posed(scenario.scene, file)
         plan = plan_bricks(scene, routes, options)
         with StageBars() as bars:
             bars.say(

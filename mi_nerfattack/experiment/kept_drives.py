@@ -5,7 +5,6 @@ Those that several runs of one sweep have in common are done by the first of the
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from mi_nerfattack.evaluation.identity import short_digest
 from mi_nerfattack.experiment.checkpoint import REMEDY
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.io import files
+from mi_nerfattack.io.digest import array_digest
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -211,17 +211,11 @@ class SharedDrives:
             **{f"version.{k}": v for k, v in (versions() | needed).items()},
             **decisive,
             "environment": label,
-            "look": "none" if look is None else _digest(look),
+            "look": "none"
+            if look is None
+            else array_digest((*look.textures, look.offsets)),
             "start": json.dumps(np.asarray(start).tolist()),
             "drive_seed": f"{scenario.seed + run}",
         }
         path = self.folder / f"{label}_{short_digest(identity)}.safetensors"
         return Unit(path, identity, Record, "remove the file")
-
-
-def _digest(look: Appearance) -> str:
-    found = hashlib.sha256()
-    for values in (*look.textures, look.offsets):
-        found.update(f"{values.dtype} {values.shape}".encode())
-        found.update(np.ascontiguousarray(values).data)
-    return found.hexdigest()

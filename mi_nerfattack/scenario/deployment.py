@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 from weakref import WeakKeyDictionary
 
-import numpy as np
 from pydantic import Field, PlainValidator, SerializeAsAny, TypeAdapter, ValidationInfo
 
 from mi_nerfattack.deploy.built_in import BuiltInObject, make_built_in
@@ -16,6 +14,7 @@ from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions, Place
 from mi_nerfattack.deploy.registry import make_environment
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.io.digest import array_digest
 from mi_nerfattack.ranges import Count, Finite, NonNegative
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
@@ -26,7 +25,7 @@ from mi_nerfattack.scenario.section import Kinds, Section
 SURROGATE, DEPLOYMENT = "surrogate", "deployment"
 #: What was built in last of a field, by its content: seconds each, and the same in all
 #: environments and conditions.
-_BUILT: WeakKeyDictionary[GridField, dict[bytes, BuiltInObject]] = WeakKeyDictionary()
+_BUILT: WeakKeyDictionary[GridField, dict[str, BuiltInObject]] = WeakKeyDictionary()
 _LOOKS = 4  # of a field that are kept
 
 Label = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,19}$")]
@@ -174,11 +173,9 @@ class Deployment:
 
 def _built_in(field: GridField, pose: Pose) -> BuiltInObject:
     """Build in an object, or what was built in of a field with the same content."""
-    content = hashlib.sha256()
-    arrays = [value.numpy() for value in field.parameters().values()]
-    for values in (*arrays, *field.occupancy_tensors().values()):
-        content.update(np.ascontiguousarray(values).data)
-    looks, key = _BUILT.setdefault(field, {}), content.digest()
+    values = [value.numpy() for value in field.parameters().values()]
+    key = array_digest([*values, *field.occupancy_tensors().values()])
+    looks = _BUILT.setdefault(field, {})
     found = looks.pop(key, None) or make_built_in(field, pose)
     looks[key] = found
     while len(looks) > _LOOKS:

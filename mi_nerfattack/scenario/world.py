@@ -34,7 +34,7 @@ from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
 from mi_nerfattack.scenario.method import Task
-from mi_nerfattack.scenario.scenario import Scenario
+from mi_nerfattack.scenario.scenario import Scenario, SceneSection
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -311,15 +311,24 @@ def build_attack(world: World) -> AbstractAttack:
     return section.method.build(Task(rollout, world.route, initial, *rest))
 
 
+def load_posed(scene: SceneSection, path: Path) -> PosedField:
+    """Load a field where a scene has it, with the scene's marching step.
+
+    Raises:
+        InputError: the file is missing or wrong.
+    """
+    field = load_field(path)
+    field.refine(scene.step_m or field.step_m)
+    return PosedField(field, scene.pose)
+
+
 def _load_layer(scenario: Scenario, path: Path) -> Layer:
     """Load a scene: a field, or splats, which are told by the suffix .ply."""
-    pose = scenario.scene.pose
     if path.suffix.lower() != ".ply":
-        field = load_field(path)
-        field.refine(scenario.scene.step_m or field.step_m)
+        posed = load_posed(scenario.scene, path)
         if scenario.attack.attached:
-            field.see_all()
-        return PosedField(field, pose)
+            posed.field.see_all()
+        return posed
     if scenario.scene.step_m is not None:
         raise InputError(f"scene.step_m: {path} holds splats, which take no steps")
     if scenario.attack.attached:
@@ -327,7 +336,7 @@ def _load_layer(scenario: Scenario, path: Path) -> Layer:
             f"{path}: splats have no derivative by the camera; set attack.attached to "
             "false, or fit a field to the scene"
         )
-    return SplatBackground(read_splats(path), pose)
+    return SplatBackground(read_splats(path), scenario.scene.pose)
 
 
 def optimised_states(scenario: Scenario, route: Route) -> np.ndarray:

@@ -27,6 +27,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 ROUTE = Route("line", 0, np.array([[-1.6, 0.1], [0.2, 0.1]]))
 CAMERA, MOUNT = from_fov(40, 24, 80.0), CameraMount(0.4, 0.0, 10.0)
 POSE = Pose.upright((7.0, -3.0, 0.0), 2.0, 2.0)
+POINTS = POSE.apply(np.insert(ROUTE.points, 2, 0, 1))[:, :2]
 ROWS = np.hstack([2 * POSE.rotation, POSE.translation[:, None]]).tolist()
 SCENARIO = f"""
 name = "line"
@@ -41,8 +42,6 @@ deployment = "absent"
 routes = "routes.json"
 route = "line"
 """
-
-
 GIVEN = ["field.safetensors", "routes.json", "scenario.toml"]
 
 
@@ -88,7 +87,7 @@ def test_refinement_brings_bricks_to_the_field(field):
 
 
 def test_a_pose_moves_the_bricks_with_the_field(field):
-    wide = Route("wide", 0, POSE.apply(np.insert(ROUTE.points, 2, 0, 1))[:, :2], 7.0)
+    wide = Route("wide", 0, POINTS, 7.0)
     high = CameraMount(0.8, 0.0, 10.0)
     options = BakeOptions(cone=0.3, views=4)
     here = bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
@@ -114,8 +113,8 @@ def words(field, tmp_path, monkeypatch) -> list[str]:
     """The command, in a folder with what it needs."""
     monkeypatch.chdir(tmp_path)
     save_field("field.safetensors", field)
-    points = POSE.apply(np.insert(ROUTE.points, 2, 0, 1))[:, :2].tolist()
-    route = {"goal": 0, "points_m": points, "lane_width_m": 7.0, "speed_ms": 5.0}
+    route = {"goal": 0, "lane_width_m": 7.0, "speed_ms": 5.0}
+    route["points_m"] = POINTS.tolist()
     (tmp_path / "routes.json").write_text(json.dumps({"line": route}))
     (tmp_path / "scenario.toml").write_text(SCENARIO)
     return "bake scenario.toml --views 4 --cone 0.1".split()
