@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,31 @@ import numpy as np
 
 from bench.table2.page import section
 from bench.table2.rows import cell
+from mi_nerfattack.commands.transfer import Transfer
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.evaluation.pairs import DEPARTED_S
 from mi_nerfattack.experiment.sweep.cell import CELLS
+from mi_nerfattack.experiment.transfer.columns import ENVIRONMENTS, make_columns
+from mi_nerfattack.experiment.transfer.figures import column_figures, compare_rows
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT
 from mi_nerfattack.scenario.deployment import SURROGATE
 
+Row = dict[str, Any]
+
 #: Attacks of each route.
 OF_ROUTE = 8
-FIGURES = ("cross_track_mean_m", "cross_track_max_m", "wheel_out_s", "drives_departed")
+CASES = (NO_OBJECT, ATTACK)
+FIGURES = (
+    "n",
+    "cross_track_mean_m",
+    "cross_track_max_m",
+    "wheel_out_s",
+    "drives_departed",
+)
+#: Seed of starts and intervals.
+SEED = Transfer.seed
+_KEY = ("attack", "environment", "condition", "case")
+_AT_A_TIME = 3  # conditions
 _INTRODUCTION = """\
 # The best attacks in every environment
 
@@ -27,6 +44,7 @@ environment and under every condition of [`transfer`](../transfer.md). Best are,
 route, the {of_route} with the largest mean error in the surrogate from starts that no
 search had seen; of a method at a place the better one alone. Number, environments,
 conditions, starts ({starts}) and samples a pixel were settled before the first drive.
+{whole} of {total} columns are driven to their end; the others are not on this page.
 
 Figures are mean distances from the lane's centre, metres: mean ± standard deviation
 over attacks [95 % interval, BCa] (attacks); then how many of them have a wheel out of
@@ -68,28 +86,109 @@ def best_attacks(
     return [path for pairs in ranked.values() for _, path in pairs[:of_route]]
 
 
-def drives_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the figures of a ``transfer.json``: a row an attack, column and case."""
-    return [
-        {name: row[name] for name in ("attack", "environment", "condition")}
-        | {"case": case}
-        | {name: figures[name] for name in FIGURES}
-        for row in document["rows"]
-        for case, figures in row["cases"].items()
+def passes() -> list[list[str]]:
+    """Return all conditions, those that are driven together side by side; day first."""
+    plain, *rest = Transfer.conditions
+    groups = [rest[i : i + _AT_A_TIME] for i in range(0, len(rest), _AT_A_TIME)]
+    return [[plain], *groups]
+
+
+def columns_of(conditions: Sequence[str]) -> list[tuple[str, str]]:
+    """Return environment and condition of each column."""
+    columns = make_columns(ENVIRONMENTS, conditions, 1)
+    return [(column.environment, column.condition.label) for column in columns]
+
+
+def table_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield a row an attack, column and case of a ``transfer.json``, whole or not."""
+    about = {item["label"]: item for item in document["attacks"]}
+    for row in document["rows"]:
+        attack = about[row["attack"]]
+        for case, figures in row["cases"].items():
+            labels = row["attack"], row["environment"], row["condition"], case
+            found = dict(zip(_KEY, labels, strict=True))
+            found |= {name: attack[name] for name in ("route", "found_sha256")}
+            yield found | {name: figures[name] for name in FIGURES}
+
+
+def merged(known: Iterable[Row], new: Iterable[Row]) -> list[Row]:
+    """Return all rows, later ones in place of earlier ones."""
+    return list({tuple(row[k] for k in _KEY): row for row in (*known, *new)}.values())
+
+
+def left(
+    rows: Iterable[Row], labels: Iterable[str], columns: Iterable[tuple[str, str]]
+) -> list[str]:
+    """Return the attacks of which a column is not driven."""
+    there = {tuple(row[k] for k in _KEY) for row in rows}
+    wanted = [(*column, case) for column in columns for case in CASES]
+    return [a for a in labels if any((a, *rest) not in there for rest in wanted)]
+
+
+def check_same(rows: Iterable[Row], found: Mapping[str, str], path: Path) -> None:
+    """Raise InputError if rows are of other attacks by the same names.
+
+    Args:
+        rows: of the table.
+        found: digests of what was found, by attack.
+        path: of the table.
+    """
+    for row in rows:
+        name = row["attack"]
+        if found.get(name, row["found_sha256"]) != row["found_sha256"]:
+            raise InputError(
+                f"{path}: {name} was found with other digits where its rows were "
+                "driven, perhaps on another machine; choose another folder with -o"
+            )
+
+
+def document_of(rows: Sequence[Row], labels: Collection[str]) -> dict[str, Any]:
+    """Return rows, attacks and whole columns as in ``transfer.json``.
+
+    Args:
+        rows: of the table.
+        labels: of all attacks; a column is whole with all of them.
+    """
+    order = [column for group in passes() for column in columns_of(group)]
+    order.sort(key=lambda column: ENVIRONMENTS.index(column[0]))
+    cells: dict[tuple[str, str], dict[str, Row]] = {column: {} for column in order}
+    for row in rows:
+        about = {name: row[name] for name in _KEY[:3]} | {"cases": {}}
+        column = cells[row["environment"], row["condition"]]
+        cases = column.setdefault(row["attack"], about)["cases"]
+        cases[row["case"]] = {name: row[name] for name in FIGURES}
+    whole = [
+        column[label]
+        for column in cells.values()
+        if all(len(column.get(label, {}).get("cases", ())) == 2 for label in labels)
+        for label in labels
     ]
+    compare_rows(whole)
+    routes = {row["attack"]: row["route"] for row in rows}
+    return {
+        "attacks": [{"label": name, "route": routes.get(name)} for name in labels],
+        "conditions": list(dict.fromkeys(row["condition"] for row in whole)),
+        "starts": rows[0]["n"] if rows else 0,
+        "success_s": DEPARTED_S,
+        "cases": CASES,
+        "rows": whole,
+        "columns": column_figures(whole, SEED),
+        "total": len(order),
+    }
 
 
 def page(document: Mapping[str, Any], made: Mapping[str, Any]) -> str:
     """Return the page.
 
     Args:
-        document: ``transfer.json``, complete.
+        document: of :func:`document_of`, with a column at least.
         made: date, machine and command, as of `bench.results.stamp`.
     """
     attacks, columns = document["attacks"], document["columns"]
     routes = {about["route"] for about in attacks}
     told = {"count": len(attacks), "of_route": len(attacks) // len(routes)}
-    parts = [_INTRODUCTION.format(starts=document["starts"], **told)]
+    told |= {"whole": len(columns)} | {k: document[k] for k in ("total", "starts")}
+    parts = [_INTRODUCTION.format(**told)]
     for environment in dict.fromkeys(column["environment"] for column in columns):
         own = [c for c in columns if c["environment"] == environment]
         parts.append(section(environment, "", _HEADER, map(_row, own)))

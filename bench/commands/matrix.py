@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -15,10 +15,10 @@ import tyro
 class BenchMatrix:
     """Drive past the best attacks of sweeps in every environment and condition.
 
-    Takes the eight best of each route, gives them to one transfer in FOLDER, first in
-    its default environments, then with what is left of them built in, and writes the
-    page once all is driven. Attacks of which there is but the table are made again,
-    in FOLDER/remade. The same command goes on.
+    Takes the eight best of each route and gives them to transfers in FOLDER, some
+    conditions at a time, the plain one first. The table beside the page grows after
+    each; what it has is not driven again, on whatever machine, and so the same command
+    goes on. Attacks of which there is but the table are made again, in FOLDER/remade.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -36,36 +36,93 @@ class BenchMatrix:
 
     def run(self) -> int:
         """Choose, drive and write."""
-        import pyarrow as pa
-        import pyarrow.parquet
-
-        from bench import results
-        from bench.commands.quality import run_command
-        from bench.matrix import best_attacks, drives_of, page
+        from bench.matrix import (
+            best_attacks,
+            check_same,
+            columns_of,
+            left,
+            passes,
+            table_rows,
+        )
+        from mi_nerfattack import variant
         from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
-        from mi_nerfattack.experiment.transfer.columns import ENVIRONMENTS
+        from mi_nerfattack.experiment.transfer.found import read_found
         from mi_nerfattack.experiment.transfer.run import DOCUMENT
         from mi_nerfattack.io import files
 
         tables = [(path, read_table(path / RESULTS)) for path in self.sweeps]
-        chosen = self._made(best_attacks(tables))
-        words = ["transfer", *map(str, chosen), "-o", str(self.folder)]
-        words += ["--cases", "no_object", "attack", "--starts", str(self.starts)]
-        words += ["--spp", str(self.spp)]
+        chosen = {path.name: path for path in best_attacks(tables)}
+        document = self.folder / DOCUMENT
+        if document.exists():  # of an interrupted pass
+            self._add(table_rows(files.read_json(document)), chosen)
+        for conditions in passes():
+            columns = columns_of(conditions)
+            names = left(self._rows(), chosen, columns)
+            if not names:
+                continue
+            variant.ensure()
+            folders = self._made([chosen[name] for name in names])
+            found = {item.label: item.digest for item in read_found(folders)}
+            check_same(self._rows(), found, self._table)
+            environments = list(dict.fromkeys(name for name, _ in columns))
+            self._drive(folders, environments, conditions)
+            self._add(table_rows(files.read_json(document)), chosen)
+        return 0
+
+    @property
+    def _table(self) -> Path:
+        return self.output / "drives.parquet"
+
+    def _rows(self) -> list[dict[str, Any]]:
+        """Return what the table has so far."""
+        from mi_nerfattack.experiment.sweep.table import require_parquet
+
+        require_parquet()
+        import pyarrow.parquet
+
+        if not self._table.exists():
+            return []
+        return pyarrow.parquet.read_table(self._table).to_pylist()
+
+    def _add(self, new: Iterable[dict[str, Any]], labels: Collection[str]) -> None:
+        """Add rows to the table, and write the page if a column is whole."""
+        import pyarrow as pa
+        import pyarrow.parquet
+
+        from bench import results
+        from bench.matrix import check_same, document_of, merged, page
+        from mi_nerfattack.io import files
+        from mi_nerfattack.report.plots.transfer import plot_transfer
+
+        known, new, buffer = self._rows(), list(new), io.BytesIO()
+        found = {row["attack"]: row["found_sha256"] for row in new}
+        check_same(known, found, self._table)
+        rows = merged(known, new)
+        pyarrow.parquet.write_table(pa.Table.from_pylist(rows), buffer)
+        files.make_folder(self.output)
+        files.write_bytes(self._table, buffer.getvalue())
+        document = document_of(rows, labels)
+        if document["columns"]:
+            made = results.stamp({}, ["python -m bench matrix FOLDER TABLE2 METHODS"])
+            files.write_text(self.output / "README.md", page(document, made))
+            plot_transfer(self.folder / "matrix.png", document)
+            print(f"{self.output / 'README.md'}: written", flush=True)
+
+    def _drive(
+        self,
+        folders: Sequence[Path],
+        environments: Sequence[str],
+        conditions: Sequence[str],
+    ) -> None:
+        from bench.commands.quality import run_command
+        from bench.matrix import CASES, SEED
+
+        words = ["transfer", *map(str, folders), "-o", str(self.folder)]
+        words += ["--environments", *environments, "--conditions", *conditions]
+        words += ["--cases", *CASES, "--starts", str(self.starts)]
+        words += ["--seed", str(SEED), "--spp", str(self.spp)]
         words += [] if self.workers is None else ["--workers", str(self.workers)]
         run_command(words)
-        run_command([*words, "--environments", *ENVIRONMENTS])
-        document = files.read_json(self.folder / DOCUMENT)
-        command = "python -m bench matrix FOLDER TABLE2 METHODS"
-        made = results.stamp({}, [command])
-        buffer = io.BytesIO()
-        table = pa.Table.from_pylist(drives_of(document))
-        pyarrow.parquet.write_table(table, buffer)
-        files.make_folder(self.output)
-        files.write_bytes(self.output / "drives.parquet", buffer.getvalue())
-        files.write_text(self.output / "README.md", page(document, made))
-        print(f"{self.output / 'README.md'}: written")
-        return 0
 
     def _made(self, chosen: Sequence[Path]) -> list[Path]:
         """Return the run folders of cells; those that are not there are made again."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from bench import matrix
 from bench.__main__ import main
 from bench.matrix import best_attacks
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.sweep.table import write_table
+from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
 
-COUNTS = {"attacks": 2, "attacks_out": 1, "attacks_out_rate_ci95": [0.0945, 0.9055]}
+FOUND = "mi_nerfattack.experiment.transfer.found"
+ROW = "surrogate:attack:0"
 
 
 def row(cell, method, seed, error, case="attack", route="right"):
@@ -40,66 +44,142 @@ def test_the_best_of_a_method_at_a_place_stands_for_it(tmp_path):
         best_attacks(sweeps, 4)
 
 
-def document(labels):
-    """Return a transfer of two attacks, of which one is out by day and none at noon."""
-    columns, found = [], []
-    for condition, ratio, errors in (
-        ("day", 1.0, (0.6, 0.2)),
-        ("noon", 0.5, (0.3, 0.1)),
-    ):
-        for label, error in zip(labels, errors, strict=True):
-            about = {"attack": label, "environment": "mitsuba", "condition": condition}
-            figures = {"cross_track_mean_m": error, "cross_track_max_m": 1.0}
-            figures |= {"wheel_out_s": 0.0, "drives_departed": 0}
-            cases = {"no_object": figures, "attack": figures}
-            found.append(about | {"cases": cases, "succeeds": error > 0.5})
-        over = {"cross_track_mean_m": sum(errors) / 2, "cross_track_sd_m": 0.1}
-        over |= {"cross_track_mean_ci95_m": errors[::-1]} | COUNTS
-        transfer = {"kept": int(condition == "day"), "of": 1, "rate_ci95": [0.2, 1.0]}
-        about = {"environment": "mitsuba", "condition": condition}
-        about |= {"cases": {"no_object": over, "attack": over}, "transfer": transfer}
-        columns.append(about | {"ratio_to_surrogate": ratio})
-    attacks = [{"label": label, "route": "right"} for label in labels]
-    return {"attacks": attacks, "rows": found, "columns": columns, "starts": 1}
+def document(words):
+    """Return what a transfer of such words writes; of two attacks c8 alone is out."""
+    at = words.index("--environments"), words.index("--conditions")
+    labels = [word.rpartition("/")[2] for word in words[1 : words.index("-o")]]
+    environments, conditions = words[at[0] + 1 : at[1]], words[at[1] + 1 :]
+    conditions = conditions[: conditions.index("--cases")]
+    attacks = [
+        {"label": name, "route": "right", "found_sha256": f"{name} found"}
+        for name in labels
+    ]
+    rows = []
+    for column in make_columns(environments, conditions, 1):
+        for name in labels:
+            error, out = (0.6, 2.0) if name == "c8" else (0.2, 0.0)
+            if column.condition.label != "day":
+                error, out = error / 2, 0.0
+            figures = {"n": 1, "cross_track_mean_m": error, "cross_track_max_m": 1.0}
+            figures |= {"wheel_out_s": out, "drives_departed": int(out > 1)}
+            clean = figures | {"cross_track_mean_m": 0.1}
+            about = {"attack": name, "environment": column.environment}
+            about |= {"condition": column.condition.label}
+            rows.append(about | {"cases": {"no_object": clean, "attack": figures}})
+    return {"attacks": attacks, "rows": rows}
 
 
-def test_the_command_chooses_drives_and_writes(tmp_path, monkeypatch, capsys):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    sweep, folder, output = tmp_path / "sweep", tmp_path / "drives", tmp_path / "page"
-    files.make_folder(sweep)
-    many = [row(f"c{seed}", "gradient", seed, seed / 10) for seed in range(9)]
-    write_table(sweep / "results.parquet", many)
-    given, remade = [], folder / "remade" / "0" / "cells"
+class Commands:
+    """Stands for the commands: makes what they leave behind, and keeps their words."""
 
-    def run(words):
-        given.append(words)
+    def __init__(self, remade):
+        self.given, self.fails_at, self.remade = [], None, remade
+
+    def __call__(self, words):
+        self.given.append(words)
         if words[0] == "replay":
-            for name in words[2:10]:
-                path = remade / name.partition(":")[0]
+            for name in words[2 : words.index("-o")]:
+                path = self.remade / name.partition(":")[0]
                 files.make_folder(path)
                 (path / "metrics.json").touch()
             return
-        labels = [words[1].rpartition("/")[2], words[2].rpartition("/")[2]]
-        files.make_folder(folder)
-        (folder / "transfer.json").write_text(json.dumps(document(labels)))
+        found = document(words)
+        if fails := len(self.transfers()) == self.fails_at:
+            found["rows"] = [row for row in found["rows"] if row["attack"] == "c8"]
+        path = files.make_folder(Path(words[words.index("-o") + 1]))
+        files.write_json(path / "transfer.json", found)
+        if fails:
+            raise SystemExit(1)
 
-    monkeypatch.setattr("bench.commands.quality.run_command", run)
-    assert main(["matrix", str(folder), str(sweep), "-o", str(output)]) == 0
-    again, first, second = given
-    assert again[1] == str(sweep) and again[-2:] == ["-o", str(remade.parent)]
-    assert again[2:10] == [f"c{8 - k}:surrogate:attack:0" for k in range(8)]
-    assert second[: len(first)] == first
-    assert first[1:9] == [str(remade / f"c{8 - k}") for k in range(8)]
-    assert "mujoco_gl_built_in" in second and "--environments" not in first
-    text = (output / "README.md").read_text()
-    assert "The 2 best attacks" in text
-    day = "| day | 0.400 | 0.400 ± 0.100 [0.200, 0.600] (2); 1/2 out [9, 91] | 1.00 "
-    assert day + "| 1/1 [20, 100] |" in text
+    def transfers(self):
+        return [words for words in self.given if words[0] == "transfer"]
+
+
+def found_of(folders):
+    return [
+        SimpleNamespace(label=path.name, digest=f"{path.name} found")
+        for path in folders
+    ]
+
+
+@pytest.fixture
+def given(tmp_path, monkeypatch):
+    """Give a sweep of nine attacks, of which two a route are chosen."""
+    pytest.importorskip("pyarrow")
+    many = [row(f"c{seed}", "gradient", seed, seed / 10) for seed in range(9)]
+    write_table(files.make_folder(tmp_path / "sweep") / "results.parquet", many)
+    commands = Commands(tmp_path / "drives" / "remade" / "0" / "cells")
+    monkeypatch.setattr("bench.commands.quality.run_command", commands)
+    monkeypatch.setattr(f"{FOUND}.read_found", found_of)
+    monkeypatch.setattr(matrix.best_attacks, "__defaults__", (2,))
+    return commands
+
+
+def run(tmp_path, folder="drives"):
+    words = [str(tmp_path / folder), str(tmp_path / "sweep")]
+    return main(["matrix", *words, "-o", str(tmp_path / "page")])
+
+
+def test_the_command_chooses_drives_and_writes(tmp_path, given):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert run(tmp_path) == 0
+    again, first, *others = given.given
+    assert again[:4] == [
+        "replay",
+        str(tmp_path / "sweep"),
+        *(f"c{k}:{ROW}" for k in (8, 7)),
+    ]
+    assert first[1:3] == [str(given.remade / name) for name in ("c8", "c7")]
+    assert "day" in first and "mujoco_gl_built_in" in first
+    assert len(others) == 5 and all("day" not in words for words in others)
+    text = (tmp_path / "page" / "README.md").read_text()
+    assert "The 2 best attacks" in text and "99 of 99 columns" in text
+    day, noon = (
+        next(line for line in text.splitlines() if f"| {name} |" in line)
+        for name in ("day", "noon")
+    )
+    assert day.startswith("| day | 0.100 | 0.400 ±") and "; 1/2 out [9, 91]" in day
+    assert day.endswith("| 1.00 | 1/1 [21, 100] |")
+    assert noon.endswith("| 0.50 | 0/1 [0, 79] |")
     assert "| c8 | **0.600** |" in text and "| c7 | 0.200 |" in text
-    table = parquet.read_table(output / "drives.parquet").to_pylist()
-    assert len(table) == 8 and table[0]["case"] == "no_object"
-    given.clear()
-    assert main(["matrix", str(folder), str(sweep), "-o", str(output)]) == 0
-    assert [words[0] for words in given] == ["transfer", "transfer"]
-    few = ["matrix", str(folder), str(tmp_path / "none")]
+    table = parquet.read_table(tmp_path / "page" / "drives.parquet").to_pylist()
+    assert len(table) == 99 * 2 * 2
+    assert (tmp_path / "drives" / "matrix.png").exists()
+
+
+def test_what_the_table_has_is_not_driven_again(tmp_path, given):
+    """Not where it was interrupted, and not on another machine, either."""
+    given.fails_at = 2
+    with pytest.raises(SystemExit):
+        run(tmp_path)
+    page = tmp_path / "page" / "README.md"
+    assert "7 of 99 columns" in page.read_text()
+    given.fails_at = None
+    given.given.clear()
+    assert run(tmp_path) == 0
+    rest = given.transfers()
+    assert rest[0][1:2] == [str(given.remade / "c7")] and rest[0][2] == "-o"
+    assert len(rest) == 5 and "99 of 99 columns" in page.read_text()
+    given.given.clear()
+    assert run(tmp_path, "elsewhere") == 0 and not given.given
+
+
+def test_attacks_that_were_found_with_other_digits_are_refused(
+    tmp_path, given, monkeypatch, capsys
+):
+    given.fails_at = 2
+    with pytest.raises(SystemExit):
+        run(tmp_path)
+    monkeypatch.setattr(
+        f"{FOUND}.read_found",
+        lambda folders: [SimpleNamespace(label=p.name, digest="0") for p in folders],
+    )
+    given.given.clear()
+    assert run(tmp_path) == cli.EXIT_INPUT and not given.transfers()
+    assert "c7 was found with other digits" in capsys.readouterr().err
+
+
+def test_a_sweep_without_a_table_is_refused(tmp_path, given, capsys):
+    del given
+    few = ["matrix", str(tmp_path / "drives"), str(tmp_path / "none")]
     assert main(few) == cli.EXIT_INPUT and "results.parquet" in capsys.readouterr().err

@@ -11,7 +11,6 @@ import numpy as np
 from mi_nerfattack.evaluation.intervals import share_interval
 from mi_nerfattack.evaluation.metrics import summarise
 from mi_nerfattack.evaluation.pairs import DEPARTED_S, over_attacks
-from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.experiment.transfer.work import Batch, TransferWork
 from mi_nerfattack.rollout.drive import ATTACK, Drive
@@ -58,7 +57,7 @@ def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
         for (number, column), row in work.rows.items()
         if all(batch.digest in figures for batch in row.values())
     ]
-    _compare(rows)
+    compare_rows(rows)
     complete = len(rows) == len(work.rows)
     return {
         "schema": SCHEMA,
@@ -73,7 +72,7 @@ def make_document(work: TransferWork, figures: Figures) -> dict[str, Any]:
         },
         "attacks": [_about(found) for found in work.attacks],
         "rows": rows,
-        "columns": _columns(rows, work.columns, work.seed) if complete else [],
+        "columns": column_figures(rows, work.seed) if complete else [],
         "surrogates": _surrogates(work, rows) if complete else [],
     }
 
@@ -94,8 +93,13 @@ def _about(found: FoundAttack) -> dict[str, Any]:
     }
 
 
-def _compare(rows: Sequence[Row]) -> None:
-    """Set each row's attack beside the same in the surrogate without a condition."""
+def compare_rows(rows: Sequence[Row]) -> None:
+    """Set each row's attack beside the same in the surrogate without a condition.
+
+    Args:
+        rows: of ``transfer.json``; get ``ratio_to_surrogate``, ``succeeds`` and
+            ``succeeds_in_surrogate``.
+    """
     bases = {
         row["attack"]: row["cases"].get(ATTACK)
         for row in rows
@@ -111,14 +115,20 @@ def _compare(rows: Sequence[Row]) -> None:
         row["succeeds_in_surrogate"] = None if base is None else _is_out(base)
 
 
-def _columns(
-    rows: Sequence[Row], columns: Sequence[Column], seed: int
-) -> list[dict[str, Any]]:
-    """Summarise each column over the attacks."""
-    found = []
-    for column in columns:
-        key = column.environment, column.condition.label
-        own = [row for row in rows if (row["environment"], row["condition"]) == key]
+def column_figures(rows: Sequence[Row], seed: int) -> list[dict[str, Any]]:
+    """Summarise each column over the attacks that have it.
+
+    Args:
+        rows: of :func:`compare_rows`.
+        seed: of the bootstrap.
+
+    Returns:
+        ``columns`` of ``transfer.json``, in the order of the rows.
+    """
+    found, groups = [], {}
+    for row in rows:
+        groups.setdefault((row["environment"], row["condition"]), []).append(row)
+    for key, own in groups.items():
         ratios = [r for row in own if (r := row["ratio_to_surrogate"])]
         mean = float(np.exp(np.log(ratios).mean())) if len(ratios) == len(own) else None
         found.append(
@@ -148,7 +158,7 @@ def _surrogates(work: TransferWork, rows: Sequence[Row]) -> list[dict[str, Any]]
     for group in groups.values():
         labels = [found.label for found in group]
         own = [row for row in rows if row["attack"] in labels]
-        columns = _columns(own, work.columns, work.seed)
+        columns = column_figures(own, work.seed)
         about = dict(group[0].surrogate)
         summaries.append({**about, "attacks": labels, "columns": columns})
     unknown = float("inf")
