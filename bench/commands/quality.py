@@ -14,6 +14,7 @@ import tyro
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FIELD = "intersection/field.safetensors"
+_ONE_LOOK = {"textures": 1, "deployment_textures": 1}
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class BenchQuality:
         cells = [str(path) for path in self._cells(grid, folder / "sweep")]
         words = ["transfer", *cells, "-o", str(folder / "transfer"), *workers]
         words += ["--environments", "surrogate", "mitsuba", "--conditions", "day"]
-        run_command([*words, "--starts", str(self.starts)])
+        words += ["--cases", "no_object", "attack", "--starts", str(self.starts)]
+        run_command(words)
         return 0
 
     def _fits(self, folder: Path) -> list[tuple[Path, list[str]]]:
@@ -82,7 +84,10 @@ class BenchQuality:
         return found
 
     def _grid(self, folder: Path) -> str:
-        """Return the grid: that of Table 2, its method in each field."""
+        """Return the grid: that of Table 2, its method in each field.
+
+        The transfer drives by itself: what else than search a run does is cut short.
+        """
         import tomlkit
 
         from mi_nerfattack.io import files
@@ -91,10 +96,11 @@ class BenchQuality:
         [method] = grid.pop("methods")
         named = {f"steps_{n}": str(_field(folder, n)) for n in self.steps}
         named["bundled"] = f"bundled:{FIELD}"
-        scenes = {name: {"scene": {"field": file}} for name, file in named.items()}
+        search = method["set"] | {"baseline": _ONE_LOOK}
+        search["drive"] |= {"runs": 1}
         methods = [
-            {"name": name, "set": method["set"] | scene}
-            for name, scene in scenes.items()
+            {"name": name, "set": search | {"scene": {"field": file}}}
+            for name, file in named.items()
         ]
         return tomlkit.dumps(grid | {"seeds": list(self.seeds), "methods": methods})
 
