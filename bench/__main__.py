@@ -25,6 +25,7 @@ from bench.commands.speed import (
     BenchRender,
     BenchSteps,
 )
+from bench.commands.steering import BenchSteering
 from bench.commands.study import BenchStudy
 from bench.commands.table2 import BenchTable2
 from bench.commands.training import BenchCollect, BenchDagger
@@ -46,6 +47,7 @@ COMMANDS = {
     "study": BenchStudy,
     "quality": BenchQuality,
     "table2": BenchTable2,
+    "steering": BenchSteering,
     "methods": BenchMethods,
     "matrix": BenchMatrix,
     "overlay": BenchOverlay,

@@ -51,6 +51,9 @@ _RETRAIN = (
     "mi-nerfattack retrain FOLDER/cells/* -o retrained.safetensors --data DATA "
     "--more FRAMES  # which: docs/retrain.md"
 )
+_WHY = (
+    "Why some of it is missed: [what the policy does](../bench.md#why-aims-are-missed)."
+)
 _REPLAY = "mi-nerfattack replay docs/table2 --rows 10  # any row comes back"
 _BUDGETS = """\
 The same places and unseen starts, [budgets](../../scenes/budgets.toml) of four times as
@@ -96,7 +99,7 @@ def page(
     parts += [
         section("In the paper's unit", _UNIT, ["route", "", *cases], theirs),
         section("Against random textures", "", _AGAINST, against),
-        section("What was aimed at", "", ["aim", "found", ""], aims),
+        section("What was aimed at", _WHY, ["aim", "found", ""], aims),
     ]
     if budgets is not None:
         parts += list(_budgets(budgets))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from mi_nerfattack.experiment.checks.standing import (
     scene_findings,
     solids_of,
 )
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.rollout.drive import OWN, Drive, departure_limit
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -113,7 +114,8 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
         for k, item in enumerate(world.scenario.objects):
             seen, most = 0, 0.0
             for step in steps:
-                share = _share_shown(world, k, first.states[step], int(step))
+                own = world.fields[k : k + 1]
+                share = changeable_share(world, own, first.states[step], int(step))
                 seen, most = seen + (share >= PIXELS), max(most, share)
                 if seen == needed:
                     break
@@ -129,16 +131,25 @@ def view_findings(world: World, first: Drive) -> Iterator[str]:
         world.show(original)
 
 
-def _share_shown(world: World, k: int, pose: np.ndarray, step: int) -> float:
-    """Return the share of the pixels that the texture of object k can change."""
-    sensor, field = world.surrogate, world.fields[k]
-    state = to_state(pose[None])
-    texture = np.full((field.n_vertices, 3), _RAW, np.float32)
-    field.set_parameter("texture", texture)
-    seen = sensor.observe(state, step)
-    field.set_parameter("texture", -texture)
-    other = sensor.observe(state, step)
-    change = np.abs(seen.image.numpy() - other.image.numpy()).max(-1)
+def changeable_share(
+    world: World, fields: Sequence[GridField], pose: np.ndarray, step: int
+) -> float:
+    """Return the share of the pixels that the textures of objects can change.
+
+    Args:
+        world: of the attack; the fields keep another texture.
+        fields: of the objects.
+        pose: (3,) of the vehicle.
+        step: control period, of the rays.
+    """
+    sensor, state = world.surrogate, to_state(pose[None])
+    images = []
+    for raw in (_RAW, -_RAW):
+        for field in fields:
+            texture = np.full((field.n_vertices, 3), raw, np.float32)
+            field.set_parameter("texture", texture)
+        images.append(sensor.observe(state, step).image.numpy())
+    change = np.abs(images[0] - images[1]).max(-1)
     return float((change >= CHANGE).mean())
 
 

@@ -1,0 +1,46 @@
+"""``python -m bench steering``: how hard the policy steers back at a sweep's places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from mi_nerfattack.commands.shared.result import Result
+
+
+@dataclass(frozen=True)
+class BenchSteering:
+    """Compare what attacks did at a sweep's places with how the policy steers back.
+
+    At each place of a sweep of attacks by gradient: the share of the pixels that
+    textures can change, and by how much the policy's control changes, without objects,
+    with the distance from the lane's centre. Both from along the centre, in the
+    surrogate. Nothing is attacked.
+    """
+
+    folder: tyro.conf.Positional[Path] = Path("docs/table2")
+    """Of a finished sweep, or a copy of its table."""
+    json: bool = False
+    """Print a line of JSON for each place in place of the table."""
+
+    def run(self) -> Result:
+        """Look, and print."""
+        from bench.table2.page import section
+        from bench.table2.steering import HEADER, errors, lines, measure
+        from mi_nerfattack import variant
+        from mi_nerfattack.experiment.sweep.replay import read_replay
+        from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
+        from mi_nerfattack.scenario.world import build_world
+
+        variant.ensure()
+        rows = read_table(self.folder / RESULTS)
+        places = []
+        every = [str(index) for index in range(len(rows))]
+        for cell in read_replay(self.folder, every).cells:
+            world = build_world(cell.scenario, cell.scenario.policy.build())
+            place = {"route": cell.route, "seed": cell.seed}
+            places.append(place | measure(world) | errors(rows, cell.id))
+        table = section("Steering", "", HEADER, lines(places))
+        return Result({"places": places}, lambda: print(table))
