@@ -75,6 +75,7 @@ class BenchMatrix:
 
     def _rows(self) -> list[dict[str, Any]]:
         """Return what the table has so far."""
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.table import require_parquet
 
         require_parquet()
@@ -82,7 +83,13 @@ class BenchMatrix:
 
         if not self._table.exists():
             return []
-        return pyarrow.parquet.read_table(self._table).to_pylist()
+        rows = pyarrow.parquet.read_table(self._table).to_pylist()
+        if others := {row["n"] for row in rows} - {self.starts}:
+            raise InputError(
+                f"{self._table}: has drives from {min(others)} starts; give --starts "
+                f"{min(others)}, or choose another folder with -o"
+            )
+        return rows
 
     def _add(self, new: Iterable[dict[str, Any]], labels: Collection[str]) -> None:
         """Add rows to the table, and write the page if a column is whole."""

@@ -164,6 +164,14 @@ def test_what_the_table_has_is_not_driven_again(tmp_path, given):
     assert run(tmp_path, "elsewhere") == 0 and not given.given
 
 
+def test_a_table_from_other_starts_is_refused(tmp_path, given, capsys):
+    assert run(tmp_path) == 0
+    words = [str(tmp_path / "drives"), str(tmp_path / "sweep"), "--starts", "4"]
+    refused = main(["matrix", *words, "-o", str(tmp_path / "page")])
+    assert refused == cli.EXIT_INPUT and len(given.transfers()) == 6
+    assert "drives from 1 starts; give --starts 1" in capsys.readouterr().err
+
+
 def test_attacks_that_were_found_with_other_digits_are_refused(
     tmp_path, given, monkeypatch, capsys
 ):
