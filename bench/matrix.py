@@ -25,7 +25,7 @@ Row = dict[str, Any]
 OF_ROUTE = 8
 CASES = (NO_OBJECT, ATTACK)
 FIGURES = (
-    "n",
+    "n",  # drives
     "cross_track_mean_m",
     "cross_track_max_m",
     "wheel_out_s",
@@ -35,6 +35,7 @@ FIGURES = (
 SEED = Transfer.seed
 _KEY = ("attack", "environment", "condition", "case")
 _AT_A_TIME = 3  # conditions
+_NONE: Row = {"cases": {}}
 _INTRODUCTION = """\
 # The best attacks in every environment
 
@@ -99,8 +100,15 @@ def columns_of(conditions: Sequence[str]) -> list[tuple[str, str]]:
     return [(column.environment, column.condition.label) for column in columns]
 
 
-def table_rows(document: Mapping[str, Any]) -> Iterator[Row]:
-    """Yield a row an attack, column and case of a ``transfer.json``, whole or not."""
+def table_rows(
+    document: Mapping[str, Any], settings: Mapping[str, Any]
+) -> Iterator[Row]:
+    """Yield a row an attack, column and case of a ``transfer.json``, whole or not.
+
+    Args:
+        document: as read.
+        settings: of its drives, ``starts`` among them.
+    """
     about = {item["label"]: item for item in document["attacks"]}
     for row in document["rows"]:
         attack = about[row["attack"]]
@@ -108,7 +116,7 @@ def table_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             labels = row["attack"], row["environment"], row["condition"], case
             found = dict(zip(_KEY, labels, strict=True))
             found |= {name: attack[name] for name in ("route", "found_sha256")}
-            yield found | {name: figures[name] for name in FIGURES}
+            yield found | {name: figures[name] for name in FIGURES} | dict(settings)
 
 
 def merged(known: Iterable[Row], new: Iterable[Row]) -> list[Row]:
@@ -154,21 +162,28 @@ def document_of(rows: Sequence[Row], labels: Collection[str]) -> dict[str, Any]:
     cells: dict[tuple[str, str], dict[str, Row]] = {column: {} for column in order}
     for row in rows:
         about = {name: row[name] for name in _KEY[:3]} | {"cases": {}}
-        column = cells[row["environment"], row["condition"]]
+        key = row["environment"], row["condition"]
+        if key not in cells:
+            raise InputError(
+                f"drives.parquet: {' under '.join(key)}: no column of the matrix; "
+                "choose another folder with -o"
+            )
+        column = cells[key]
         cases = column.setdefault(row["attack"], about)["cases"]
         cases[row["case"]] = {name: row[name] for name in FIGURES}
     whole = [
         column[label]
         for column in cells.values()
-        if all(len(column.get(label, {}).get("cases", ())) == 2 for label in labels)
+        if all(set(CASES) == set(column.get(label, _NONE)["cases"]) for label in labels)
         for label in labels
     ]
     compare_rows(whole)
+    there = {row["condition"] for row in whole}
     routes = {row["attack"]: row["route"] for row in rows}
     return {
         "attacks": [{"label": name, "route": routes.get(name)} for name in labels],
-        "conditions": list(dict.fromkeys(row["condition"] for row in whole)),
-        "starts": rows[0]["n"] if rows else 0,
+        "conditions": [c for group in passes() for c in group if c in there],
+        "starts": rows[0]["starts"] if rows else 0,
         "success_s": DEPARTED_S,
         "cases": CASES,
         "rows": whole,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +18,9 @@ class BenchMatrix:
 
     Takes the eight best of each route and gives them to transfers in FOLDER, some
     conditions at a time, the plain one first. The table beside the page grows after
-    each; what it has is not driven again, on whatever machine, and so the same command
-    goes on. Attacks of which there is but the table are made again, in FOLDER/remade.
+    each; attacks that it has under all of some conditions are not driven past again,
+    on whatever machine. The same command goes on. Attacks of which there is but the
+    table are made again, in FOLDER/remade.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -52,22 +54,35 @@ class BenchMatrix:
 
         tables = [(path, read_table(path / RESULTS)) for path in self.sweeps]
         chosen = {path.name: path for path in best_attacks(tables)}
-        document = self.folder / DOCUMENT
+        variant.ensure()
+        document = self._drives / DOCUMENT
         if document.exists():  # of an interrupted pass
-            self._add(table_rows(files.read_json(document)), chosen)
+            self._add(table_rows(files.read_json(document), self._settings), chosen)
         for conditions in passes():
             columns = columns_of(conditions)
             names = left(self._rows(), chosen, columns)
             if not names:
                 continue
-            variant.ensure()
             folders = self._made([chosen[name] for name in names])
             found = {item.label: item.digest for item in read_found(folders)}
             check_same(self._rows(), found, self._table)
             environments = list(dict.fromkeys(name for name, _ in columns))
             self._drive(folders, environments, conditions)
-            self._add(table_rows(files.read_json(document)), chosen)
+            self._add(table_rows(files.read_json(document), self._settings), chosen)
         return 0
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        """Of all rows of a table."""
+        from mi_nerfattack.backend.versions import versions
+
+        told = json.dumps(versions())
+        return {"starts": self.starts, "spp": self.spp, "versions": told}
+
+    @property
+    def _drives(self) -> Path:
+        """Folder of the transfers with these settings."""
+        return self.folder / f"starts_{self.starts}_spp_{self.spp}"
 
     @property
     def _table(self) -> Path:
@@ -84,11 +99,12 @@ class BenchMatrix:
         if not self._table.exists():
             return []
         rows = pyarrow.parquet.read_table(self._table).to_pylist()
-        if others := {row["n"] for row in rows} - {self.starts}:
-            raise InputError(
-                f"{self._table}: has drives from {min(others)} starts; give --starts "
-                f"{min(others)}, or choose another folder with -o"
-            )
+        for name, value in self._settings.items():
+            if others := {row[name] for row in rows} - {value}:
+                raise InputError(
+                    f"{self._table}: has drives with {name} {others.pop()}, here "
+                    f"{value}; take the same, or choose another folder with -o"
+                )
         return rows
 
     def _add(self, new: Iterable[dict[str, Any]], labels: Collection[str]) -> None:
@@ -105,6 +121,8 @@ class BenchMatrix:
         found = {row["attack"]: row["found_sha256"] for row in new}
         check_same(known, found, self._table)
         rows = merged(known, new)
+        if rows == known:
+            return
         pyarrow.parquet.write_table(pa.Table.from_pylist(rows), buffer)
         files.make_folder(self.output)
         files.write_bytes(self._table, buffer.getvalue())
@@ -124,7 +142,7 @@ class BenchMatrix:
         from bench.commands.quality import run_command
         from bench.matrix import CASES, SEED
 
-        words = ["transfer", *map(str, folders), "-o", str(self.folder)]
+        words = ["transfer", *map(str, folders), "-o", str(self._drives)]
         words += ["--environments", *environments, "--conditions", *conditions]
         words += ["--cases", *CASES, "--starts", str(self.starts)]
         words += ["--seed", str(SEED), "--spp", str(self.spp)]

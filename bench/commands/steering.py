@@ -12,12 +12,12 @@ from mi_nerfattack.commands.shared.result import Result
 
 @dataclass(frozen=True)
 class BenchSteering:
-    """Compare what attacks did at a sweep's places with how the policy steers back.
+    """Set attacks at a sweep's places beside how the policy steers back there.
 
-    At each place of a sweep of attacks by gradient: the share of the pixels that
-    textures can change, and by how much the policy's control changes, without objects,
-    with the distance from the lane's centre. Both from along the centre, in the
-    surrogate. Nothing is attacked.
+    At each place of a sweep with one method, from along the lane's centre, in the
+    surrogate: the share of the pixels that textures can change, and by how much the
+    policy's control, without objects, changes aside of the centre, and turned. Nothing
+    is attacked.
     """
 
     folder: tyro.conf.Positional[Path] = Path("docs/table2")
@@ -30,17 +30,23 @@ class BenchSteering:
         from bench.table2.page import section
         from bench.table2.steering import HEADER, errors, lines, measure
         from mi_nerfattack import variant
+        from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.replay import read_replay
         from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
         from mi_nerfattack.scenario.world import build_world
 
         variant.ensure()
         rows = read_table(self.folder / RESULTS)
+        if len(methods := {row["method"] for row in rows}) > 1:
+            raise InputError(
+                f"{self.folder / RESULTS}: has the methods {', '.join(sorted(methods))}"
+                "; give a sweep with one, such as docs/table2"
+            )
         places = []
         every = [str(index) for index in range(len(rows))]
         for cell in read_replay(self.folder, every).cells:
             world = build_world(cell.scenario, cell.scenario.policy.build())
-            place = {"route": cell.route, "seed": cell.seed}
-            places.append(place | measure(world) | errors(rows, cell.id))
+            place = {"route": cell.route, "seed": cell.seed, "looks": measure(world)}
+            places.append(place | errors(rows, cell.id))
         table = section("Steering", "", HEADER, lines(places))
         return Result({"places": places}, lambda: print(table))

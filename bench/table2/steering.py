@@ -9,6 +9,7 @@ import numpy as np
 
 from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.deploy.driving import policy_image
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.checks.before_attack import changeable_share
 from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
@@ -17,27 +18,34 @@ from mi_nerfattack.vehicle.state import to_state
 
 EVERY = 4  # control periods
 ASIDE_M, TURNED_RAD = 0.2, 0.05
+UNIT = "rad/s"  # of the control
 CASES = (NO_OBJECT, RANDOM, ATTACK)
 HEADER = [
     *("route", "places", "objects' share of the image, %", "at most"),
-    *("steers back, rad/s per m", "at the least", "per rad"),
+    *(f"steers back, {UNIT} per m", "at the least", "there, m along", "per rad"),
     *("unperturbed, m", "random, m", "attack, m", "attack less random"),
 ]
 
 
-def measure(world: World) -> dict[str, float]:
-    """Look from along the route's centre, at the speed of the drive, every 0.4 s.
+def measure(world: World) -> list[dict[str, float]]:
+    """Look from along the route's centre, every `EVERY` periods of a drive.
 
     Returns:
-        ``share`` and ``share_most`` of the pixels that textures change by 0.1 or more;
-        ``per_m`` and ``per_rad``, the policy's control against a place 0.2 m aside and
-        a heading 0.05 rad off, without objects, central differences, and the least of
-        the former, ``per_m_least``; means else.
+        of each look ``along_m``, arc length; ``share`` of the pixels that textures can
+        change; ``per_m`` and ``per_rad``, by how much the policy's control, without
+        objects, changes against `ASIDE_M` to the left and `TURNED_RAD` (half the
+        difference to as much to the right).
+
+    Raises:
+        InputError: the vehicle's control is no heading rate.
     """
-    drive, route = world.scenario.drive, world.route
-    sensor = world.surrogate.showing([])
-    ahead_m = route.speed_ms * world.scenario.vehicle.dt_s
-    shares, aside, turned = [], [], []
+    drive, route, place = world.scenario.drive, world.route, world.place
+    if place.car.control_unit != UNIT:
+        raise InputError(
+            f"{world.scenario.name!r}: its control is in {place.car.control_unit}; "
+            f"give a sweep with a vehicle steered in {UNIT}"
+        )
+    sensor, period_m = world.surrogate.showing([]), route.speed_ms * place.period
 
     def control(pose: np.ndarray, step: int) -> float:
         seen = np.array(sensor.observe(to_state(pose[None]), step).image)[0]
@@ -45,24 +53,23 @@ def measure(world: World) -> dict[str, float]:
         memory = world.policy.initial_memory(1)
         return float(np.array(world.policy.step(image, route.goal, memory)[0])[0])
 
-    def back(shift: np.ndarray, pose: np.ndarray, step: int) -> float:
-        sides = control(pose - shift, step) - control(pose + shift, step)
-        return sides / (2 * float(np.linalg.norm(shift)))
-
+    looks = []
     with one_thread():
         for step in range(0, world.horizon, EVERY):
-            pose = np.asarray(route.pose_at(drive.start_m + step * ahead_m))
-            left = np.array([-np.sin(pose[2]), np.cos(pose[2]), 0])
-            shares.append(changeable_share(world, world.fields, pose, step))
-            aside.append(back(ASIDE_M * left, pose, step))
-            turned.append(back(np.array([0, 0, TURNED_RAD]), pose, step))
-    return {
-        "share": float(np.mean(shares)),
-        "share_most": max(shares),
-        "per_m": float(np.mean(aside)),
-        "per_m_least": min(aside),
-        "per_rad": float(np.mean(turned)),
-    }
+            along = drive.start_m + step * period_m
+            here = route.pose_at(along)
+            aside = route.pose_at(along, [ASIDE_M, -ASIDE_M])
+            turned = route.pose_at(along, 0, [TURNED_RAD, -TURNED_RAD])
+            left, right, in_, out = (control(p, step) for p in (*aside, *turned))
+            looks.append(
+                {
+                    "along_m": along,
+                    "share": changeable_share(world, world.fields, here, step),
+                    "per_m": (right - left) / (2 * ASIDE_M),
+                    "per_rad": (out - in_) / (2 * TURNED_RAD),
+                }
+            )
+    return looks
 
 
 def errors(rows: Iterable[Mapping[str, Any]], cell: str) -> dict[str, float]:
@@ -79,16 +86,16 @@ def lines(places: Sequence[Mapping[str, Any]]) -> Iterator[Sequence[str]]:
     """Yield a line a route of a table with `HEADER`: means, the most and the least."""
     for route in dict.fromkeys(place["route"] for place in places):
         own = [place for place in places if place["route"] == route]
-        mean = {
-            name: float(np.mean([place[name] for place in own]))
-            for name in ("share", "per_m", "per_rad", *CASES)
-        }
+        looks = [look for place in own for look in place["looks"]]
+        mean = {case: np.mean([place[case] for place in own]) for case in CASES}
+        for name in ("share", "per_m", "per_rad"):
+            mean[name] = np.mean([look[name] for look in looks])
+        least = min(looks, key=lambda look: look["per_m"])
         yield (
             *(route, str(len(own)), f"{100 * mean['share']:.1f}"),
-            f"{100 * max(place['share_most'] for place in own):.1f}",
-            f"{mean['per_m']:.2f}",
-            f"{min(place['per_m_least'] for place in own):.2f}",
-            f"{mean['per_rad']:.2f}",
+            f"{100 * max(look['share'] for look in looks):.1f}",
+            *(f"{mean['per_m']:.2f}", f"{least['per_m']:.2f}"),
+            *(f"{least['along_m']:.0f}", f"{mean['per_rad']:.2f}"),
             *(f"{mean[case]:.3f}" for case in CASES),
             f"{mean[ATTACK] - mean[RANDOM]:.3f}",
         )

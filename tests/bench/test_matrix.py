@@ -11,6 +11,7 @@ from bench import matrix
 from bench.__main__ import main
 from bench.matrix import best_attacks
 from mi_nerfattack import cli
+from mi_nerfattack.commands.transfer import Transfer
 from mi_nerfattack.experiment.sweep.table import write_table
 from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
@@ -73,7 +74,8 @@ class Commands:
     """Stands for the commands: makes what they leave behind, and keeps their words."""
 
     def __init__(self, remade):
-        self.given, self.fails_at, self.remade = [], None, remade
+        self.given, self.remade = [], remade
+        self.fails_at, self.rows_until = None, 0
 
     def __call__(self, words):
         self.given.append(words)
@@ -85,7 +87,7 @@ class Commands:
             return
         found = document(words)
         if fails := len(self.transfers()) == self.fails_at:
-            found["rows"] = [row for row in found["rows"] if row["attack"] == "c8"]
+            found["rows"] = found["rows"][: self.rows_until]
         path = files.make_folder(Path(words[words.index("-o") + 1]))
         files.write_json(path / "transfer.json", found)
         if fails:
@@ -115,9 +117,9 @@ def given(tmp_path, monkeypatch):
     return commands
 
 
-def run(tmp_path, folder="drives"):
-    words = [str(tmp_path / folder), str(tmp_path / "sweep")]
-    return main(["matrix", *words, "-o", str(tmp_path / "page")])
+def run(tmp_path, folder="drives", page="page", more=()):
+    words = [str(tmp_path / folder), str(tmp_path / "sweep"), *more]
+    return main(["matrix", *words, "-o", str(tmp_path / page)])
 
 
 def test_the_command_chooses_drives_and_writes(tmp_path, given):
@@ -145,11 +147,16 @@ def test_the_command_chooses_drives_and_writes(tmp_path, given):
     table = parquet.read_table(tmp_path / "page" / "drives.parquet").to_pylist()
     assert len(table) == 99 * 2 * 2
     assert (tmp_path / "drives" / "matrix.png").exists()
+    again = matrix.document_of(table, ["c8", "c7"])
+    assert again["conditions"] == list(Transfer.conditions)
 
 
 def test_what_the_table_has_is_not_driven_again(tmp_path, given):
-    """Not where it was interrupted, and not on another machine, either."""
-    given.fails_at = 2
+    """Not where it was interrupted, and not on another machine, either.
+
+    The interrupted pass has all of the columns of c8, and all but one of c7.
+    """
+    given.fails_at, given.rows_until = 2, 2 * 6 * 3 - 1
     with pytest.raises(SystemExit):
         run(tmp_path)
     page = tmp_path / "page" / "README.md"
@@ -164,12 +171,19 @@ def test_what_the_table_has_is_not_driven_again(tmp_path, given):
     assert run(tmp_path, "elsewhere") == 0 and not given.given
 
 
-def test_a_table_from_other_starts_is_refused(tmp_path, given, capsys):
+def test_a_table_of_other_settings_is_refused(tmp_path, given, capsys):
+    """And another table in another folder has none of the first one's drives."""
+    parquet = pytest.importorskip("pyarrow.parquet")
     assert run(tmp_path) == 0
-    words = [str(tmp_path / "drives"), str(tmp_path / "sweep"), "--starts", "4"]
-    refused = main(["matrix", *words, "-o", str(tmp_path / "page")])
-    assert refused == cli.EXIT_INPUT and len(given.transfers()) == 6
-    assert "drives from 1 starts; give --starts 1" in capsys.readouterr().err
+    for option in ("--starts", "--spp"):
+        assert run(tmp_path, more=[option, "4"]) == cli.EXIT_INPUT
+        told = f"drives with {option[2:]} {8 if option == '--spp' else 1}, here 4"
+        assert told in capsys.readouterr().err
+    assert len(given.transfers()) == 6
+    assert run(tmp_path, page="other", more=["--starts", "4"]) == 0
+    assert len(given.transfers()) == 12
+    rows = parquet.read_table(tmp_path / "other" / "drives.parquet").to_pylist()
+    assert {row["starts"] for row in rows} == {4}
 
 
 def test_attacks_that_were_found_with_other_digits_are_refused(
@@ -184,7 +198,7 @@ def test_attacks_that_were_found_with_other_digits_are_refused(
     )
     given.given.clear()
     assert run(tmp_path) == cli.EXIT_INPUT and not given.transfers()
-    assert "c7 was found with other digits" in capsys.readouterr().err
+    assert "c8 was found with other digits" in capsys.readouterr().err
 
 
 def test_a_sweep_without_a_table_is_refused(tmp_path, given, capsys):

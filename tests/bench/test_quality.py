@@ -60,7 +60,8 @@ def test_table_2_is_attacked_in_every_field(commands, tmp_path):
     for cell in cells:
         if cell.method == "bundled":
             own, theirs = cell.scenario.identity(), known[cell.route, cell.seed]
-            differ = {key for key in own if own[key] != theirs.get(key)}
+            keys = own.keys() | theirs.keys()
+            differ = {key for key in keys if own.get(key) != theirs.get(key)}
             assert differ == {
                 "scenario.baseline.textures",
                 "scenario.baseline.deployment_textures",
