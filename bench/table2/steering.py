@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ from mi_nerfattack.backend.threads import one_thread
 from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.checks.before_attack import changeable_share
-from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, RANDOM
+from mi_nerfattack.io import files
+from mi_nerfattack.rollout.drive import ATTACK, NO_OBJECT, OWN, RANDOM
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World
 from mi_nerfattack.vehicle.state import to_state
@@ -19,12 +22,14 @@ from mi_nerfattack.vehicle.state import to_state
 EVERY = 4  # control periods
 ASIDE_M, TURNED_RAD = 0.2, 0.05
 UNIT = "rad/s"  # of the control
+NEAR_M = 0.15  # two drives that see alike
 CASES = (NO_OBJECT, RANDOM, ATTACK)
 HEADER = [
     *("route", "places", "objects' share of the image, %", "at most"),
     *(f"steers back, {UNIT} per m", "at the least", "there, m along", "per rad"),
     *("unperturbed, m", "random, m", "attack, m", "attack less random"),
 ]
+CHANGED = ["route", "attacks", f"changes the control by, {UNIT}", "there, m along"]
 
 
 def measure(world: World) -> list[dict[str, float]]:
@@ -99,3 +104,46 @@ def lines(places: Sequence[Mapping[str, Any]]) -> Iterator[Sequence[str]]:
             *(f"{mean[case]:.3f}" for case in CASES),
             f"{mean[ATTACK] - mean[RANDOM]:.3f}",
         )
+
+
+def largest_change(path: Path, period_m: float) -> dict[str, float]:
+    """Return by how much an attack changes the control at most, and where.
+
+    Its drives in the surrogate are set beside those past the objects as they are, from
+    the same starts, step by step, while the places of both are within `NEAR_M`.
+
+    Args:
+        path: ``steps.csv`` of its run folder.
+        period_m: metres driven in a control period.
+
+    Returns:
+        ``control`` and ``along_m``.
+    """
+    drives: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in csv.DictReader(files.read_text(path).splitlines()):
+        if row["environment"] == SURROGATE:
+            values = float(row["control"]), float(row["cross_track_m"])
+            drives.setdefault((row["case"], row["run"]), []).append(values)
+    found = []
+    for (case, run), rows in drives.items():
+        if case == ATTACK:
+            attacked, own = np.array(rows), np.array(drives[OWN, run])
+            controls, aside = np.abs(attacked - own).T
+            # the frame of a control was taken where the step before had ended
+            near = np.append(0, aside[:-1]) < NEAR_M
+            step = int(np.where(near, controls, -1).argmax())
+            found.append({"control": controls[step], "along_m": step * period_m})
+    return max(found, key=lambda change: change["control"])
+
+
+def changed_lines(places: Sequence[Mapping[str, Any]]) -> Iterator[Sequence[str]]:
+    """Yield a line a route of a table with `CHANGED`: least and most of its attacks."""
+    for route in dict.fromkeys(place["route"] for place in places):
+        own = [p["change"] for p in places if p["route"] == route and "change" in p]
+        if own:
+            controls = sorted(change["control"] for change in own)
+            along = sorted(change["along_m"] for change in own)
+            yield (
+                *(route, str(len(own)), f"{controls[0]:.2f} to {controls[-1]:.2f}"),
+                f"{along[0]:.1f} to {along[-1]:.1f}",
+            )

@@ -120,6 +120,25 @@ def test_a_line_has_means_the_most_and_the_least():
     assert line[8:] == ("0.100", "0.200", "0.600", "0.400")
 
 
+def test_the_largest_change_counts_while_both_drives_see_alike(tmp_path):
+    """The second step changes most; later the drives are apart."""
+    steps = {
+        "own": [(0.0, 0.0), (0.1, 0.0), (0.0, 0.0), (0.0, 0.0)],
+        "attack": [(0.2, 0.1), (-0.5, 0.3), (1.5, 0.6), (1.0, 0.9)],
+    }
+    lines = ["environment,case,run,control,cross_track_m"]
+    for case, rows in steps.items():
+        lines += [f"surrogate,{case},0,{control},{aside}" for control, aside in rows]
+        lines += [f"deployment,{case},0,{9 * (case == 'own')},0"]
+    (tmp_path / "steps.csv").write_text("\n".join(lines))
+    change = steering.largest_change(tmp_path / "steps.csv", 0.5)
+    assert change == pytest.approx({"control": 0.6, "along_m": 0.5})
+    places = [{"route": "left", "change": change}, {"route": "right"}]
+    places.append({"route": "left", "change": {"control": 1.0, "along_m": 4.0}})
+    [line] = steering.changed_lines(places)
+    assert line == ("left", "2", "0.60 to 1.00", "0.5 to 4.0")
+
+
 @pytest.fixture
 def one_place(tmp_path):
     """Give the table of one place of Table 2."""
