@@ -105,9 +105,11 @@ class BenchQuality:
         return tomlkit.dumps(grid | {"seeds": list(self.seeds), "methods": methods})
 
     def _cells(self, grid: Path, sweep: Path) -> list[Path]:
+        from mi_nerfattack import variant
         from mi_nerfattack.experiment.sweep.cell import folder_of
         from mi_nerfattack.experiment.sweep.grid import load_cells
 
+        variant.ensure()  # places are drawn in the scene
         return [folder_of(sweep, cell) for cell in load_cells(grid)]
 
     def _check(self, folder: Path) -> int:
