@@ -33,11 +33,13 @@ def commands(monkeypatch) -> list[list[str]]:
 
 
 @pytest.mark.slow
-def test_table_2_is_attacked_in_every_field(commands, tmp_path):
-    folder = tmp_path / "quality"
+def test_table_2_is_attacked_in_every_field(commands, tmp_path, monkeypatch):
+    folder, set_by = tmp_path / "quality", []
+    monkeypatch.setattr("mi_nerfattack.variant.ensure", lambda: set_by.append(1))
     words = ["quality", str(folder), "--steps", "120", "600", "--seeds", "1"]
     assert main([*words, "--workers", "1"]) == 0
     assert [c[0] for c in commands] == ["capture", "fit", "fit", "sweep", "transfer"]
+    assert set_by  # the command runs without one, other than this test
     capture, fit, _, sweep, transfer = commands
     assert Path(capture[1]).is_file() and capture[capture.index("-o") + 1] == fit[1]
     assert fit[fit.index("--steps") + 1] == "120" and "--step-m" in fit
