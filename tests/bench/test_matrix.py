@@ -15,6 +15,8 @@ from mi_nerfattack.commands.transfer import Transfer
 from mi_nerfattack.experiment.sweep.table import write_table
 from mi_nerfattack.experiment.transfer.columns import make_columns
 from mi_nerfattack.io import files
+from mi_nerfattack.report.plots import transfer as plots
+from mi_nerfattack.report.plots.transfer import plot_transfer
 
 FOUND = "mi_nerfattack.experiment.transfer.found"
 ROW = "surrogate:attack:0"
@@ -113,6 +115,7 @@ def given(tmp_path, monkeypatch):
     commands = Commands(tmp_path / "drives" / "remade" / "0" / "cells")
     monkeypatch.setattr("bench.commands.quality.run_command", commands)
     monkeypatch.setattr(f"{FOUND}.read_found", found_of)
+    monkeypatch.setattr(f"{plots.__name__}.plot_transfer", lambda path, _: path.touch())
     monkeypatch.setattr(matrix.best_attacks, "__defaults__", (2,))
     return commands
 
@@ -148,6 +151,7 @@ def test_the_command_chooses_drives_and_writes(tmp_path, given):
     assert len(table) == 99 * 2 * 2
     assert (tmp_path / "drives" / "matrix.png").exists()
     again = matrix.document_of(table, ["c8", "c7"])
+    plot_transfer(tmp_path / "matrix.png", again)
     assert again["conditions"] == list(Transfer.conditions)
 
 
