@@ -59,13 +59,13 @@ class BenchMatrix:
         if document.exists():  # of an interrupted pass
             self._add(table_rows(files.read_json(document), self._settings), chosen)
         for conditions in passes():
-            columns = columns_of(conditions)
-            names = left(self._rows(), chosen, columns)
+            columns, rows = columns_of(conditions), self._rows()
+            names = left(rows, chosen, columns)
             if not names:
                 continue
             folders = self._made([chosen[name] for name in names])
             found = {item.label: item.digest for item in read_found(folders)}
-            check_same(self._rows(), found, self._table)
+            check_same(rows, found, self._table)
             environments = list(dict.fromkeys(name for name, _ in columns))
             self._drive(folders, environments, conditions)
             self._add(table_rows(files.read_json(document), self._settings), chosen)

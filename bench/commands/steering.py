@@ -58,10 +58,11 @@ class BenchSteering:
         for cell in read_replay(self.folder, every).cells:
             world = build_world(cell.scenario, cell.scenario.policy.build())
             place = {"route": cell.route, "seed": cell.seed, "looks": measure(world)}
-            steps = folder_of(self.cells or Path(), cell) / "steps.csv"
-            if self.cells is not None and steps.exists():
-                period_m = world.route.speed_ms * world.place.period
-                place["change"] = largest_change(steps, period_m)
+            if self.cells is not None:
+                steps = folder_of(self.cells, cell) / "steps.csv"
+                if steps.exists():
+                    period_m = world.route.speed_ms * world.place.period
+                    place["change"] = largest_change(steps, period_m)
             places.append(place | errors(rows, cell.id))
         parts = [section("Steering", "", HEADER, lines(places))]
         if self.cells is not None:
