@@ -45,7 +45,7 @@ environment and under every condition of [`transfer`](../transfer.md). Best are,
 route, the {of_route} with the largest mean error in the surrogate from starts that no
 search had seen; of a method at a place the better one alone. Number, environments,
 conditions, starts ({starts}) and samples a pixel were settled before the first drive.
-{whole} of {total} columns are driven to their end; the others are not on this page.
+{whole} of {total} columns are driven to their end; the page shows these alone.
 
 Figures are mean distances from the lane's centre, metres: mean ± standard deviation
 over attacks [95 % interval, BCa] (attacks); then how many of them have a wheel out of
