@@ -22,6 +22,7 @@ from mi_nerfattack.backend import llvm
 from mi_nerfattack.errors import NerfAttackError
 from mi_nerfattack.io import files
 from mi_nerfattack.system.cores import cores
+from mi_nerfattack.system.extras import install_hint
 from mi_nerfattack.system.processes import module_command
 
 DISTRIBUTION = "mi-nerfattack"
@@ -109,7 +110,7 @@ def _packages() -> Iterator[Finding]:
             yield _package(item, "missing", f"run \"pip install '{_spec(item)}'\"")
     extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
     for extra in extras:
-        remedy = f"for {extra}, run \"pip install '{DISTRIBUTION}[{extra}]'\""
+        remedy = f"for {extra}, {install_hint(extra)}"
         for item in needed:
             if item.name != DISTRIBUTION and _belongs(item, extra):
                 yield _package(item, "absent", remedy)

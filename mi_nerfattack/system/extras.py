@@ -8,6 +8,11 @@ from typing import Any
 from mi_nerfattack.errors import SetupError
 
 
+def install_hint(extra: str) -> str:
+    """Return what installs an extra of this package, for the end of a message."""
+    return f"in the checkout of mi-nerfattack, run: pip install '.[{extra}]'"
+
+
 def load_extra(module: str, extra: str, purpose: str) -> Any:
     """Import a package that an extra of ours installs.
 
@@ -24,5 +29,5 @@ def load_extra(module: str, extra: str, purpose: str) -> Any:
     except ImportError as err:
         raise SetupError(
             f"{purpose} needs {module.partition('.')[0]}, which cannot be imported "
-            f"({err}): pip install 'mi-nerfattack[{extra}]'"
+            f"({err}); {install_hint(extra)}"
         ) from err

@@ -17,6 +17,7 @@ from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.deploy.carla.conventions import CarlaPose
 from mi_nerfattack.errors import InputError, NerfAttackError
 from mi_nerfattack.ranges import Name, Seconds, checked
+from mi_nerfattack.system.extras import install_hint
 
 _SUBSTEP = 0.01  # seconds of the physics
 _MAX_SUBSTEPS = 16  # CARLA's own limit
@@ -70,8 +71,8 @@ def load_client() -> Any:
     except ImportError as error:
         raise InputError(
             f"environment 'carla': its client cannot be imported ({error}); "
-            "pip install 'mi-nerfattack[carla]' (0.9.16 has wheels for Python 3.10 to "
-            "3.12 on Linux and Windows, x86-64)"
+            f"{install_hint('carla')} (0.9.16 has wheels for Python 3.10 to 3.12 on "
+            "Linux and Windows, x86-64)"
         ) from error
 
 

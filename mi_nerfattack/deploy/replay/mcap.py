@@ -45,6 +45,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.strict_json import parse_json
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, camera_to_body
+from mi_nerfattack.system.extras import install_hint
 
 MAX_LOG_BYTES = 1 << 32
 MAX_CHUNK_BYTES = 1 << 30
@@ -181,8 +182,7 @@ def _read_messages(
         from mcap.exceptions import McapError
     except ImportError as error:
         raise InputError(
-            f"{path}: MCAP logs need the package mcap ({error}); "
-            "pip install 'mi-nerfattack[mcap]'"
+            f"{path}: MCAP logs need the package mcap ({error}); {install_hint('mcap')}"
         ) from error
     raw, remarks = _ended(files.read_bytes(path, MAX_LOG_BYTES))
     found: dict[str, list[dict[str, Any]]] = {topic: [] for topic in schemas}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from mi_nerfattack.capture.photographs.markers import (
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, from_fov, look_at
+from mi_nerfattack.system.extras import install_hint
 
 cv2 = pytest.importorskip("cv2")
 
@@ -169,7 +171,7 @@ class TestRefused:
 
     def test_without_opencv(self, lying, monkeypatch):
         monkeypatch.setitem(sys.modules, "cv2", None)
-        with pytest.raises(SetupError, match=r"mi-nerfattack\[markers\]"):
+        with pytest.raises(SetupError, match=re.escape(install_hint("markers"))):
             align(lying[1], lying[0], Markers(EDGE_M, FAMILY))
 
     @pytest.mark.parametrize(

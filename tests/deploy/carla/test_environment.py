@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import re
 import sys
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from mi_nerfattack.render.camera.intrinsics import (
 )
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.system.extras import install_hint
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -327,7 +329,7 @@ def test_server_addresses():
 
 def test_the_client_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(InputError, match=r"pip install 'mi-nerfattack\[carla\]'"):
+    with pytest.raises(InputError, match=re.escape(install_hint("carla"))):
         load_client()
 
 

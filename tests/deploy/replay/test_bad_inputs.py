@@ -30,6 +30,7 @@ from mi_nerfattack.deploy.replay.environment import open_recording
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
 from mi_nerfattack.io.video import write_video
+from mi_nerfattack.system.extras import install_hint
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -352,4 +353,4 @@ def test_mcap_is_not_installed(tmp_path, monkeypatch):
     for name in list(sys.modules):
         if name.split(".")[0] == "mcap":
             monkeypatch.setitem(sys.modules, name, None)
-    refused(r"pip install 'mi-nerfattack\[mcap\]'", path)
+    refused(re.escape(install_hint("mcap")), path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import socket
@@ -35,6 +36,7 @@ from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_
 from mi_nerfattack.render.camera.outside import seen_at
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.rollout.offset import offset_pose
+from mi_nerfattack.system.extras import install_hint
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -279,7 +281,7 @@ def test_a_place_that_is_not_here():
 
 def test_without_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(SetupError, match=r"mi-nerfattack\[view\]"):
+    with pytest.raises(SetupError, match=re.escape(install_hint("view"))):
         with serving("127.0.0.1", 0):
             pass
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import mitsuba as mi
@@ -12,6 +13,7 @@ import torch
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.policy.goals import OneHotGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.system.extras import install_hint
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
 pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
@@ -127,7 +129,8 @@ def test_wrong_inputs_are_named(rng):
 
 def test_without_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(SetupError, match=r"net.onnx.*pip install .mi-nerfattack\[onnx"):
+    hint = re.escape(install_hint("onnx"))
+    with pytest.raises(SetupError, match=f"net.onnx.*{hint}"):
         load_onnx(tmp_path / "net.onnx")
 
 

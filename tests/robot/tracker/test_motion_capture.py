@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import time
@@ -14,6 +15,7 @@ from helpers.waiting import wait_for
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.robot.devices import DeviceLostError
 from mi_nerfattack.robot.tracker.motion_capture import MotionCaptureTracker
+from mi_nerfattack.system.extras import install_hint
 
 STAND_IN = """
 import ctypes, os, time
@@ -135,5 +137,5 @@ def test_a_missing_package_and_no_time_are_refused(stand_in, monkeypatch):
     with pytest.raises(InputError, match="timeout_s: 0"):
         MotionCaptureTracker("vicon", "live", timeout_s=0)
     monkeypatch.setitem(sys.modules, "motioncapture", None)
-    with pytest.raises(SetupError, match=r"mi-nerfattack\[motion-capture\]"):
+    with pytest.raises(SetupError, match=re.escape(install_hint("motion-capture"))):
         MotionCaptureTracker("vicon", "live")
