@@ -9,6 +9,7 @@ from bench.commands.experts import BenchExperts
 from bench.commands.gaps import BenchGaps
 from bench.commands.gpu import BenchFrames, BenchGpu
 from bench.commands.imports import BenchImports
+from bench.commands.loop import BenchLoop
 from bench.commands.matrix import BenchMatrix
 from bench.commands.memory import BenchMemory
 from bench.commands.methods import BenchMethods
@@ -36,6 +37,7 @@ COMMANDS = {
     "fit": BenchFit,
     "attack": BenchAttack,
     "memory": BenchMemory,
+    "loop": BenchLoop,
     "soak": BenchSoak,
     "scaling": BenchScaling,
     "composite": BenchComposite,

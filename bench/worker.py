@@ -13,12 +13,15 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.attack.sides import AbstractAttack
 from bench.full_ngp import NGPData
 from bench.render.sides import AbstractSide, AbstractTrainer
 from mi_nerfattack import variant
+
+if TYPE_CHECKING:
+    from bench.loop.ways import AbstractLoop
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -26,7 +29,8 @@ def main(arguments: Sequence[str]) -> None:
 
     Args:
         arguments: ``fit`` and what :func:`make_trainer` takes; ``attack`` and what
-            :func:`make_attack` takes; or role, width, height,
+            :func:`make_attack` takes; ``loop`` and what :func:`make_loop` takes; or
+            role, width, height,
             and what the role needs: the field's file (``ours``, ``plain``,
             ``tuned``), samples per ray (``slab``), nothing (``object``); then, for the
             peers, sizes of chunks.
@@ -36,6 +40,8 @@ def main(arguments: Sequence[str]) -> None:
         side = make_trainer(*arguments[1:])
     elif arguments[0] == "attack":
         side = make_attack(*arguments[1:])
+    elif arguments[0] == "loop":
+        side = make_loop(*arguments[1:])
     else:
         role, width, height, *rest = arguments
         side = make_side(role, int(width), int(height), rest)
@@ -116,6 +122,25 @@ def make_attack(role: str, *rest: str) -> AbstractAttack:
     from bench.attack.ours import OurAttack
 
     return OurAttack(job, *map(Path, others))
+
+
+def make_loop(way: str, policy: str, width: str, height: str) -> AbstractLoop:
+    """Make a side of `bench loop`.
+
+    Args:
+        way: ``replay``, ``kept_backgrounds`` or ``plain``.
+        policy: ``torch`` or ``drjit``, the library of the policy.
+        width: of the image, pixels.
+        height: of the image, pixels.
+    """
+    variant.ensure()
+    from bench.loop.ways import PlainLoop, RolloutLoop
+    from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
+
+    if way == "plain":
+        return PlainLoop(policy, int(width), int(height))
+    adjoint = Replay() if way == "replay" else KeptBackgrounds()
+    return RolloutLoop(adjoint, policy, int(width), int(height))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,1 @@
+"""`bench loop`: a closed-loop gradient, beside a loop over `mi.render`."""
