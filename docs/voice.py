@@ -1,0 +1,225 @@
+"""List the sentences, phrases and lines of a page that break the plain voice.
+
+    python docs/voice.py docs/install.md README.md
+
+Each finding is printed with its page and line. The rules: a sentence has at most 35
+words, a line at most 100 characters, no phrase is one of PHRASES, and only pages of
+results name a machine. Tables may have long lines and sentences; code may have the
+phrases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
+
+ROOT = Path(__file__).resolve().parents[1]
+MAX_WORDS = 35
+MAX_CHARACTERS = 100
+CODE = "`x`"  # one word instead of a code span or of mathematics
+
+# Pattern -> what to write. A space matches a line break too. A pattern with a group
+# finds only the matches of the group: its other branch is the good use.
+_MOVES = r"driv(?:es?|en|ing)|drove|go(?:es|ing)?|went|mov(?:es?|ed|ing)|steer(?:s|ed)?"
+PHRASES = {
+    r"\b(?:told|tells)\b": "report, print, say, show; or name who learns it and how",
+    r"\bin place of\b": "instead of",
+    r"\bbeside\b": "next to (a place), compared with (a number)",
+    r"\bpass(?:es|ed|ing)? back\b": "backward pass",
+    r"\bat hand\b": "available",
+    r"\blikewise\b": "also, in the same way; in a table: repeat the cell",
+    r"\bwhatever (?:it|they|that|this) gives?\b": "say which values it may give",
+    r"\banew\b": "again",
+    # "one row per drive"; not "a road between two walls"
+    r"\b(?:a|one) (?:row|column|page|plot|number|bit|cost) an? \w+": "one ... per ...",
+    r"\bone (?:drive|frame|ray|tick|process|concept|image) an? \w+": "one ... per ...",
+    # "drives past one car and past another" is plain; "the error past a car" is not
+    rf"\b(?:{_MOVES})(?:[:,]|(?: [^\s,:]+){{0,3}}?) past\b"
+    r"(?:[^.;]*? (?:and|or) past\b)*"
+    r"|\bin the past\b|\bpast (?:the|an|its) end\b|\b(past)\b": (
+        "after, with; or say what drives past"
+    ),
+    # The noun: "random looks". The verb is plain: "each looks at the road".
+    r"\b(?:random|these|those|the|of|over|own|best|each|every|no|a|one|new|starts,)"
+    r" looks?\b(?! (?:at|like|for|from|up|down|through|across|along|into)\b)": (
+        "texture, appearance"
+    ),
+    # "each object has its own texture" is plain; "with their own textures" is not
+    r"\b(?:has|have|gets?|keeps?|needs?|gives?) \w+ own\b|\byour own\b"
+    r"|\b(own (?:textures?|colou?rs?|looks?))\b": "original texture",
+    # An object stands on the pavement; a word does not stand for another.
+    r"\bst(?:ands?|anding|ood) (?:for|in for|there|here|first|above|below)\b"
+    r"|\bst(?:ands?|anding|ood) in `x`": "mean, represent, replace, be",
+    r"\bst(?:ands?|anding|ood) (?:at the (?:top|end|bottom|start|beginning)"
+    r"|in the (?:list|table|file|page|scenario|section|glossary|report))\b": "be, find",
+    r"\bas (?:it|they) stands?\b": "unchanged, exactly as written",
+}
+_PHRASES = {re.compile(p.replace(" ", r"\s+"), re.I): new for p, new in PHRASES.items()}
+
+_MACHINES = re.compile(
+    r"\b(?:AMD|EPYC|Xeon|Ryzen|Threadripper|Intel Core|Core i\d|Graviton|Apple M\d"
+    r"|[AHV][12]00|RTX \w+|GTX \w+|Tesla [A-Z]\d+)\b"
+)
+_RESULTS = ("docs/bench.md", "docs/table2/", "docs/methods/", "docs/matrix/")
+
+_SENTENCE_END = re.compile(r"(?<!\.\.)[.!?][)\]\"'”’*]*\s+")
+_ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|cf|vs|approx|et al|Fig|Eq|Sec)\.\s+$")
+_MATHEMATICS = re.compile(r"\$\$.+?\$\$|\$[^$\n]+\$", re.S)
+_ADDRESS = r"https?://\S+|<https?://\S+>|\[[^\]]+\]:\s+\S+"
+_ONLY_A_LINK = re.compile(
+    rf"\s*(?:[-*] )?(?:{_ADDRESS}|!?\[[^\]]*\]\(\S+\)|\[!\[.*\]\(\S+\)"
+    r"|<(?:img|a|source) [^>]*>)[.,;:]?\s*$"
+)
+
+
+@dataclass(frozen=True, order=True)
+class Finding:
+    """What breaks the voice: kind is "sentence", "phrase", "line" or "machine"."""
+
+    line: int
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Passage:
+    """A paragraph, heading, item or cell as plain text, and the line that it begins."""
+
+    line: int
+    text: str
+    in_table: bool
+
+
+def findings(markdown: str, results: bool = False) -> list[Finding]:
+    """Find all that breaks the voice in a page; results may name machines."""
+    tokens = MarkdownIt().enable("table").parse(markdown)
+    found: list[Finding] = []
+    for passage in passages(tokens):
+        found += _phrases(passage)
+        if not passage.in_table:
+            found += _long_sentences(passage)
+    found += _long_lines(markdown, tokens)
+    if not results:
+        found += _machines(markdown)
+    return sorted(found)
+
+
+def passages(tokens: Sequence[Token]) -> Iterator[Passage]:
+    """Take the text out of parsed Markdown: no code, one word for each formula."""
+    in_table = False
+    for token in tokens:
+        if token.type in ("table_open", "table_close"):
+            in_table = token.type == "table_open"
+        if token.map is None:
+            continue
+        line = token.map[0] + 1
+        if token.type == "inline":
+            children = token.children or []
+            text = "".join(map(_plain, children))
+            yield Passage(line, _MATHEMATICS.sub(CODE, text), in_table)
+            for image in children:
+                if image.type == "image":
+                    yield Passage(line, image.content, in_table)
+        elif token.type == "html_block":
+            text = re.sub(r"<!--.*?-->|<[^>]+>", _blank, token.content, flags=re.S)
+            yield Passage(line, text, in_table or "<td" in token.content)
+
+
+def sentences(text: str) -> Iterator[tuple[int, str]]:
+    """Split a passage into sentences, each with its offset."""
+    begin = 0
+    for end in _SENTENCE_END.finditer(text):
+        if not _ABBREVIATION.search(text[begin : end.end()]):
+            yield begin, text[begin : end.end()].strip()
+            begin = end.end()
+    if text[begin:].strip():
+        yield begin, text[begin:].strip()
+
+
+def _plain(token: Token) -> str:
+    if token.type in ("softbreak", "hardbreak"):
+        return "\n"
+    if token.type == "code_inline":
+        return CODE
+    return (
+        token.content if token.type == "text" else " " * (token.type == "html_inline")
+    )
+
+
+def _blank(match: re.Match[str]) -> str:
+    return "\n" * match[0].count("\n")
+
+
+def _line(passage: Passage, offset: int) -> int:
+    return passage.line + passage.text.count("\n", 0, offset)
+
+
+def _long_sentences(passage: Passage) -> Iterator[Finding]:
+    for offset, sentence in sentences(passage.text):
+        words = [word for word in sentence.split() if re.search(r"\w", word)]
+        if len(words) > MAX_WORDS:
+            text = f"{len(words)} words: {' '.join(words[:8])} ..."
+            yield Finding(_line(passage, offset), "sentence", text)
+
+
+def _phrases(passage: Passage) -> Iterator[Finding]:
+    for pattern, instead in _PHRASES.items():
+        for match in pattern.finditer(passage.text):
+            group = pattern.groups  # 0, the whole match, where there is no group
+            if match[group] is not None:
+                words = " ".join(match[group].split())
+                line = _line(passage, match.start(group))
+                yield Finding(line, "phrase", f'"{words}": {instead}')
+
+
+def _long_lines(markdown: str, tokens: Sequence[Token]) -> Iterator[Finding]:
+    tables: set[int] = set()
+    for token in tokens:
+        if token.type == "table_open" and token.map is not None:
+            tables.update(range(*token.map))
+    for index, line in enumerate(markdown.split("\n")):
+        exempt = index in tables or _ONLY_A_LINK.match(line)
+        if len(line) > MAX_CHARACTERS and not exempt:
+            yield Finding(index + 1, "line", f"{len(line)} characters")
+
+
+def _machines(markdown: str) -> Iterator[Finding]:
+    for number, line in enumerate(markdown.split("\n"), 1):
+        if match := _MACHINES.search(line):
+            yield Finding(number, "machine", f'"{match[0]}": a rounded number, a link')
+
+
+def pages() -> dict[str, Path]:
+    """Find the pages of the repository, by their names in it."""
+    paths = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
+    return {path.relative_to(ROOT).as_posix(): path for path in sorted(paths)}
+
+
+def findings_in(name: str, path: Path) -> list[Finding]:
+    """Find what breaks the voice in a file; its name decides if it shows results."""
+    return findings(path.read_text("utf-8"), results=name.startswith(_RESULTS))
+
+
+def main() -> int:
+    """List the findings of the pages that are named, of all without a name."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("pages", nargs="*", help="all without one")
+    named = {name: Path(name) for name in parser.parse_args().pages}
+    lines = [
+        f"{name}:{found.line}: {found.kind}: {found.text}"
+        for name, path in (named or pages()).items()
+        for found in findings_in(name, path)
+    ]
+    print("\n".join(lines) or "no findings")
+    return int(bool(lines))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
