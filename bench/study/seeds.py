@@ -1,4 +1,4 @@
-"""The demo with three seeds: of its rays, its starts, its random textures."""
+"""The base scenario with three seeds: of its rays, its starts, its random textures."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def keys() -> list[rows.Row]:
 
 
 def attack_row(key: rows.Key) -> rows.Row:
-    """Run the demo."""
+    """Attack by the base scenario of the studies."""
     return jobs.run(lambda folder: write(folder, key["seed"]))
 
 
 def write(folder: Path, seed: int) -> Path:
-    """Write the demo's scenario with another seed, and return the file."""
-    text = files.read_text(bundled("demo.toml"))
-    path = folder / "demo.toml"
+    """Write the base scenario with another seed, and return the file."""
+    text = files.read_text(bundled("base.toml"))
+    path = folder / "base.toml"
     path.write_text(re.sub(r"(?m)^seed = \d+$", f"seed = {seed}", text), "utf-8")
     return path
 

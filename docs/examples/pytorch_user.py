@@ -25,7 +25,7 @@ class Damped(nn.Module):
         return control, control  # rad/s to the left, and the next hidden state
 
 
-described, _ = scenario.load_scenario(scenes.bundled("demo.toml"))
+described, _ = scenario.load_scenario(scenes.bundled("base.toml"))
 mine = policy.TorchPolicy(Damped(), IntegerGoal(3), recurrent=[(-1, 1)])
 world = scenario.build_world(described, mine)
 drives = rollout.Rollout(

@@ -25,7 +25,7 @@ HEADING = np.array([0.0, 0.0, 1.0])
 @pytest.fixture
 def world(variant: str) -> World:
     """The bundled scenario, with samples in the middle of their intervals."""
-    scenario, _ = load_scenario(bundled("demo.toml"))
+    scenario, _ = load_scenario(bundled("base.toml"))
     attack = scenario.attack.model_copy(update={"jitter": False, "attached": True})
     scenario = scenario.model_copy(update={"attack": attack})
     return build_world(scenario, scenario.policy.build())
