@@ -10,11 +10,12 @@ TORCH := torch==2.13.0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all test-fuzz test-random lint docs dist bench-gpu check-python clean
+.PHONY: help demo test test-fast test-slow test-all test-fuzz test-random lint docs dist bench-gpu check-python clean
 
 help:
 	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
 	@echo "make test         run the tests, at most 8 minutes; less with compiled kernels"
+	@echo "make test-fast    run the quickest tests of every folder, at most 90 seconds"
 	@echo "make test-all     the slow ones too, at most 40 minutes"
 	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
 	@echo "make test-random  formats and geometry on other examples each time"
@@ -29,6 +30,10 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-test
 	$(PYTEST) -m "not slow"
+
+# The list names files and tests, which pytest collects without reading other files.
+test-fast: $(VENV)/.installed-test
+	$(PYTEST) -m "not slow" $$(cat tests/fast.txt)
 
 test-slow: $(VENV)/.installed-test
 	$(PYTEST) -m slow
@@ -51,7 +56,6 @@ lint: $(VENV)/.installed-dev
 
 # Nothing is fetched; a warning, a dead link inside among them, is an error.
 docs: $(VENV)/.installed-dev
-	$(VENV)/bin/python docs/pictures.py
 	$(VENV)/bin/sphinx-build -W -n --keep-going -q -E -a docs build/docs
 
 # The wheel comes of the sdist, holds what one of the tree holds, and works by itself.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,7 +13,6 @@ from sphinx.application import Sphinx
 from mi_nerfattack import ranges
 
 sys.path.append(str(Path(__file__).parent / "extensions"))
-import plugin_reference  # noqa: E402  lies in the folder above
 
 project = "mi-nerfattack"
 copyright = "The mi-nerfattack authors"
@@ -20,13 +21,10 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx_tabs.tabs",
     "mathml",
-    "plugin_reference",
     "signatures",
 ]
-rst_prolog = plugin_reference.PROLOG
-exclude_patterns = ["extensions", "examples"]
+exclude_patterns = ["extensions", "examples", "pictures"]
 # Nothing is fetched, neither while the site is built nor while it is read.
 html_math_renderer = "mathml"
 
@@ -54,12 +52,36 @@ html_css_files = ["site.css"]
 highlight_language = "none"
 
 
-def _name_pages_of_the_site(app: Sphinx, page: str, text: list[str]) -> None:
-    """Point links at files beside what they describe to the site's page of them."""
-    del app, page
-    text[0] = text[0].replace("(../scenes/policy/pilotnet.md)", "(pilotnet.md)")
+# Pages whose lists of links are the table of contents.
+CONTENTS = ("index", "tutorials/index")
+# The site shows these files as pages; in the repository a page links to each.
+CARDS = {
+    "pilotnet": "../scenes/policy/pilotnet.md",
+    "room_policy": "../scenes/room/policy.md",
+}
+
+
+def _for_the_site(app: Sphinx, page: str, text: list[str]) -> None:
+    """Turn a page that reads well in the repository into a page of the site."""
+    del app
+    if page in CARDS:
+        text[0] = f"```{{include}} {CARDS[page]}\n:relative-images:\n```\n"
+    for name, card in CARDS.items():
+        text[0] = text[0].replace(f"({card})", f"({name}.md)")
+    if page in CONTENTS:
+        text[0] += "".join(_toctrees(text[0]))
+
+
+def _toctrees(text: str) -> Iterator[str]:
+    """Make a hidden toctree of each section's list of links to pages."""
+    for section in re.split(r"^##+ ", text, flags=re.MULTILINE)[1:]:
+        caption = section.partition("\n")[0]
+        names = re.findall(r"^- \[[^]]*\]\(([\w/]+)\.\w+\)", section, re.MULTILINE)
+        if names:
+            options = f":caption: {caption}\n:hidden:\n\n"
+            yield f"\n```{{toctree}}\n{options}" + "\n".join(names) + "\n```\n"
 
 
 def setup(app: Sphinx) -> None:
     """Connect what the settings cannot say."""
-    app.connect("source-read", _name_pages_of_the_site)
+    app.connect("source-read", _for_the_site)

@@ -85,14 +85,13 @@ class FieldEmitter(mi.Emitter):
                 },
             }
 
-    Next-event estimation and multiple importance sampling are those of the stock
-    ``area`` emitter: points are sampled on the shape by area, so a small bright field
-    in a large shape lights surfaces without bias, but with noise.
+    Next-event estimation and multiple importance sampling work as in the stock
+    ``area`` emitter: it samples points on the shape by area. So a small bright field in
+    a large shape lights surfaces without bias, but with noise.
 
     Differentiable in forward and backward mode with respect to the fields' parameters
-    under stock integrators (``path``, ``direct``, ``prb``; Mitsuba 3.9's ``prb`` fails
-    in forward mode with any emitter in spectral variants), not with respect to rays
-    and the shape.
+    under ``path``, ``direct`` and ``prb``, but not with respect to rays and the shape.
+    Mitsuba 3.9's ``prb`` fails in forward mode with any emitter in spectral variants.
 
     Excluded, so fields are missing there or too bright:
 

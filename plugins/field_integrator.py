@@ -68,13 +68,15 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
        - Read by Mitsuba's own base classes, and without effect here: those of the
          nested integrator count
 
-    Every camera ray is marched through the nested fields up to the nearest surface
-    of the scene, and lies over what a nested integrator sees behind, or over the
-    background of the first field that has one: ``L = I + (1 - a) L_b``. The composite
-    is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum sigma_k L_k /
-    sigma``) or ``depth`` (each field alone, folded front to back by expected depth,
-    ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do not overlap.
-    A ``splat_background`` is a layer of ``depth`` alone, and takes no derivatives.
+    The integrator marches every camera ray through the nested fields up to the nearest
+    surface of the scene: ``L = I + (1 - a) L_b``. Behind the fields, the ray shows what
+    a nested integrator sees, or the background of the first field that has one.
+
+    The composite is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum
+    sigma_k L_k / sigma``) or ``depth`` (each field alone, folded front to back by
+    expected depth, ``I = I_f + (1 - a_f) I_b``, A.4 to A.6); they agree where fields do
+    not overlap. A ``splat_background`` is a layer of ``depth`` alone, and takes no
+    derivatives.
 
     AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
     ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of the field's
@@ -102,11 +104,11 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
                 "object": {"type": "grid_field", "filename": "hydrant.safetensors"},
             }
 
-    Volumes with ``relit`` true are inserted objects, lit by the scene's emitters: their
-    radiance counts as the reflectance of a diffuse surface, ``L = radiance E / pi``, at
-    their expected depth; all else, fields and surfaces, is darkened where they shadow
-    it. See ``render.lighting.relight`` for what this leaves out. Costs several
-    marches a field.
+    Volumes with ``relit`` true are inserted objects, which the scene's emitters light.
+    Their radiance is the reflectance of a diffuse surface at their expected depth:
+    ``L = radiance E / pi``. They throw shadows on all other fields and surfaces. See
+    ``render.lighting.relight`` for what this leaves out. It costs several marches per
+    field.
 
     Differentiable in primal, forward and backward mode with respect to the fields'
     parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces, and

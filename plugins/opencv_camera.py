@@ -96,9 +96,8 @@ class OpencvCamera(mi.Sensor):
         y' = y (1 + k_1 r^2 + k_2 r^4) + p_1 (r^2 + 2 y^2) + 2 p_2 x y.
 
     Rays follow from eight Newton steps. Pixels count from the top-left corner of the
-    full film, so that the centre of the first pixel is (0.5, 0.5), as in COLMAP; to a
-    principal point found with OpenCV, which counts from the centre of the first pixel,
-    add 0.5.
+    full film, so the centre of the first pixel is (0.5, 0.5), as in COLMAP. OpenCV
+    counts from the centre of the first pixel: add 0.5 to its principal point.
 
     Other values need no other kernel, unless the first distortion coefficient becomes
     other than zero.

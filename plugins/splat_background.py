@@ -33,11 +33,12 @@ class SplatBackgroundVolume(mi.Volume):
          to world. (Default: identity)
 
     The scene that a 3D Gaussian splatting trainer wrote, seen by ``field_integrator``
-    behind, between and in front of fields, by depth. Splats are intersected through
-    Mitsuba's ``ellipsoids``, with the kernel of ``volprim_rf_basic``, and laid over
-    each other by the distance of their peaks: ``I = sum_i c_i a_i prod_{j<i} (1 -
-    a_j)``, ``a_i = min(opacity_i exp(-m_i^2 / 2), 0.9999)``, m_i the least distance of
-    the ray from the centre in standard deviations, at most 3. See ``render.splats``.
+    behind, between and in front of fields, by depth. Rays meet splats through Mitsuba's
+    ``ellipsoids``, with the kernel of ``volprim_rf_basic``. The distance of their peaks
+    orders the splats: ``I = sum_i c_i a_i prod_{j<i} (1 - a_j)``. A splat's opacity is
+    ``a_i = min(opacity_i exp(-m_i^2 / 2), 0.9999)``. Here ``m_i`` is the least
+    distance of the ray from the centre in standard deviations, at most 3. See
+    ``render.splats``.
 
     .. tabs::
         .. code-tab:: xml
