@@ -87,9 +87,10 @@ def places_chart(rows: Sequence[dict[str, Any]]) -> Figure:
             marked = [row for row in driven if row["case"] == case]
             x = [places.index((row["route"], row["seed"])) for row in marked]
             y = [row["cross_track_mean_m"] for row in marked]
-            axis.scatter(x, y, 34, colour, marker, label=label, alpha=0.75)
+            style = {"s": 34, "color": colour, "marker": marker, "alpha": 0.75}
+            axis.scatter(x, y, label=label, **style)
         axis.axhline(LIMIT_M, color=GREY, linestyle="--", linewidth=1)
-        axis.text(-0.4, LIMIT_M * 1.08, "a wheel is off the lane", color=GREY, size=9.5)
+        axis.text(-0.4, LIMIT_M * 1.15, "a wheel is off the lane", color=GREY, size=9.5)
         for k in range(1, len(places)):
             if places[k][0] != places[k - 1][0]:
                 axis.axvline(k - 0.5, color="#cccccc", linewidth=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
+from mi_nerfattack.capture.mesh.surface import has_area
 from mi_nerfattack.capture.object_views import Placement
 from mi_nerfattack.deploy.built_in import built_in_shapes, make_built_in
 from mi_nerfattack.deploy.views.above import surrogate_above
@@ -60,7 +62,7 @@ def draw_drive(run: Path, folder: Path, small: bool) -> None:
         ground = surrogate_above(viewed.world.surrogate, overhead)
         grounds.append(Image.fromarray(ground))
     source, frames = FrameSource(viewed), []
-    for step in range(0, len(drives[0].controls) + 1, 20 if small else 2):
+    for step in range(0, len(drives[0].controls) + 1, 5 if small else 2):
         columns = []
         for drive, ground in zip(drives, grounds, strict=True):
             seen = Image.fromarray(source.see(drive, step))
@@ -96,7 +98,7 @@ def scene_of_drive(viewed: ViewedRun, drive: Drive) -> object:
     viewed.show(drive.case, {})
     items = [make_built_in(i.field, i.placed) for i in viewed.world.surrogate.objects]
     shapes = built_in_shapes(items)
-    car = Placement(longest_m=CAR_M[0]).mesh(CAR)
+    car = solid_car()
     for k, (x, y, theta) in enumerate(drive.states[10::12]):
         moved = car.transformed(1.0, np.array([AXLE_M, 0, 0]))
         moved = moved.turned(float(np.degrees(theta)))
@@ -107,6 +109,16 @@ def scene_of_drive(viewed: ViewedRun, drive: Drive) -> object:
     shapes["path"] = path["part_000"]
     file = viewed.world.scenario.scene.deployment.file
     return load_scene(file, shapes=shapes)
+
+
+def solid_car() -> TexturedMesh:
+    """Read the car without its triangles of no area, whose normals are not finite."""
+    car = Placement(longest_m=CAR_M[0]).mesh(CAR)
+    parts = (
+        replace(part, faces=part.faces[has_area(part.vertices[part.faces])])
+        for part in car.parts
+    )
+    return replace(car, parts=tuple(parts))
 
 
 def path_strip(drive: Drive, width_m: float = 0.25, z_m: float = 0.03) -> MeshPart:

@@ -7,14 +7,56 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
 
-from mi_nerfattack import plugins
+from mi_nerfattack import cli, plugins
+from mi_nerfattack.experiment.sweep.table import read_table
+from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.outside import seen_at
 
 DOCS = Path(__file__).parents[2] / "docs"
+sys.path.append(str(DOCS / "pictures"))
+import diagrams  # noqa: E402  lies in the folder above
+
+# A drive of 15 periods through the right turn of the demo, and two iterations.
+SCENARIO = """
+name = "small"
+
+[scene]
+field = "bundled:intersection/field.safetensors"
+deployment = "bundled:intersection/scene.xml"
+routes = "bundled:intersection/routes.json"
+route = "right"
+
+[[objects]]
+id = "hydrant"
+field = "bundled:hydrant/field.safetensors"
+position_m = [4.4, -10.5, 0.12]
+scale = 3.3
+
+[policy]
+file = "bundled:policy/pilotnet.safetensors"
+
+[drive]
+start_m = 14
+horizon = 15
+runs = 1
+
+[attack]
+max_iterations = 2
+adjoint = "kept_backgrounds"
+
+[baseline]
+textures = 1
+
+[deployment]
+spp = 1
+"""
 NAMES = [name for names in plugins._REGISTERED.values() for name in names]
+KINDS = (".jpg", ".png", ".svg", ".webp")
 PLUGINS = {f"plugin_{name}.jpg" for name in NAMES}
 # The gallery's first picture is one of the README's.
 GALLERY = set(
@@ -41,9 +83,9 @@ def assert_shows_something(image: np.ndarray) -> None:
     assert image[rows, columns].std() > 0.05
 
 
-def make(name: str, folder: Path) -> None:
-    command = [sys.executable, DOCS / "pictures/make.py", name]
-    words = ["--small", "--output", folder]
+def make(name: str, folder: Path, *words: object) -> None:
+    command = [sys.executable, DOCS / "pictures/make.py", name, *map(str, words)]
+    words = ["--small", "--output", str(folder)]
     done = subprocess.run([*command, *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -76,11 +118,93 @@ def test_pictures_of_the_gallery_are_made(tmp_path):
     assert red(before).mean() > 0.02 > red(after).mean()
 
 
-@pytest.mark.parametrize("name", sorted(PLUGINS | GALLERY))
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A finished attack at the place of the demo."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "scenario.toml").write_text(SCENARIO)
+    words = ["attack", folder / "scenario.toml", "-o", folder / "run", "--no-pictures"]
+    assert cli.main([str(word) for word in words]) == 0
+    return folder / "run"
+
+
+def colour_at(image: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The mean colour of 3 x 3 pixels."""
+    column, row = np.round(point).astype(int)
+    return image[row - 1 : row + 2, column - 1 : column + 2].mean((0, 1))
+
+
+@pytest.mark.slow
+def test_the_banner_shows_both_drives_and_the_object(run, tmp_path):
+    import run_pictures as pictures
+
+    make("banner", tmp_path, "--run", run)
+    image = read(tmp_path / "banner.jpg")
+    height, width = image.shape[:2]
+    panels = image[:, : (width - 8) // 2], image[:, (width + 8) // 2 :]
+    camera = from_fov(panels[0].shape[1], height, pictures.FOV_DEG)
+    pose = pictures.look_at(pictures.EYE_M, pictures.TARGET_M)
+    viewed = pictures.read_viewed(run)
+    for panel, case, channel in zip(panels, pictures.TITLES, (2, 0), strict=True):
+        drive = pictures.drive_of(viewed, "deployment", case)
+        place = np.append(drive.states[3, :2], 0.03)  # of the path, before the car
+        found = colour_at(panel, seen_at(camera, pose, place[None])[0])
+        assert found[channel] > 1.3 * found[2 - channel], f"{case}: {found}"
+    (hydrant,) = seen_at(camera, pose, np.array([[4.4, -10.5, 1.3]]))
+    original, attacked = (colour_at(panel, hydrant) for panel in panels)
+    assert original[0] > 1.5 * original[2], "the hydrant is red"
+    assert np.abs(original - attacked).max() > 0.1, "both have the same colours"
+
+
+@pytest.mark.slow
+def test_the_animation_shows_both_drives(run, tmp_path):
+    import run_pictures as pictures
+
+    make("drive", tmp_path, "--run", run)
+    with Image.open(tmp_path / "drive.webp") as animation:
+        assert animation.n_frames == 1 + 15 // 5
+        animation.seek(3)
+        image = np.asarray(animation.convert("RGB")).astype(float)
+    half = (image.shape[1] - 8) // 2
+    columns = image[:, :half], image[:, half + 8 :]
+    seen = [column[12:40] / 255 for column in columns]  # below the title
+    assert all(part.std() > 0.1 for part in seen), "the images of the policy"
+    for column, case in zip(columns, pictures.TITLES, strict=True):
+        below = column[half * 66 // 200 :]  # the place from above
+        away = np.abs(below - pictures.COLOURS[case]).max(-1)
+        assert (away < 40).mean() > 0.01, f"{case}: path and car"
+
+
+def test_the_loop_names_its_parts(tmp_path):
+    diagrams.draw_loop(tmp_path, small=True)
+    for path in (tmp_path / "loop.svg", DOCS / "pictures/loop.svg"):
+        text = path.read_text("utf-8")
+        for word in ("object", "render", "policy", "vehicle", "image", "gradient"):
+            assert f"{word}" in text
+
+
+def test_the_chart_has_a_mark_for_each_drive():
+    rows = read_table(diagrams.TABLE)
+    (axis,) = diagrams.places_chart(rows).axes
+    assert axis.get_yscale() == "log"
+    assert [line.get_ydata()[0] for line in axis.lines][0] == diagrams.LIMIT_M
+    for marks, case in zip(axis.collections, diagrams.CASES, strict=True):
+        x, y = np.array(marks.get_offsets()).T
+        expected = [
+            row["cross_track_mean_m"]
+            for row in rows
+            if (row["environment"], row["case"]) == ("deployment", case)
+        ]
+        assert y.tolist() == expected and len(y) >= 30
+        assert set(x.astype(int)) == set(range(15))
+
+
+@pytest.mark.parametrize("name", sorted(PLUGINS | GALLERY | {"banner.jpg"}))
 def test_committed_pictures_show_something(name):
     assert_shows_something(read(DOCS / "pictures" / name))
 
 
 def test_pictures_are_small():
-    sizes = [path.stat().st_size for path in (DOCS / "pictures").glob("*.jpg")]
-    assert sum(sizes) < 1.5e6
+    pictures = [p for p in (DOCS / "pictures").iterdir() if p.suffix in KINDS]
+    assert sum(path.stat().st_size for path in pictures) < 1.5e6

@@ -44,11 +44,14 @@ def test_the_demo_beats_random_textures_and_transfers(tmp_path):
     assert json.loads(done.stdout) == document
     harmless = ("not converged", "texture at its bounds")  # it has few iterations
     assert [f for f in document["flags"] if not f.startswith(harmless)] == []
+    routes = document["routes"]["right"]
     means = {
         (environment, case): figures["cross_track_mean_m"]
-        for environment, cases in document["routes"]["right"].items()
+        for environment, cases in routes.items()
         for case, figures in cases.items()
     }
     for environment, least in (("surrogate", 3.0), ("deployment", 2.0)):
         ratio = means[environment, "attack"] / means[environment, "random"]
         assert ratio >= least, f"{environment}: {ratio:.2f} times random textures"
+        attacked = routes[environment]["attack"]
+        assert attacked["drives_departed"] == attacked["n"] == 4
