@@ -31,7 +31,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-test
 	$(PYTEST) -m "not slow"
 
-# The list names files and tests, which pytest collects without reading other files.
+# Tests by name, because pytest would need too long to import all files of tests.
 test-fast: $(VENV)/.installed-test
 	$(PYTEST) -m "not slow" $$(cat tests/fast.txt)
 
