@@ -18,7 +18,7 @@ from mi_nerfattack.deploy.built_in import built_in_shapes, make_built_in
 from mi_nerfattack.deploy.views.above import surrogate_above
 from mi_nerfattack.experiment.view.frames import FrameSource
 from mi_nerfattack.experiment.view.run import ViewedRun, read_viewed
-from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
 from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.pathtrace.views import ViewRenderer
@@ -133,18 +133,6 @@ def path_strip(drive: Drive, width_m: float = 0.25, z_m: float = 0.03) -> MeshPa
     red, green, blue = (np.array(COLOURS[drive.case]) / 255) ** 2.2
     vertices = np.column_stack([edges, np.full(len(edges), z_m)])
     return MeshPart(vertices, faces, (float(red), float(green), float(blue)))
-
-
-def look_at(eye: Sequence[float], target: Sequence[float]) -> np.ndarray:
-    """Return camera to world (4, 4), OpenCV's axes."""
-    forward = np.subtract(target, eye)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = eye
-    return pose
 
 
 def driven(

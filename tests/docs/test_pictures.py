@@ -14,7 +14,7 @@ from PIL import Image
 
 from mi_nerfattack import cli, plugins
 from mi_nerfattack.experiment.sweep.table import read_table
-from mi_nerfattack.render.camera.intrinsics import from_fov
+from mi_nerfattack.render.camera.intrinsics import from_fov, look_at
 from mi_nerfattack.render.camera.outside import seen_at
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -144,7 +144,7 @@ def test_the_banner_shows_both_drives_and_the_object(run, tmp_path):
     height, width = image.shape[:2]
     panels = image[:, : (width - 8) // 2], image[:, (width + 8) // 2 :]
     camera = from_fov(panels[0].shape[1], height, pictures.FOV_DEG)
-    pose = pictures.look_at(pictures.EYE_M, pictures.TARGET_M)
+    pose = look_at(pictures.EYE_M, pictures.TARGET_M)
     viewed = pictures.read_viewed(run)
     for panel, case, channel in zip(panels, pictures.TITLES, (2, 0), strict=True):
         drive = pictures.drive_of(viewed, "deployment", case)
