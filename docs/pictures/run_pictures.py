@@ -26,9 +26,7 @@ from mi_nerfattack.rollout.drive import ATTACK, OWN, Drive
 
 CAR = Path(__file__).resolve().parents[2] / "scenes/car/car.glb"
 CAR_M = 4.2, 1.8  # length and width
-AXLE_M = (
-    1.25  # from the middle of the rear axle, a vehicle's state, to the car's middle
-)
+AXLE_M = 1.25  # from a vehicle's state, the middle of its rear axle, to its middle
 TITLES = {
     OWN: "original colours: the car turns right",
     ATTACK: "repainted: the car misses the turn",
@@ -52,7 +50,7 @@ def draw_banner(run: Path, folder: Path, small: bool) -> None:
 
 def draw_drive(run: Path, folder: Path, small: bool) -> None:
     """Animate both drives: what the policy sees, and the car from above."""
-    viewed, source = read_viewed(run), None
+    viewed = read_viewed(run)
     drives = [drive_of(viewed, "surrogate", case) for case in TITLES]
     points = np.concatenate([drive.states[:, :2] for drive in drives])
     overhead = Overhead.covering(points, 3.0, 120 if small else 400)
