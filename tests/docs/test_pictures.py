@@ -146,11 +146,13 @@ def test_the_banner_shows_both_drives_and_the_object(run, tmp_path):
     camera = from_fov(panels[0].shape[1], height, pictures.FOV_DEG)
     pose = look_at(pictures.EYE_M, pictures.TARGET_M)
     viewed = pictures.read_viewed(run)
-    for panel, case, channel in zip(panels, pictures.TITLES, (2, 0), strict=True):
+    for panel, case in zip(panels, pictures.TITLES, strict=True):
         drive = pictures.drive_of(viewed, "deployment", case)
-        place = np.append(drive.states[3, :2], 0.03)  # of the path, before the car
-        found = colour_at(panel, seen_at(camera, pose, place[None])[0])
-        assert found[channel] > 1.3 * found[2 - channel], f"{case}: {found}"
+        places = np.pad(drive.states[[3, 10], :2], ((0, 0), (0, 1)))
+        path, car = (colour_at(panel, p) for p in seen_at(camera, pose, places))
+        sign = np.sign(pictures.COLOURS[case][0] - pictures.COLOURS[case][2])
+        assert sign * (path[0] - path[2]) > 0.05, f"{case}: the path"
+        assert car[2] > 1.5 * car[0], f"{case}: the car is blue"
     (hydrant,) = seen_at(camera, pose, np.array([[4.4, -10.5, 1.3]]))
     original, attacked = (colour_at(panel, hydrant) for panel in panels)
     assert original[0] > 1.5 * original[2], "the hydrant is red"
