@@ -13,8 +13,8 @@ WORKERS ?= 2
 .PHONY: help demo test test-fast test-slow test-all test-fuzz test-random lint docs dist bench-gpu check-python clean
 
 help:
-	@echo "make demo         run the whole chain on the bundled scene, less than 10 minutes"
-	@echo "make test         run the tests, at most 8 minutes; less with compiled kernels"
+	@echo "make demo         run the whole chain on the bundled scene, up to 11 minutes"
+	@echo "make test         run the tests, up to 23 minutes; less with compiled kernels"
 	@echo "make test-fast    run the quickest tests of every folder, at most 90 seconds"
 	@echo "make test-all     the slow ones too, at most 40 minutes"
 	@echo "make test-fuzz    100,000 damaged files of each format, hours; others each day"
