@@ -1,4 +1,4 @@
-"""``python -m bench loop``: a closed-loop gradient, beside a loop over `mi.render`."""
+"""``python -m bench loop``: a closed-loop gradient, two ways."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BenchLoop:
     repeats: int = 1
     """Gradients to time; the median counts."""
     json: bool = False
-    """Print one line of JSON in place of the table."""
+    """Print one line of JSON instead of the table."""
 
     def run(self) -> Result:
         """Measure and print."""

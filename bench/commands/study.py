@@ -23,7 +23,7 @@ class BenchStudy:
     `steps`: parametrisations of colour and learning rates at six places. `robust`: what
     disturbances of the optimisation do for the transfer. `textures`: the price of
     smooth and coarse textures. `distribution`: 24 places, two sizes. Each of these
-    takes hours on two cores, `seeds`, the demo three times, minutes. Stopped, the same
+    takes hours on two cores, `seeds`, three attacks, minutes. Stopped, the same
     command continues from OUTPUT. Ends with the table in Markdown.
     """
 

@@ -1,1 +1,1 @@
-"""`bench loop`: a closed-loop gradient, beside a loop over `mi.render`."""
+"""`bench loop`: a closed-loop gradient, by the rollout and over `mi.render`."""
