@@ -17,7 +17,7 @@ from mi_nerfattack.commands.shared.result import Result
 class Demo:
     """Attack the bundled policy at the bundled intersection.
 
-    Takes a few minutes on two cores and opens nothing but files.
+    Takes about ten minutes on two slow cores, and opens nothing but files.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
