@@ -10,7 +10,7 @@ import numpy as np
 from images import write_jpeg
 from PIL import Image, ImageDraw, ImageFont
 
-from mi_nerfattack.backend.colour import linear_to_uint8
+from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
 from mi_nerfattack.capture.mesh.mesh import MeshPart, TexturedMesh, mitsuba_shapes
 from mi_nerfattack.capture.mesh.surface import has_area
 from mi_nerfattack.capture.object_views import Placement
@@ -38,7 +38,7 @@ EYE_M, TARGET_M, FOV_DEG = (-2.5, -28.0, 13.5), (-1.5, -8.5, 0.0), 47.0
 def draw_banner(run: Path, folder: Path, small: bool) -> None:
     """Path-trace both drives from outside: the object, and the car at several times."""
     viewed = read_viewed(run)
-    size = (150, 90) if small else (596, 360)
+    size = (300, 180) if small else (596, 360)
     panels = []
     for case in TITLES:
         scene = scene_of_drive(viewed, drive_of(viewed, "deployment", case))
@@ -128,7 +128,7 @@ def path_strip(drive: Drive, width_m: float = 0.25, z_m: float = 0.03) -> MeshPa
     faces = np.concatenate(
         [np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)]
     )
-    red, green, blue = (np.array(COLOURS[drive.case]) / 255) ** 2.2
+    red, green, blue = srgb_to_linear_numpy(np.array(COLOURS[drive.case]) / 255)
     vertices = np.column_stack([edges, np.full(len(edges), z_m)])
     return MeshPart(vertices, faces, (float(red), float(green), float(blue)))
 
