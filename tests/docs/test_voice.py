@@ -15,7 +15,7 @@ FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
     "docs/attack.md": 89,
-    "docs/bench.md": 175,
+    "docs/bench.md": 173,
     "docs/environments.md": 36,
     "docs/faults.md": 17,
     "docs/fields.md": 77,
