@@ -16,6 +16,10 @@ _MODULES = (
     "ngp_field",
     "splat_background",
     "field_emitter",
+    "aovs",
+    "film",
+    "limits",
+    "nested",
     "field_integrator",
     "opencv_camera",
 )

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.plugins import limits
+from mi_nerfattack.plugins.aovs import FieldChannels
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
+from mi_nerfattack.plugins.film import FilmIntegrator
+from mi_nerfattack.plugins.nested import State, sample_nested
 from mi_nerfattack.plugins.properties import (
     Mask,
     background,
@@ -20,14 +26,13 @@ from mi_nerfattack.plugins.properties import (
 )
 from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render.backdrop import only_fields
-from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.surroundings import nearest_surface
 
 
-class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
+class FieldIntegrator(FilmIntegrator):
     r"""
     .. _integrator-field_integrator:
 
@@ -58,6 +63,10 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
        - |bool|
        - Random instead of middle sample positions. (Default: |false|)
 
+     * - aovs
+       - |bool|
+       - Render opacity, depth and layers, too: see below. (Default: |false|)
+
      * - relit_samples
        - |int|
        - Light samples a ray, for each field and for what lies behind; only if a field
@@ -69,8 +78,11 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
          nested integrator count
 
     The integrator marches every camera ray through the nested fields up to the nearest
-    surface of the scene: ``L = I + (1 - a) L_b``. Behind the fields, the ray shows what
-    a nested integrator sees, or the background of the first field that has one.
+    surface of the scene that light does not pass straight (as it does ``null``, a
+    ``thindielectric`` and the transparent parts of a ``mask``):
+    ``L = I + (1 - a) L_b``. Behind the fields, the ray shows what a nested integrator
+    sees, with what such surfaces reflect, or the background of the first field that
+    has one.
 
     The composite is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum
     sigma_k L_k / sigma``) or ``depth`` (each field alone, folded front to back by
@@ -78,11 +90,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     not overlap. A ``splat_background`` is a layer of ``depth`` alone, and takes no
     derivatives.
 
-    AOVs: ``opacity``, ``depth`` (metres, of the composite), and per field ``<id>.R``,
-    ``<id>.G``, ``<id>.B`` (premultiplied), ``<id>.A`` and ``<id>.Z``: of the field's
-    share of the image (``interleaved``) or of the field alone (``depth``). The depth of
-    a pixel is the mean of its samples weighted by their opacity, infinite where none
-    is above 0; ``mi.render`` returns it, the film alone holds depth times opacity.
+    With ``aovs``, the image has more channels: ``opacity``, ``depth`` (metres, of the
+    composite), and per field ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
+    ``<id>.A`` and ``<id>.Z``: of the field's share of the image (``interleaved``) or
+    of the field alone (``depth``). The depth of a pixel is the mean of its samples
+    weighted by their opacity, infinite where none is above 0. The film itself holds
+    ``moment`` and ``<id>.moment``, depth times opacity, in the place of depths. AOVs of
+    the nested integrator come last. The film's alpha is the opacity, over that of the
+    nested integrator.
 
     .. tabs::
         .. code-tab:: xml
@@ -110,9 +125,14 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
     ``render.lighting.relight`` for what this leaves out. It costs several marches per
     field.
 
-    Differentiable in primal, forward and backward mode with respect to the fields'
-    parameters, of radiance only. Not differentiable: AOVs, the camera, surfaces, and
-    the light on relit objects, which is a constant.
+    Differentiable in forward and backward mode with respect to the fields' parameters,
+    and to all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
+    of Mitsuba's shows: BSDFs, bitmaps and lights, and fields that an emitter shares.
+    In backward mode with respect to ``to_world`` of fields, and to the sensor where
+    fields are alone in the scene. AOVs are differentiated, too, but for the shares of
+    single fields in ``interleaved``. What has no derivative raises an error: a nested
+    integrator without that interface (``path``), moving surfaces, which occlude
+    fields, and the light on relit objects.
     Monochromatic variants show luminance; spectral ones the linear spectrum of
     ``render.lighting.spectrum``; AOVs are RGB everywhere.
     """
@@ -123,6 +143,7 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         self.stop = read_stop(props)
         self.composite = read_composite(props)
         self.jitter = bool(props.get("jitter", False))
+        has_aovs = bool(props.get("aovs", False))
         kinds = (AbstractFieldVolume, SplatBackgroundVolume)
         self.volumes, others = read_nested(props, "field_integrator", kinds)
         is_first = bool(others) and isinstance(others[0], mi.SamplingIntegrator)
@@ -131,9 +152,13 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
             "field_integrator",
             ", splat_background, and one sampling integrator such as path",
         )
+        ids = tuple(volume.id() for volume in self.volumes)
+        self.channels = FieldChannels(ids if has_aovs else ())
         self.posed = [volume.posed for volume in self.volumes]
         self.composite.check(self.posed)
         self.behind = others[0] if is_first else None
+        #: Whether derivatives are asked for by what the nested integrator renders.
+        self.differentiates_behind = False
         samples: Any = props.get("relit_samples", LIGHT_SAMPLES)
         relit = tuple(volume.relit for volume in self.volumes)
         relighting = Relighting(relit, int(samples), self.stop)
@@ -142,97 +167,58 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
                 self.posed, "relit objects throw no shadow on it", "set relit to false"
             )
         self.relighting = relighting if any(relit) else None
-        self._has_aovs = True
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """Expose the fields under their ids."""
+        """Expose the fields under their ids, and the nested integrator."""
         for volume in self.volumes:
             cb.put(volume.id(), volume, mi.ParamFlags.Differentiable)
+        if self.behind is not None:
+            cb.put("behind", self.behind, mi.ParamFlags.Differentiable)
 
     def aov_names(self) -> list[str]:
-        """Name the arbitrary output variables."""
-        if not self._has_aovs:
-            return []
-        layers = [f"{v.id()}.{c}" for v in self.volumes for c in "RGBAZ"]
-        return ["opacity", "depth", *layers]
+        """Name the arbitrary output variables, those of the nested integrator last."""
+        behind = [] if self.behind is None else list(self.behind.aov_names())
+        return [*self.channels.names(), *behind]
 
-    def render(
-        self,
-        scene: mi.Scene,
-        sensor: Any = 0,
-        seed: Any = 0,
-        spp: int = 0,
-        develop: bool = True,
-        evaluate: bool = True,
-    ) -> mi.TensorXf:
-        """Render the image with its AOVs."""
-        image = super().render(scene, sensor, seed, spp, develop, evaluate)
-        return self._with_depths(image)
+    def film_channels(self) -> list[str]:
+        """See :meth:`FilmIntegrator.film_channels`."""
+        names = self.channels.film_names()
+        return [*names, *self.aov_names()[len(names) :]]
 
-    def _with_depths(self, image: mi.TensorXf) -> mi.TensorXf:
-        """Divide the depth moments, which filters can average, by the opacities."""
-        height, width, count = image.shape
-        names = self.aov_names()
-        first = count - len(names)
-        pixel = count * dr.arange(mi.UInt32, height * width)
-        values = mi.Float(image.array)
-        ids = [volume.id() for volume in self.volumes]
-        pairs = [("opacity", "depth"), *((f"{i}.A", f"{i}.Z") for i in ids)]
-        for name, moment in pairs:
-            opacity = dr.gather(
-                mi.Float, image.array, pixel + first + names.index(name)
-            )
-            target = pixel + first + names.index(moment)
-            hit = opacity > 0
-            depth = dr.gather(mi.Float, image.array, target) / dr.select(
-                hit, opacity, 1
-            )
-            dr.scatter(values, dr.select(hit, depth, dr.inf), target)
-        return mi.TensorXf(values, image.shape)
+    def splats(self, state: State) -> tuple[mi.Float, list[mi.Float]]:
+        """See :meth:`FilmIntegrator.splats`."""
+        alpha = state.seen.total.opacity
+        if state.valid is not None:
+            alpha = dr.select(state.valid, 1, alpha)
+        return alpha, [*self.channels.of_film(state.seen), *state.aovs]
 
-    def render_backward(
-        self,
-        scene: mi.Scene,
-        params: Any,
-        grad_in: mi.TensorXf,
-        sensor: Any = 0,
-        seed: Any = 0,
-        spp: int = 0,
-    ) -> None:
-        """Accumulate gradients; those of AOVs are ignored."""
-        count = _film(scene, sensor).base_channels_count()
-        with self._without_aovs():
-            super().render_backward(
-                scene, params, grad_in[..., :count], sensor, seed, spp
-            )
-
-    def render_forward(
-        self,
-        scene: mi.Scene,
-        params: Any,
-        sensor: Any = 0,
-        seed: Any = 0,
-        spp: int = 0,
-    ) -> mi.TensorXf:
-        """Render the image's tangent; that of AOVs is zero."""
-        with self._without_aovs():
-            tangent = super().render_forward(scene, params, sensor, seed, spp)
-        height, width, count = tangent.shape
-        total = count + len(self.aov_names())
-        full = dr.zeros(mi.Float, height * width * total)
-        index = dr.arange(mi.UInt32, height * width * count)
-        pixel = index // count
-        dr.scatter(full, tangent.array, pixel * total + index - pixel * count)
-        return mi.TensorXf(full, (height, width, total))
+    def developed(self, image: mi.TensorXf) -> mi.TensorXf:
+        """See :meth:`FilmIntegrator.developed`."""
+        after = len(self.aov_names()) - len(self.channels.names())
+        return self.channels.develop(image, after)
 
     @contextmanager
-    def _without_aovs(self) -> Iterator[None]:
-        # Mitsuba 3.9 multiplies AOVs by the sensor's spectral weight there and fails.
-        self._has_aovs = False
-        try:
-            yield
-        finally:
-            self._has_aovs = True
+    def differentiating(self, scene: mi.Scene, mode: dr.ADMode) -> Iterator[None]:
+        """Prepare to differentiate by the parameters that have gradients enabled.
+
+        Args:
+            scene: that is rendered.
+            mode: forward or backward.
+
+        Raises:
+            InputError: a derivative that is not computed; the message names what is.
+        """
+        before = self.differentiates_behind
+        self.differentiates_behind = limits.check(self, scene)
+        with ExitStack() as stack:
+            # Inside an operation, Dr.Jit cannot pass tangents from a parameter on to
+            # what was derived from it before.
+            for volume in self.volumes if mode == dr.ADMode.Forward else []:
+                stack.enter_context(volume.tangents())
+            try:
+                yield
+            finally:
+                self.differentiates_behind = before
 
     def sample(
         self,
@@ -245,59 +231,145 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         δaovs: Any = None,
         state_in: Any = None,
         active: Mask = True,
+        δsplats: Any = None,
+        **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
-        """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``."""
-        del depth, δaovs
-        ray = mi.Ray3f(dr.detach(ray))
+        """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
+
+        Where a film asks for the derivatives of :meth:`splats`, it gives their
+        cotangents as ``δsplats``, and finds their tangents in the place of the state.
+        """
+        del depth, δaovs, kwargs
+        attached, ray = ray, mi.Ray3f(dr.detach(ray))
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
+        # Fields end at the first surface that light does not pass straight.
         t_max = nearest_surface(scene, ray, active)
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         if state_in is None:  # primal mode, or forward mode, which comes without
-            rays.gains, shadow = self._relight(scene, sampler, ray, rays)
-            seen = self.composite.render(self.posed, rays, self.stop)
-            behind = self._behind(scene, sampler, ray, active)
-            state_in = seen, self._darken(behind, shadow, ray), rays.gains
-        seen, behind, rays.gains = state_in
+            inner = sampler if mode == dr.ADMode.Primal else sampler.clone()
+            state_in = self._look(scene, inner, ray, rays)
+        state: State = state_in
+        rays.gains = state.gains
+        valid = state.seen.total.opacity > 0
+        if state.valid is not None:
+            valid |= state.valid
         if mode == dr.ADMode.Primal:
-            radiance = self._over(seen.total, rays, behind, ray.wavelengths)
-            return radiance, active, self._aovs(seen), state_in
+            radiance = self._over(state.seen.total, rays, state.behind, ray.wavelengths)
+            aovs = [*self.channels.of_sample(state.seen), *state.aovs]
+            return radiance, valid, aovs, state
         if mode == dr.ADMode.Backward:
-            self._backward(rays, seen, behind, ray.wavelengths, δL)
-            return δL, active, [], None
-        tangent = self._forward(rays, seen, behind, ray.wavelengths)
+            self._backward(scene, sampler, attached, rays, state, δL, δsplats)
+            return δL, valid, [], None
+        tangent, t_splats = self._forward(scene, sampler, ray, rays, state)
         # Mitsuba writes this into the tangent of alpha, which is zero.
-        valid = mi.Bool(False)
-        return tangent, valid, [], None
+        return tangent, mi.Bool(False), [], t_splats
+
+    def _look(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
+    ) -> State:
+        """March the fields, and see what lies behind them."""
+        rays.gains, shadow = self._relight(scene, sampler, ray, rays)
+        seen = self.composite.render(self.posed, rays, self.stop)
+        if self.behind is None:
+            return State(seen, rays.gains)
+        behind, valid, aovs, *inner = sample_nested(
+            self.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
+        )
+        if shadow is not None:
+            behind *= spectrum.reflectance(shadow, ray.wavelengths)
+        return State(seen, rays.gains, behind, valid, list(aovs), *inner)
 
     def _backward(
-        self, rays: Rays, seen: Seen, behind: Any, wavelengths: Any, δL: Any
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        rays: Rays,
+        state: State,
+        δL: Any,
+        δsplats: Any,
     ) -> None:
+        """Accumulate the gradients of all that the rays show."""
         with dr.resume_grad():
-            total = seen.total.copy()
-            dr.enable_grad(total)
-            radiance = self._over(total, rays, behind, wavelengths)
-            dr.backward_from(dr.sum(radiance * δL))
-            cotangent = dr.grad(total)
-        self.composite.backward(self.posed, rays, seen, cotangent, self.stop)
-
-    def _forward(self, rays: Rays, seen: Seen, behind: Any, wavelengths: Any) -> Any:
-        tangent = self.composite.forward(self.posed, rays, seen, self.stop)
+            by_camera = dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
+        if by_camera:
+            limits.check_camera(self, scene, "sensor")
+        # From the colour back to the fields, to what is behind, and to the sky
         with dr.resume_grad():
-            total = seen.total.copy()
-            dr.enable_grad(total)
-            dr.set_grad(total, tangent)
-            radiance = self._over(total, rays, behind, wavelengths)
-            return dr.forward_to(radiance, flags=dr.ADFlag.ClearEdges)
+            leaf = state.copy()
+            direction = mi.Vector3f(rays.direction)
+            dr.enable_grad(leaf.seen, leaf.behind, direction)
+            lit = replace(rays, direction=direction)
+            radiance = self._over(leaf.seen.total, lit, leaf.behind, ray.wavelengths)
+            result = dr.sum(radiance * δL)
+            if δsplats is not None:
+                δalpha, δothers = δsplats
+                alpha, others = self.splats(leaf)
+                pairs = zip(others, δothers, strict=True)
+                result += alpha * δalpha + sum((x * δ for x, δ in pairs), mi.Float(0))
+            dr.backward_from(result)
+            cotangent = dr.grad(leaf.seen)
+            δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
+            by_sky = dr.grad(direction)
+        if self.differentiates_behind:
+            sample_nested(
+                self.behind,
+                dr.ADMode.Backward,
+                scene,
+                sampler,
+                mi.Ray3f(dr.detach(ray)),
+                rays.active,
+                δbehind,
+                state.inner,
+            )
+        if not by_camera and not any(item.has_pose_gradients for item in self.posed):
+            self.composite.backward(self.posed, rays, state.seen, cotangent, self.stop)
+            return
+        # Fields, camera and poses in one march
+        found = self.composite.backward_rays(
+            self.posed, rays, state.seen, cotangent, self.stop, range(len(self.posed))
+        )
+        with dr.resume_grad():
+            for item, by_ray in zip(self.posed, found, strict=True):
+                item.backward_pose(rays, by_ray)
+            if by_camera:
+                by_origin = sum((part.origin for part in found), mi.Vector3f(0))
+                by_direction = sum((part.direction for part in found), by_sky)
+                dr.backward_from(dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction))
 
-    def _behind(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
-    ) -> Any:
-        """Return the spectrum that the nested integrator sees; None without one."""
-        if self.behind is None:
-            return None
-        ray = mi.RayDifferential3f(ray)
-        return self.behind.sample(scene, sampler, ray, active=active)[0]
+    def _forward(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        rays: Rays,
+        state: State,
+    ) -> tuple[Any, Any]:
+        """Return the tangents of the colour and of :meth:`splats`."""
+        tangent = self.composite.forward(self.posed, rays, state.seen, self.stop)
+        if len(tangent.layers) < len(self.channels.ids):
+            raise InputError(
+                "composite interleaved: the shares of single fields have no tangents; "
+                "set composite to depth, or aovs to false"
+            )
+        with dr.resume_grad():
+            leaf = state.copy()
+            dr.enable_grad(leaf.seen, leaf.behind)
+            dr.set_grad(leaf.seen.total, tangent.total)
+            for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
+                dr.set_grad(layer, part)
+            if self.differentiates_behind:
+                parts = scene, sampler, ray, rays.active, None, state.inner
+                dr.set_grad(
+                    leaf.behind,
+                    sample_nested(self.behind, dr.ADMode.Forward, *parts)[0],
+                )
+            colour = self._over(leaf.seen.total, rays, leaf.behind, ray.wavelengths)
+            found = colour, *self.splats(leaf)
+            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+            colour, alpha, aovs = dr.forward_to(found, flags=flags)
+        return colour, (alpha, aovs)
 
     def _relight(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
@@ -311,11 +383,6 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         shadow = self.relighting.behind(scene, sampler, self.posed, ray, rays.active)
         return gains, shadow
 
-    def _darken(self, behind: Any, shadow: mi.Color3f | None, ray: mi.Ray3f) -> Any:
-        if shadow is None:
-            return behind
-        return behind * spectrum.reflectance(shadow, ray.wavelengths)
-
     def _over(self, total: March, rays: Rays, behind: Any, wavelengths: Any) -> Any:
         """Lay the fields over what is behind, as a spectrum."""
         passed = 1 - total.opacity
@@ -325,23 +392,10 @@ class FieldIntegrator(mi.ad.integrators.common.RBIntegrator):
         sky = background(fields, rays.direction) & (rays.t_max == dr.inf)
         return spectrum.emission(total.radiance + passed * sky, wavelengths)
 
-    def _aovs(self, seen: Seen) -> list[mi.Float]:
-        if not self._has_aovs:
-            return []
-        result = [seen.total.opacity, seen.total.moment]
-        for layer in seen.layers:
-            result += [*layer.radiance, layer.opacity, layer.moment]
-        return result
-
     def to_string(self) -> str:
         """Describe the checked parameters."""
-        names = ", ".join(volume.id() for volume in self.volumes)
-        kind = type(self.composite).__name__
-        return f"FieldIntegrator[fields=({names}), {kind}, stop={self.stop}]"
-
-
-def _film(scene: mi.Scene, sensor: Any) -> mi.Film:
-    return (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
+        kind, names = type(self.composite).__name__, [v.id() for v in self.volumes]
+        return f"FieldIntegrator[fields={names}, {kind}, stop={self.stop}]"
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

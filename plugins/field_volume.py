@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import drjit as dr
@@ -87,11 +88,11 @@ def read_quantity(props: mi.Properties) -> str:
 class AbstractFieldVolume(mi.Volume):
     """Field of one kind as a Mitsuba volume.
 
-    Members set `kind` and `parameter_names` and register themselves.
+    Members set `kind` and register themselves.
     """
 
     kind = ""
-    parameter_names: tuple[str, ...] = ()
+    field: GridField | NGPField
 
     def __init__(self, props: mi.Properties) -> None:
         spectrum.prepare()
@@ -100,21 +101,61 @@ class AbstractFieldVolume(mi.Volume):
         field = read_field(props, self.kind)
         field.refine(read_step(props, field.step_m))
         super().__init__(place_unit_cube(props, field, pose))
-        self.quantity, self.limit, self.field = quantity, limit, field
+        self.quantity, self.limit = quantity, limit
+        self.field = field
         self.relit = bool(props.get("relit", False))
         self.posed = PosedField(field, pose)
-        self.values = self.field.parameters()
+        self._loaded, self._moved = pose, False
+        # Mitsuba finds them here where `drjit.freeze` records a rendering
+        self.live = [field.live, self.posed.live]
+
+    def parameters(self) -> dict[str, Any]:
+        """Return what `traverse` exposes, by name: the same objects for good."""
+        return self.field.parameters()
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """Expose the parameters of the field."""
-        for name in self.parameter_names:
-            cb.put(name, self.values[name], mi.ParamFlags.Differentiable)
+        """Expose the parameters of the field, and its pose."""
+        for name, value in self.parameters().items():
+            cb.put(name, value, mi.ParamFlags.Differentiable)
+        cb.put("to_world", self.posed.to_world, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Hand changed parameters to the field; what is empty stays so."""
-        for name in self.parameter_names:
+        """Hand changed parameters to the field; what is empty stays so.
+
+        Raises:
+            InputError: a value that is not allowed, with its name.
+        """
+        for name, value in self.parameters().items():
             if not keys or name in keys:
-                self.field.set_parameter(name, self.values[name])
+                self.field.set_parameter(name, value)
+        if not keys or "to_world" in keys:
+            try:
+                self.posed.follow()
+            except ValueError as err:
+                raise InputError(
+                    f"{self.id()}.to_world: {err}; fields take rotation, translation "
+                    "and uniform scale"
+                ) from err
+            self._moved = not self.posed.pose.is_near(self._loaded)
+
+    @contextmanager
+    def tangents(self) -> Iterator[None]:
+        """Let what kernels read have the tangents of the parameters.
+
+        Raises:
+            InputError: the pose has one.
+        """
+        if self.posed.has_pose_gradients:
+            raise InputError(
+                f"{self.id()}.to_world: has no derivative in forward mode; use "
+                "dr.backward"
+            )
+        with self._tangents():
+            yield
+
+    def _tangents(self) -> AbstractContextManager[None]:
+        """Do so for the field's parameters."""
+        return nullcontext()
 
     def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
         """Evaluate the quantity as a spectrum, (channels, n).
@@ -137,6 +178,12 @@ class AbstractFieldVolume(mi.Volume):
         return mi.Vector3f(self._evaluate(it, active)[1])
 
     def _evaluate(self, it: mi.Interaction3f, active: Mask) -> Any:
+        if self._moved:
+            raise InputError(
+                f"{self.id()}: a medium cannot follow to_world, since Mitsuba keeps "
+                "the box in which the volume was loaded; load the scene again, or use "
+                "field_integrator or field_emitter"
+            )
         point, _ = self.posed.to_local(it.p, mi.Vector3f(0, 0, 1))
         lower = mi.Point3f(*map(float, self.field.lower))
         upper = mi.Point3f(*map(float, self.field.upper))

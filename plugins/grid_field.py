@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+from typing import Any
+
 import mitsuba as mi
 
+from mi_nerfattack.fields import GridField
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 
@@ -25,6 +29,7 @@ class GridFieldVolume(AbstractFieldVolume):
        - |transform|
        - Rotation, translation and uniform scale, field to world, metres.
          (Default: identity)
+       - |exposed|, |differentiable|
 
      * - quantity
        - |string|
@@ -44,9 +49,9 @@ class GridFieldVolume(AbstractFieldVolume):
        - Lit by the scene's emitters, in ``field_integrator`` alone.
          (Default: |false|)
 
-     * - texture
+     * - colour
        - |tensor|
-       - Raw colours of the vertices of all levels, (n, 3)
+       - sRGB colours of the vertices of the finest level, (n, 3), in (0, 1)
        - |exposed|, |differentiable|
 
      * - density
@@ -80,12 +85,25 @@ class GridFieldVolume(AbstractFieldVolume):
     (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass
     more than a centimetre (0.7 %).
 
-    Where the file calls space empty, the density is 0 whatever ``density`` says: see
-    ``fields.window``. Not differentiable: the pose.
+    ``colour`` stands for the texture of all levels: a step of an optimiser is a change
+    of colour by that step. Keep it within 0 and 1, for instance by ``dr.clip``. Where
+    the file calls space empty, the density is 0 whatever ``density`` says: see
+    ``fields.window``. A new ``to_world`` moves the field, except in media. Derivatives
+    by it are in backward mode alone.
     """
 
     kind = "grid_field"
-    parameter_names = ("texture", "density")
+    field: GridField  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the colours of the finest level's vertices, and the densities."""
+        return {
+            "colour": self.field.colours.value,
+            "density": self.field.parameters()["density"],
+        }
+
+    def _tangents(self) -> AbstractContextManager[None]:
+        return self.field.tangents()
 
 
 mi.register_texture("grid_field", lambda props: GridFieldVolume(props))

@@ -81,7 +81,6 @@ class NGPFieldVolume(AbstractFieldVolume):
     """
 
     kind = "ngp_field"
-    parameter_names = ("table", "density_weights", "colour_weights", "sky")
 
 
 mi.register_texture("ngp_field", lambda props: NGPFieldVolume(props))

@@ -86,10 +86,12 @@ class AbstractField(ABC):
     cone: float
     occupancy: Occupancy
     window: Window
+    _live: list[Any]
 
     def occupy(self, occupancy: Occupancy) -> None:
         """Make the field empty outside the occupied cells of a grid over its box."""
         self.occupancy, self.window = occupancy, Window(occupancy.cells)
+        self._relist()
 
     def see_all(self) -> None:
         """Let marches see thin octants, too.
@@ -98,6 +100,23 @@ class AbstractField(ABC):
         derivative by the ray misses that.
         """
         self.occupancy = Occupancy(self.window.cells)
+        self._relist()
+
+    @property
+    def live(self) -> list[Any]:
+        """:meth:`arrays` in a list that is always up to date.
+
+        A Mitsuba object that has it as an attribute can be part of a function that
+        `drjit.freeze` records: Mitsuba finds the arrays there.
+        """
+        if "_live" not in self.__dict__:
+            self._live = self.arrays()
+        return self._live
+
+    def _relist(self) -> None:
+        """Bring :attr:`live` up to date."""
+        if "_live" in self.__dict__:
+            self._live[:] = self.arrays()
 
     def occupancy_tensors(self) -> dict[str, np.ndarray]:
         """Return what field files of all kinds hold of the occupancy."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +16,7 @@ from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.occupancy import Occupancy
+from mi_nerfattack.fields.vertex_colours import VertexColours
 
 _ROUNDING = (
     1e-3  # cells of a level, more than single precision errs by; files rely on it
@@ -130,6 +133,7 @@ class GridField(AbstractField):
         self.n_vertices: int = self.encoding.n_params // 4
         self._density = flat_parameter(density, (self.n_vertices,), "density")
         self._texture = flat_parameter(texture, (self.n_vertices, 3), "texture")
+        self._colours: VertexColours | None = None
         self._pack()
 
     @property
@@ -145,6 +149,14 @@ class GridField(AbstractField):
     @packed.setter
     def packed(self, value: mi.Float) -> None:
         self.encoding.data = value
+        self._relist()
+
+    @property
+    def colours(self) -> VertexColours:
+        """The colours of the finest level's vertices."""
+        if self._colours is None:
+            self._colours = VertexColours(self)
+        return self._colours
 
     def texture_gradient(self, packed_gradient: mi.Float) -> mi.TensorXf:
         """Pick the colours' part, (n_vertices, 3), out of a gradient of `packed`."""
@@ -174,7 +186,7 @@ class GridField(AbstractField):
         return packed
 
     def _pack(self) -> None:
-        self.encoding.data = self.pack(self._texture)
+        self.packed = self.pack(self._texture)
 
     def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
@@ -241,14 +253,40 @@ class GridField(AbstractField):
         return {"texture": self.texture, "density": self._density}
 
     def set_parameter(self, name: str, value: Any) -> None:
-        """Replace ``texture`` or ``density``."""
-        if name == "texture":
+        """Replace ``texture``, ``colour`` or ``density``.
+
+        ``colour`` (n, 3) are the sRGB colours of :attr:`colours`.
+        """
+        if name == "colour":
+            self._texture = self.colours.replace(value)
+        elif name == "texture":
             self._texture = flat_parameter(value, (self.n_vertices, 3), name)
         elif name == "density":
-            self._density = flat_parameter(value, (self.n_vertices,), name)
+            density = flat_parameter(value, (self.n_vertices,), name)
+            mi.set_property(self._density, density)
         else:
-            raise KeyError(f"{name}: a grid field has 'texture' and 'density'")
+            raise KeyError(
+                f"{name}: a grid field has 'texture', 'colour' and 'density'"
+            )
         self._pack()
+        if name == "texture" and self._colours is not None:
+            self._colours.read()
+
+    @contextmanager
+    def tangents(self) -> Iterator[None]:
+        """Let :attr:`packed` have the tangents of ``colour`` and ``density``."""
+        before, zero = self.packed, dr.zeros(mi.Float, 3 * self.n_vertices)
+        colour = self.colours.value
+        if dr.grad_enabled(colour):
+            zero = self.colours.tangent(dr.grad(colour).array)
+        tangent = self.pack(zero, dr.grad(self._density))
+        self.packed = mi.Float(dr.detach(before))
+        dr.enable_grad(self.packed)
+        dr.set_grad(self.packed, tangent)
+        try:
+            yield
+        finally:
+            self.packed = before
 
     def held_vertices(self) -> np.ndarray:
         """Tell which vertices are read anywhere in an occupied cell, (n_vertices,)."""

@@ -269,6 +269,7 @@ class NGPField(AbstractField):
         else:
             net = self.density_net if name[0] == "d" else self.colour_net
             net["weights"] = value
+        self._relist()
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return table (half precision), network matrices, sky, occupancy bits."""

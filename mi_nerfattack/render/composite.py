@@ -13,7 +13,7 @@ import mitsuba as mi
 from mi_nerfattack.backend.concat import concat
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
 from mi_nerfattack.render.batched import FIRST_RAYS, march_gradient
-from mi_nerfattack.render.march import RayTangent, march, march_derivative
+from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
@@ -33,6 +33,10 @@ class Seen:
 
     total: March = field(default_factory=March)
     layers: list[March] = field(default_factory=list)
+
+    def copy(self) -> Seen:
+        """Return the same values with no derivatives attached."""
+        return Seen(self.total.copy(), [layer.copy() for layer in self.layers])
 
 
 @dataclass
@@ -120,8 +124,8 @@ class AbstractComposite(ABC):
         rays: Rays,
         seen: Seen,
         stop: float,
-    ) -> March:
-        """Return the tangent of the total, from those of the fields' parameters.
+    ) -> Seen:
+        """Return the tangents of what was seen, from those of the fields' parameters.
 
         Args:
             posed: as given to :meth:`render`.
@@ -161,7 +165,7 @@ class AbstractComposite(ABC):
         posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
-        cotangent: March,
+        cotangent: Seen,
         stop: float,
     ) -> None:
         """Accumulate gradients of the parameters of the fields that ask for them.
@@ -170,7 +174,8 @@ class AbstractComposite(ABC):
             posed: as given to :meth:`render`.
             rays: likewise.
             seen: what it returned.
-            cotangent: derivative of the objective by the total, per ray.
+            cotangent: derivative of the objective by what was seen, per ray; no
+                layers where it depends on the total alone.
             stop: as given to :meth:`render`.
         """
         for task in self.tasks(posed, rays, seen, cotangent):
@@ -178,7 +183,7 @@ class AbstractComposite(ABC):
 
     @abstractmethod
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
     ) -> list[Task]:
         """Say what :meth:`backward` has to march again.
 
@@ -196,17 +201,18 @@ class AbstractComposite(ABC):
         posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
-        cotangent: March,
+        cotangent: Seen,
         stop: float,
         wanted: Sequence[int],
-    ) -> list[RayTangent]:
+    ) -> list[RayGradient]:
         """Do what :meth:`backward` does, and differentiate by the rays.
 
         Args:
             posed: as given to :meth:`render`.
             rays: likewise.
             seen: what it returned.
-            cotangent: derivative of the objective by the total, per ray.
+            cotangent: derivative of the objective by what was seen, per ray; no
+                layers where it depends on the total alone.
             stop: as given to :meth:`render`.
             wanted: layers that matter, among them those that ask for gradients.
 
@@ -255,7 +261,7 @@ class DepthComposite(AbstractComposite):
         rays: Rays,
         seen: Seen,
         stop: float,
-    ) -> March:
+    ) -> Seen:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
         tangents = [
@@ -269,12 +275,11 @@ class DepthComposite(AbstractComposite):
             dr.enable_grad(leaves)
             for leaf, tangent in zip(leaves, tangents, strict=True):
                 dr.set_grad(leaf, tangent)
-            total = depth_composite(leaves)
-            tangent: Any = dr.forward_to(total, flags=dr.ADFlag.ClearEdges)
-        return tangent
+            total: Any = depth_composite(leaves)
+            return Seen(dr.forward_to(total, flags=dr.ADFlag.ClearEdges), tangents)
 
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one for each field."""
         parts = self._cotangents(seen, cotangent)
@@ -298,10 +303,10 @@ class DepthComposite(AbstractComposite):
         posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
-        cotangent: March,
+        cotangent: Seen,
         stop: float,
         wanted: Sequence[int],
-    ) -> list[RayTangent]:
+    ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
         purpose = "a backdrop is not differentiated by rays"
@@ -309,17 +314,19 @@ class DepthComposite(AbstractComposite):
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [
-            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop)[1:]
+            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop)[1]
             for k, item in zip(wanted, fields, strict=True)
         ]
 
-    def _cotangents(self, seen: Seen, cotangent: March) -> list[March]:
+    def _cotangents(self, seen: Seen, cotangent: Seen) -> list[March]:
         """Return the derivatives of the objective by each layer."""
         with dr.resume_grad():
             leaves = [layer.copy() for layer in seen.layers]
             dr.enable_grad(leaves)
-            total = depth_composite(leaves)
-            dr.backward_from(total.pair(cotangent))
+            result = depth_composite(leaves).pair(cotangent.total)
+            for leaf, part in zip(leaves, cotangent.layers, strict=False):
+                result += leaf.pair(part)
+            dr.backward_from(result)
             return [dr.grad(leaf) for leaf in leaves]
 
 
@@ -337,8 +344,11 @@ def _see(item: Layer, rays: Rays, stop: float) -> March:
 def select(
     wanted: mi.Bool, rays: Rays, primal: March, cotangent: March, which: tuple[int, ...]
 ) -> list[Task]:
-    """Return the task of marching the wanted rays again; none without such rays."""
-    index = dr.compress(wanted)
+    """Return the task of marching the wanted rays again; none without such rays.
+
+    Rays without a cotangent are not among them.
+    """
+    index = dr.compress(wanted & cotangent.differs())
     if not dr.width(index):
         return []
 

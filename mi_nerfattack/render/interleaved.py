@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.backdrop import Layer, only_fields
 from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
@@ -25,7 +26,7 @@ from mi_nerfattack.render.composite import (
     select,
 )
 from mi_nerfattack.render.march import (
-    RayTangent,
+    RayGradient,
     integrate,
     march,
     private_gradients,
@@ -81,16 +82,17 @@ class InterleavedComposite(AbstractComposite):
         rays: Rays,
         seen: Seen,
         stop: float,
-    ) -> March:
-        """See :meth:`AbstractComposite.forward`."""
+    ) -> Seen:
+        """See :meth:`AbstractComposite.forward`; of several fields, of the total."""
         fields, mode = _fields(posed), dr.ADMode.Forward
-        if not any(item.has_gradients for item in fields):
-            return March()
-        with dr.suspend_grad():
-            return _replay(mode, fields, rays, seen.total, March(), stop, False)[0]
+        total = March()
+        if any(item.has_gradients for item in fields):
+            with dr.suspend_grad():
+                total, _ = _replay(mode, fields, rays, seen.total, March(), stop, False)
+        return Seen(total, [total] if len(fields) == 1 else [])
 
     def tasks(
-        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: March
+        self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one, which needs all fields."""
         met = [
@@ -101,7 +103,8 @@ class InterleavedComposite(AbstractComposite):
         if not met:
             return []
         wanted = reduce(operator.or_, met)
-        return select(wanted, rays, seen.total, cotangent, tuple(range(len(posed))))
+        whole = _whole(seen, cotangent)
+        return select(wanted, rays, seen.total, whole, tuple(range(len(posed))))
 
     def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
@@ -118,14 +121,15 @@ class InterleavedComposite(AbstractComposite):
         posed: Sequence[Layer],
         rays: Rays,
         seen: Seen,
-        cotangent: March,
+        cotangent: Seen,
         stop: float,
         wanted: Sequence[int],
-    ) -> list[RayTangent]:
+    ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
-            by_field = _replay(mode, fields, rays, seen.total, cotangent, stop, True)[1]
+            whole = _whole(seen, cotangent)
+            by_field = _replay(mode, fields, rays, seen.total, whole, stop, True)[1]
         return [by_field[k] for k in wanted]
 
 
@@ -140,12 +144,28 @@ def _fields(posed: Sequence[Layer]) -> list[PosedField]:
     return only_fields(posed, purpose, "set composite to depth")
 
 
+def _whole(seen: Seen, cotangent: Seen) -> March:
+    """Return the cotangent of the total; that of a single layer is part of it.
+
+    Raises:
+        InputError: one of several layers has a cotangent.
+    """
+    if len(seen.layers) == 1 and cotangent.layers:
+        return cotangent.total.plus(cotangent.layers[0], mi.Bool(True))
+    if any(dr.any(layer.differs()) for layer in cotangent.layers):
+        raise InputError(
+            "composite interleaved: the shares of single fields have no derivatives; "
+            "set composite to depth, or leave <id>.R to <id>.Z out of the loss"
+        )
+    return cotangent.total
+
+
 def _total(shares: list[March]) -> March:
     return reduce(lambda a, b: a.plus(b, mi.Bool(True)), shares)
 
 
 def _replay(
     mode: dr.ADMode, posed: list[PosedField], rays: Rays, *options: Any
-) -> tuple[March, list[RayTangent]]:
+) -> tuple[March, list[RayGradient]]:
     lit = rays.light(posed)
     return replay(mode, lit, *MergedWalk.start(lit, rays), *options)

@@ -97,7 +97,7 @@ def march_derivative(  # noqa: D417  one entry describes three
     primal: March,
     cotangent: March,
     stop: float = STOP,
-) -> tuple[March, mi.Vector3f, mi.Vector3f]:
+) -> tuple[March, RayGradient]:
     """Replay :func:`march` and propagate derivatives through the field.
 
     With ``w_k`` the weight and ``T_k+1`` the transmittance behind sample k:
@@ -119,14 +119,14 @@ def march_derivative(  # noqa: D417  one entry describes three
 
     Returns:
         the tangent of the march (forward mode; zeros otherwise), and the objective's
-        derivative by origin and direction (3, n) (backward mode).
+        derivatives by the rays (backward mode; zeros otherwise).
     """
     with dr.suspend_grad(), private_gradients():
         walk, active = Walk.start(posed, rays)
         with_rays = mode == dr.ADMode.Backward
         fixed = [posed], walk, active, primal, cotangent, stop
-        tangent, ((by_origin, by_direction),) = replay(mode, *fixed, with_rays)
-    return tangent, by_origin, by_direction
+        tangent, (by_rays,) = replay(mode, *fixed, with_rays)
+    return tangent, by_rays
 
 
 @dr.syntax
@@ -161,27 +161,42 @@ def integrate(
 
 @dataclass
 class RayGradient:
-    """Derivatives by the rays in the frame of one field, so far."""
+    """Derivatives of an objective by n rays, as one field sees them.
+
+    Attributes:
+        origin: (3, n).
+        direction: (3, n).
+        heading: (3, n), by the direction of travel that the radiance depends on, while
+            a march goes on; then it is part of `direction`.
+        log_density: (n,), by the logarithm of a factor of the field's density.
+    """
 
     origin: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
     direction: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
     heading: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
+    log_density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
-    def plus(self, point: Any, heading: Any, here: Segment) -> RayGradient:
-        """Add what a sample's point and heading got, where there is a sample."""
+    def plus(
+        self, point: Any, heading: Any, growth: mi.Float, here: Segment
+    ) -> RayGradient:
+        """Add what a sample's point and heading got, and its `Slope.growth`."""
         by_point = dr.select(here.active, mi.Vector3f(dr.grad(point)), 0)
         by_heading = dr.select(here.active, dr.grad(heading), 0)
         return RayGradient(
             self.origin + by_point,
             self.direction + here.t * by_point,
             self.heading + by_heading,
+            self.log_density + dr.select(here.active, growth, 0),
         )
 
-    def in_world(self, posed: PosedField, path: Path) -> RayTangent:
+    def in_world(self, posed: PosedField, path: Path) -> RayGradient:
         """Return the derivatives by origin and direction in the world."""
         along = path.heading * dr.dot(path.heading, self.heading)
         turned = (self.heading - along) * dr.rcp(dr.norm(path.d))
-        return posed.to_world_gradient(self.origin, self.direction + turned)
+        by_origin, by_direction = posed.to_world_gradient(
+            self.origin, self.direction + turned
+        )
+        return RayGradient(by_origin, by_direction, log_density=self.log_density)
 
 
 @dr.syntax
@@ -194,7 +209,7 @@ def replay(  # noqa: D417  one entry describes four
     cotangent: March,
     stop: float,
     with_rays: bool,
-) -> tuple[March, list[RayTangent]]:
+) -> tuple[March, list[RayGradient]]:
     """Replay :func:`integrate` of the fields, and propagate derivatives.
 
     Args:
@@ -222,7 +237,11 @@ def replay(  # noqa: D417  one entry describes four
             change = slope.change(depths, colours)
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                 dr.backward_from(cotangent.pair(change))
-                by_rays = [by_rays[k].plus(points[k], headings[k], here) for k in count]
+                growth = slope.growth(cotangent, dr.detach(depths), dr.detach(colours))
+                by_rays = [
+                    by_rays[k].plus(points[k], headings[k], growth[k], here)
+                    for k in count
+                ]
             else:
                 tangent = tangent.plus(dr.forward_to(change), here.active)
         active = here.active & (dr.exp(-rest.tau) > stop)

@@ -24,28 +24,63 @@ class PosedField:
 
     def __init__(self, field: AbstractField, pose: Pose | None = None) -> None:
         self.field = field
-        self.pose: Pose = pose or Pose.identity()
-        self.move(self.pose.rotation, self.pose.translation)
-        self._inverse_scale = mi.Float(1 / self.pose.scale)
-        self._step = mi.Float(field.step_m * self.pose.scale)
         # cone -> 0 makes the lattice uniform; the floor keeps step / cone finite, and
         # so large that no ray comes there
         self._cone = mi.Float(max(field.cone, 1e-12))
-        dr.make_opaque(self._inverse_scale, self._step, self._cone)
+        dr.make_opaque(self._cone)
         self._gain: mi.Color3f | None = None
+        #: What kernels read of the pose, in a list that is always up to date.
+        self.live: list[Any] = []
+        #: Field to world as Mitsuba has it; the same object for good.
+        self.to_world: Any = mi.AffineTransform4f()
+        self.place(pose or Pose.identity())
+
+    def place(self, pose: Pose) -> None:
+        """Give the field another pose, from which :meth:`move` counts."""
+        self._set(pose)
+        self.move(pose.rotation, pose.translation)
 
     def move(self, rotation: np.ndarray, translation: np.ndarray) -> None:
-        """Put the field elsewhere: `placed`; `pose` stays what it was made with.
+        """Put the field elsewhere: `placed`; `pose` stays what it was.
 
         Args:
             rotation: (3, 3), field to world.
             translation: (3,) of the field's origin, metres in the world.
         """
-        self.placed: Pose = Pose(rotation, translation, self.pose.scale)
-        rotation = np.asarray(rotation, np.float32)
+        self._put(Pose(rotation, translation, self.pose.scale))
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.pose.scale * rotation, translation
+        mi.set_property(self.to_world, mi.AffineTransform4f(matrix))
+        self._attached: Any = None
+
+    def follow(self) -> None:
+        """Take the pose of `to_world`, which has been changed, and its derivatives.
+
+        Raises:
+            ValueError: it shears, reflects or scales unequally.
+        """
+        matrix = np.array(dr.detach(self.to_world.matrix), np.float64)
+        pose = Pose.from_matrix(matrix.reshape(4, 4))
+        self._set(pose)
+        self._put(pose)
+        attached = dr.grad_enabled(self.to_world.matrix)
+        self._attached = self.to_world if attached else None
+
+    def _set(self, pose: Pose) -> None:
+        self.pose: Pose = pose
+        #: (6,), where an attack has moved it to from `pose`; see `rollout.offset`.
+        self.offset: np.ndarray = np.zeros(6)
+        self._inverse_scale = mi.Float(1 / pose.scale)
+        self._step = mi.Float(self.field.step_m * pose.scale)
+        dr.make_opaque(self._inverse_scale, self._step)
+
+    def _put(self, placed: Pose) -> None:
+        self.placed: Pose = placed
+        rotation = np.asarray(placed.rotation, np.float32)
         self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
-        self._origin = mi.Point3f(*map(float, translation))
+        self._origin = mi.Point3f(*map(float, placed.translation))
         dr.make_opaque(self._columns, self._origin)
+        self.live[:] = [*self._columns, self._origin, self._inverse_scale, self._step]
 
     def with_gain(self, gain: mi.Color3f) -> PosedField:
         """Return this field with its radiance multiplied, ray by ray.
@@ -66,6 +101,17 @@ class PosedField:
     def has_gradients(self) -> bool:
         """Whether derivatives by the field's parameters are asked for."""
         return self.field.has_gradients
+
+    @property
+    def has_pose_gradients(self) -> bool:
+        """Whether derivatives by `to_world` are asked for."""
+        return self._attached is not None
+
+    def attached(self) -> list[mi.Float]:
+        """Return the entries of `to_world` if derivatives by it are asked for."""
+        if self._attached is None:
+            return []
+        return [row for column in self._attached.matrix for row in column]
 
     @property
     def has_gain(self) -> bool:
@@ -114,6 +160,32 @@ class PosedField:
             return sum((c * x for c, x in axes), mi.Vector3f(0)) * self._inverse_scale
 
         return turn(d_origin), turn(d_direction)
+
+    def backward_pose(self, rays: Any, by_rays: Any) -> None:
+        """Accumulate the gradient of `to_world`, if it is asked for.
+
+        A field that moves sees rays move the other way; one that grows thins out.
+
+        Args:
+            rays: n rays.
+            by_rays: the objective's `RayGradient` by them, as the field sees them.
+        """
+        if self._attached is None:
+            return
+        with dr.resume_grad():
+            m = self._attached.matrix
+            columns = [mi.Vector3f(m[0, i], m[1, i], m[2, i]) for i in range(3)]
+            offset = rays.origin - mi.Point3f(m[0, 3], m[1, 3], m[2, 3])
+            scale = dr.cbrt(dr.dot(columns[0], dr.cross(columns[1], columns[2])))
+            # Cotangents of the local ray (o, d) = M^-1 (origin, direction)
+            result = -dr.log(scale) * by_rays.log_density
+            for column in columns:
+                to_local = column / dr.square(scale)
+                still = dr.detach(column)
+                result += dr.dot(to_local, offset) * dr.dot(still, by_rays.origin)
+                along = dr.dot(to_local, rays.direction)
+                result += along * dr.dot(still, by_rays.direction)
+            dr.backward_from(result)
 
     def interval(
         self, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float

@@ -128,6 +128,11 @@ class March:
             + self.moment * other.moment
         )
 
+    def differs(self) -> mi.Bool:
+        """Tell where any of it is not 0, (n,)."""
+        colour = dr.any(self.radiance != 0)
+        return colour | (self.opacity != 0) | (self.moment != 0)
+
     def images(self, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
         """Return the layers of a file of one image, row by row from the top left.
 

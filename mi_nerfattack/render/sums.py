@@ -159,6 +159,26 @@ class Slope:
             x * by_depth.moment,
         )
 
+    def growth(
+        self,
+        cotangent: March,
+        depths: Sequence[mi.Float],
+        colours: Sequence[mi.Color3f],
+    ) -> list[mi.Float]:
+        """Return an objective's derivative by the logarithm of each field's depth.
+
+        Args:
+            cotangent: the objective's derivative by the march.
+            depths: as given to :meth:`change`.
+            colours: likewise.
+        """
+        shared = cotangent.pair(self.by_depth)
+        pairs = zip(depths, colours, strict=True)
+        return [
+            x * (shared + self.given * dr.dot(colour, cotangent.radiance))
+            for x, colour in pairs
+        ]
+
 
 def mix(depths: Sequence[mi.Float], colours: Sequence[mi.Color3f]) -> mi.Color3f:
     """Return ``sum_k x_k L_k``, the light of a sample before it is absorbed."""

@@ -24,7 +24,6 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
-    RayTangent,
     Seen,
     Task,
     TaskQueue,
@@ -95,7 +94,6 @@ class FieldSensor(AbstractDifferentiableSensor):
         near = self.clip.near_m * ray_lengths(camera).ravel()
         self._near = mi.Float(near.tolist()) if self.clip.near_m else None
         self.renders: int = 0
-        self._offsets = np.zeros((len(objects), 6))
         self._wrenches: list[Any] | None = None
         # Tracing these in Python takes longer than running them.
         self._ahead = self.composite.ahead(self.scene[0], stop) if self.scene else None
@@ -186,7 +184,8 @@ class FieldSensor(AbstractDifferentiableSensor):
             d_rays, wrenches = self._frozen_by_rays(rays, seen, cotangent, first)
         else:
             d_rays = wrenches = None
-            for task in self.composite.tasks(self._fields, rays, seen, cotangent):
+            whole = Seen(cotangent)
+            for task in self.composite.tasks(self._fields, rays, seen, whole):
                 self._tasks.add(task)
         if wrenches is not None and self._wrenches is not None:
             pairs = zip(self._wrenches, wrenches, strict=True)
@@ -218,18 +217,18 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def _by_rays(
         self, rays: Rays, seen: Seen, cotangent: March, first: int
-    ) -> tuple[RayTangent | None, list[Any]]:
+    ) -> tuple[Any, list[Any]]:
         """Differentiate layers from `first` on: their sum if it is 0, and wrenches."""
         layers = range(first, len(self._fields))
         found = self.composite.backward_rays(
-            self._fields, rays, seen, cotangent, self.stop, layers
+            self._fields, rays, seen, Seen(cotangent), self.stop, layers
         )
         pairs = zip(self.objects, found[len(self.scene) - first :], strict=True)
         wrenches = [wrench_of(posed, rays, by_rays) for posed, by_rays in pairs]
         if first:
             return None, wrenches
-        d_origin = sum((by_origin for by_origin, _ in found), mi.Vector3f(0))
-        d_direction = sum((by_direction for _, by_direction in found), mi.Vector3f(0))
+        d_origin = sum((part.origin for part in found), mi.Vector3f(0))
+        d_direction = sum((part.direction for part in found), mi.Vector3f(0))
         return (d_origin, d_direction), wrenches
 
     def _state(self, *arguments: Any) -> list[Any]:
@@ -268,7 +267,7 @@ class FieldSensor(AbstractDifferentiableSensor):
 
     def offsets(self) -> np.ndarray:
         """See :meth:`AbstractDifferentiableSensor.offsets`."""
-        return self._offsets.copy()
+        return np.array([posed.offset for posed in self.objects]).reshape(-1, 6)
 
     def set_offsets(self, offsets: np.ndarray) -> None:
         """See :meth:`AbstractDifferentiableSensor.set_offsets`."""
@@ -278,15 +277,15 @@ class FieldSensor(AbstractDifferentiableSensor):
                 f"offsets: shape {offsets.shape}; expected finite "
                 f"({len(self.objects)}, 6)"
             )
-        self._offsets = offsets.copy()
         for posed, offset in zip(self.objects, offsets, strict=True):
             posed.move(*offset_pose(posed.pose, offset))
+            posed.offset = offset.copy()
 
     def offset_gradients(self) -> np.ndarray:
         """See :meth:`AbstractDifferentiableSensor.offset_gradients`."""
         assert self._wrenches is not None, "start_gradient(poses=True) comes before"
         wrenches = [[float(x[0]) for x in wrench] for wrench in self._wrenches]
-        pairs = zip(np.array(wrenches).reshape(-1, 6), self._offsets, strict=True)
+        pairs = zip(np.array(wrenches).reshape(-1, 6), self.offsets(), strict=True)
         return np.array([offset_gradient(*pair) for pair in pairs]).reshape(-1, 6)
 
     def _make_rays(

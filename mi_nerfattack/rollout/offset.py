@@ -63,9 +63,9 @@ def wrench_of(posed: PosedField, rays: Any, seen_as: Any) -> list[Any]:
     Args:
         posed: the object where it is.
         rays: n rays.
-        seen_as: derivatives by origin and direction, (3, n) each.
+        seen_as: the objective's `RayGradient`.
     """
-    by_origin, by_direction = seen_as
+    by_origin, by_direction = seen_as.origin, seen_as.direction
     arm = mi.Vector3f(rays.origin - posed.origin)
     torque = dr.cross(arm, by_origin) + dr.cross(rays.direction, by_direction)
     double = dr.float64_array_t(mi.Float)

@@ -135,8 +135,7 @@ class World:
     def show(self, appearance: Appearance) -> None:
         """Give the objects their textures and places."""
         self.set_textures(appearance.textures)
-        for sensor in self._sensors:
-            sensor.set_offsets(appearance.offsets)
+        self.surrogate.set_offsets(appearance.offsets)
 
     @property
     def renders(self) -> int:

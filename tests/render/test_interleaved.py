@@ -145,7 +145,8 @@ def test_rays_against_differences(rng: np.random.Generator) -> None:
     cotangent = small.random_march(rng, COUNT)
     seen = composite.render(fields, rays, 0.0)
     layers = composite.backward_rays(fields, rays, seen, cotangent, 0.0, [0, 1])
-    slopes = [a + b for a, b in zip(*layers, strict=True)]
+    first, second = layers
+    slopes = first.origin + second.origin, first.direction + second.direction
     tangent = rng.normal(size=(3, COUNT)).astype(np.float32)
     for name, slope in zip(("origin", "direction"), slopes, strict=True):
         before = getattr(rays, name)

@@ -138,7 +138,8 @@ def test_gradient_accumulates_over_passes(blob: Setting) -> None:
 
 def check_rays(setting: Setting, rng, h: float, tolerance: float) -> None:
     """Compare the derivatives by origin and direction with differences."""
-    _, d_origin, d_direction = setting.derivative(dr.ADMode.Backward)
+    by_rays = setting.derivative(dr.ADMode.Backward)[1]
+    d_origin, d_direction = by_rays.origin, by_rays.direction
     tangent = rng.normal(size=(3, COUNT)).astype(np.float32)
 
     def by_origin(s: float) -> float:
@@ -173,7 +174,8 @@ def test_direction_also_turns_the_view_of_an_ngp(rng: np.random.Generator) -> No
     width = dr.width(field.parameters()["table"])
     field.set_parameter("table", mi.Float(np.full(width, 0.5, np.float32)))
     setting = Setting(rng, field, inside=True)
-    _, d_origin, d_direction = setting.derivative(dr.ADMode.Backward)
+    by_rays = setting.derivative(dr.ADMode.Backward)[1]
+    d_origin, d_direction = by_rays.origin, by_rays.direction
     assert np.abs(d_origin.numpy()).max() < 1e-4
     assert np.abs(d_direction.numpy()).max() > 1e-2
     check_rays(setting, rng, 2e-3, 2e-2)
@@ -198,7 +200,8 @@ def test_skipped_cells_have_no_gradient(rng: np.random.Generator) -> None:
 def test_rays_that_miss_have_zero_gradient(blob: Setting) -> None:
     blob.origin = blob.origin + mi.Vector3f(0, 50, 0)
     packed = blob.attach()
-    _, d_origin, d_direction = blob.derivative(dr.ADMode.Backward)
+    by_rays = blob.derivative(dr.ADMode.Backward)[1]
+    d_origin, d_direction = by_rays.origin, by_rays.direction
     for value in (dr.grad(packed), d_origin, d_direction):
         assert (value.numpy() == 0).all()
 
@@ -207,7 +210,8 @@ def test_rays_that_miss_have_zero_gradient(blob: Setting) -> None:
 def test_gradient_is_finite_near_opacity_0_and_1(rng, density: float) -> None:
     setting = Setting(rng, small.homogeneous(density))
     packed = setting.attach()
-    _, d_origin, d_direction = setting.derivative(dr.ADMode.Backward)
+    by_rays = setting.derivative(dr.ADMode.Backward)[1]
+    d_origin, d_direction = by_rays.origin, by_rays.direction
     for value in (dr.grad(packed), d_origin, d_direction):
         assert np.isfinite(value.numpy()).all()
     assert np.abs(dr.grad(packed).numpy()).max() > 0

@@ -61,11 +61,13 @@ class MarchStep:
             if not self.source.learns_poses:
                 march_gradient(self.posed, rays, found, cotangent, STOP)
                 return
-            _, by_origin, by_direction = march_derivative(
+            _, by_rays = march_derivative(
                 dr.ADMode.Backward, self.posed, rays, found, cotangent, STOP
             )
         self.source.backward_rays(
-            draw, _put_back(by_origin, order), _put_back(by_direction, order)
+            draw,
+            _put_back(by_rays.origin, order),
+            _put_back(by_rays.direction, order),
         )
 
 

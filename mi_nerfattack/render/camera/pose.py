@@ -74,6 +74,15 @@ class Pose:
         """Turn points (..., 3) of the world, metres, into points of the field."""
         return (points - self.translation) @ self.rotation / self.scale
 
+    def is_near(self, other: Pose) -> bool:
+        """Tell whether two poses are equal to about single precision."""
+        parts = zip(
+            (self.rotation, self.translation, self.scale),
+            (other.rotation, other.translation, other.scale),
+            strict=True,
+        )
+        return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in parts)
+
     @property
     def yaw(self) -> float:
         """Angle about the world's z axis from its x axis to the field's, radians."""

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.composite import AbstractComposite
+from mi_nerfattack.render.composite import AbstractComposite, Seen
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
 
@@ -15,7 +15,7 @@ from mi_nerfattack.render.rays import March, Rays
 def attached(
     composite: AbstractComposite, posed: list[PosedField], rays: Rays, stop: float
 ) -> tuple[mi.Color3f, mi.Float]:
-    """March rays through fields; differentiable by the fields' parameters.
+    """March rays through fields; differentiable by the fields' parameters and poses.
 
     Works where the caller is being recorded, as an emitter's ``eval`` is in the loops
     of an integrator: the derivative replays all rays, whether they meet a field or
@@ -41,8 +41,7 @@ def _attached(
     sources = [
         array
         for item in posed
-        if item.field.has_gradients
-        for array in item.field.arrays()
+        for array in [*item.field.arrays(), *item.attached()]
         if dr.grad_enabled(array)
     ]
     if not sources:
@@ -74,13 +73,15 @@ class _Render(dr.CustomOp):
 
     def forward(self) -> None:
         tangent = self.composite.forward(*self.fixed, self.seen, self.stop)
-        self.set_grad_out((tangent.radiance, tangent.opacity))
+        self.set_grad_out((tangent.total.radiance, tangent.total.opacity))
 
     def backward(self) -> None:
         total: Any = self.grad_out()
         radiance, opacity = total
-        cotangent = March(radiance, opacity, mi.Float(0))
+        cotangent = Seen(March(radiance, opacity, mi.Float(0)))
         posed, rays = self.fixed
-        self.composite.backward_rays(
+        found = self.composite.backward_rays(
             posed, rays, self.seen, cotangent, self.stop, range(len(posed))
         )
+        for item, by_rays in zip(posed, found, strict=True):
+            item.backward_pose(rays, by_rays)

@@ -1,0 +1,110 @@
+"""The colours of a grid field's finest level, as one parameter of its appearance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.backend.colour import linear_to_srgb
+from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from mi_nerfattack.fields.grid import GridField
+
+_MARGIN = (
+    1e-4  # colours of a texture are cut to [margin, 1 - margin]: logits stay finite
+)
+
+
+class VertexColours:
+    """The sRGB colours c of the vertices of a grid field's finest level.
+
+    A grid field's colour is the sigmoid of a sum over levels, so that equal steps on
+    all of them add up, and colours far out on the sigmoid hardly move any more. Steps
+    in c do neither. With the texture's own colours c0::
+
+        raw(finest level) = raw(finest level of the texture) + logit(c) - logit(c0)
+
+    Where c = c0, this is the texture to the bit.
+
+    Args:
+        field: whose texture they are of.
+
+    Attributes:
+        value: tensor (n, 3), the colours; the same object for good.
+    """
+
+    def __init__(self, field: GridField) -> None:
+        self.field = field
+        level = field.levels()[-1]
+        self._start: int = level.vertices.start
+        index = dr.arange(mi.UInt32, level.resolution**3)
+        row = index // level.resolution
+        place = mi.Vector3f(index % level.resolution, row % level.resolution, 0)
+        place.z = row // level.resolution
+        extent = mi.Vector3f(*map(float, (field.upper - field.lower) / level.scale))
+        self._points = mi.Point3f(*map(float, field.lower)) + place * extent
+        self.value = mi.TensorXf()
+        self.read()
+
+    def read(self) -> None:
+        """Take the colours from the field's texture, which has been replaced.
+
+        They are computed when somebody looks at them.
+        """
+        with dr.suspend_grad():
+            self._texture = mi.Float(dr.detach(self.field.texture.array))
+            linear = self.field.eval_everywhere(
+                self._points, mi.Vector3f(0, 0, 1), mi.Bool(True)
+            )[1]
+            colours = dr.clip(linear_to_srgb(linear), _MARGIN, 1 - _MARGIN)
+            flat = dr.ravel(mi.Color3f(colours))
+            self._raw = _logit(flat)
+            shape = (dr.width(flat) // 3, 3)
+            mi.set_property(self.value, mi.TensorXf(dr.detach(flat), shape))
+
+    def replace(self, value: Any) -> mi.Float:
+        """Replace the colours.
+
+        Args:
+            value: tensor (n, 3) in (0, 1), sRGB.
+
+        Returns:
+            the texture (3 n_vertices,), raw colours; differentiable by `value`.
+
+        Raises:
+            InputError: another shape, or a colour that is not between 0 and 1.
+        """
+        if tuple(value.shape) != tuple(self.value.shape):
+            raise InputError(
+                f"colour: shape {tuple(value.shape)}; expected {self.value.shape}"
+            )
+        flat = mi.Float(value.array)
+        good = dr.detach((flat > 0) & (flat < 1))
+        if not dr.all(good):
+            count = int(dr.count(~good)[0])
+            raise InputError(
+                f"colour: {count} of {dr.width(flat)} values are not between 0 and 1; "
+                "clip them after each step, for instance to 0.01 and 0.99"
+            )
+        if value is not self.value:
+            mi.set_property(self.value, value)
+        change = _logit(flat) - self._raw
+        index = dr.arange(mi.UInt32, dr.width(self._texture))
+        finest = index >= 3 * self._start
+        change = dr.gather(mi.Float, change, index - 3 * self._start, finest)
+        return self._texture + dr.select(finest, change, 0)
+
+    def tangent(self, tangent: mi.Float) -> mi.Float:
+        """Return the texture's tangent (3 n_vertices,) from that of the colours."""
+        value = dr.detach(self.value.array)
+        slope = tangent / (value * (1 - value))
+        index = dr.arange(mi.UInt32, dr.width(self._texture))
+        finest = index >= 3 * self._start
+        return dr.gather(mi.Float, slope, index - 3 * self._start, finest) & finest
+
+
+def _logit(colour: mi.Float) -> mi.Float:
+    return dr.log(colour / (1 - colour))

@@ -1,0 +1,96 @@
+"""What `field_integrator` can be differentiated by, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_nerfattack.errors import InputError
+from mi_nerfattack.plugins.field_emitter import FieldEmitter
+
+
+def check(integrator: Any, scene: mi.Scene) -> bool:
+    """Look for parameters with gradients enabled, and refuse what is not computed.
+
+    Args:
+        integrator: a `field_integrator`.
+        scene: that it renders.
+
+    Returns:
+        whether the nested integrator has to be differentiated.
+
+    Raises:
+        InputError: a derivative is not computed; the message names what works.
+    """
+    params = mi.traverse(scene)
+    attached = [
+        (key, node, flags)
+        for key, (value, kind, node, flags) in params.properties.items()
+        if dr.grad_enabled(mi.get_property(value, kind, node) if kind else value)
+    ]
+    sensors = [(key, node) for key, node, _ in attached if isinstance(node, mi.Sensor)]
+    others = [
+        key
+        for key, node, flags in attached
+        if not isinstance(node, mi.Sensor)
+        and not _is_own(integrator, node)
+        and _has_effect(integrator, key, flags)
+    ]
+    if sensors:
+        check_camera(integrator, scene, sensors[0][0])
+    shared = _shared(integrator, scene, [node for _, node, _ in attached])
+    for key in [*others, *shared]:
+        _check_behind(integrator, key)
+    return bool(others or shared)
+
+
+def check_camera(integrator: Any, scene: mi.Scene, key: str) -> None:
+    """Raise InputError where rays have no derivative by the camera."""
+    if scene.shapes() or integrator.behind is not None:
+        raise InputError(
+            f"{key}: surfaces and a nested integrator have no derivative by the "
+            "camera; take them out of the scene, or differentiate by to_world of the "
+            "fields"
+        )
+
+
+def _is_own(integrator: Any, node: Any) -> bool:
+    return any(node is volume for volume in integrator.volumes)
+
+
+def _has_effect(integrator: Any, key: str, flags: Any) -> bool:
+    """Tell whether the image depends on a parameter that is no field's."""
+    if flags & mi.ParamFlags.Discontinuous:
+        raise InputError(
+            f"{key}: moves a surface, at which fields end; that has no derivative. "
+            "Differentiate by to_world of the fields, or leave them out and use "
+            "prb_projective"
+        )
+    return integrator.behind is not None
+
+
+def _shared(integrator: Any, scene: mi.Scene, attached: list[Any]) -> list[str]:
+    """Name the attached fields that an emitter shows, too."""
+    if integrator.behind is None:
+        return []
+    return [
+        volume.id()
+        for emitter in scene.emitters()
+        if isinstance(emitter, FieldEmitter)
+        for volume in emitter.volumes
+        if any(volume is node for node in attached)
+    ]
+
+
+def _check_behind(integrator: Any, key: str) -> None:
+    if not isinstance(integrator.behind, mi.ad.integrators.common.RBIntegrator):
+        raise InputError(
+            f"{key}: its effect through the nested {integrator.behind.class_name()} "
+            'has no derivative; nest <integrator type="prb"/> in its place'
+        )
+    if integrator.relighting is not None:
+        raise InputError(
+            f"{key}: has no derivative where fields are relit; set relit to false"
+        )
