@@ -15,7 +15,7 @@ import mitsuba as mi
 from mi_nerfattack.backend import llvm, variant
 from mi_nerfattack.errors import SetupError
 
-__all__: list[str] = []
+__all__ = ["register"]
 
 _MODULES = (
     "field_volume",
@@ -34,19 +34,25 @@ _REGISTERED = {
 }
 
 
-def _register(name: str) -> None:
-    """Register all plugins for the active variant.
+def register() -> None:
+    """Register all plugins for the active variant, if any, or stubs that say why not.
 
     Each variant has base classes of its own, so the modules are executed again when
     the variant has changed.
+
+    Raises:
+        SetupError: LLVM is missing or too old.
     """
+    name = mi.variant()
+    if name is None:
+        return
     if reason := variant.obstacle(name):
         _refuse(name, reason)
         return
     if name.startswith("llvm"):
         llvm.check_version()
     # A package that imports `mitsuba.ad` replaces mi.ad with a copy that no change of
-    # variant reloads; a scene ignores an integrator with a base class of another variant.
+    # variant reloads, and scenes ignore integrators whose base class is out of date.
     setattr(mi, "ad", importlib.import_module("mitsuba.python.ad"))  # noqa: B010
     for module in _MODULES:
         full = f"{__name__}.{module}"
@@ -82,5 +88,4 @@ def _stub(name: str, active: str, reason: str) -> Any:
     return construct
 
 
-if active := mi.variant():
-    _register(active)
+register()
