@@ -298,6 +298,19 @@ def test_doctor_as_json_and_as_table(run):
     assert re.search(r"LLVM +\d+\.\d+", table)
 
 
+def test_doctor_lists_what_developers_need_only_if_asked():
+    plain, asked = ([f.name for f in doctor.examine(d)] for d in (False, True))
+    assert {"mitsuba", "onnx"} <= set(plain) and {"pytest", "ruff"}.isdisjoint(plain)
+    assert {*plain, "pytest", "ruff", "sphinx"} <= set(asked)
+    assert len(set(asked)) == len(asked)
+
+
+def test_doctor_says_once_how_to_install_an_extra(capsys):
+    absent = [doctor.Finding(name, "not installed", "absent", "fetch") for name in "ab"]
+    doctor.print_table(absent)
+    assert capsys.readouterr().out.count("fetch") == 1
+
+
 def test_doctor_without_llvm_tells_what_to_do():
     environment = os.environ | {llvm.VARIABLE: "/nowhere/libLLVM.so"}
     command = [*COMMAND, "doctor", "--json"]

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from mi_nerfattack.capture.mesh.atlas import Atlas, lay_out
+from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh, read_mesh
 from mi_nerfattack.capture.mesh.surface import face_normals, has_area
 from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
@@ -42,13 +43,8 @@ class Surfaces:
     @classmethod
     def of(cls, shapes: Sequence[Any], texel_m: float) -> Surfaces:
         """Take those of meshes; texels of materials have an edge of so many metres."""
-        found = []
-        for shape in shapes:
-            parameters = mi.traverse(shape)
-            points: Any = parameters["vertex_positions"]
-            faces: Any = parameters["faces"]
-            found.append(points.numpy().reshape(-1, 3)[faces.numpy().reshape(-1, 3)])
-        corners = np.concatenate(found).astype(np.float64)
+        meshes = [read_mesh(shape) for shape in shapes]
+        corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
         corners = corners[has_area(corners)]
         return cls(corners, lay_out(corners, _LIGHT_M), lay_out(corners, texel_m))
 
@@ -91,21 +87,11 @@ class Surfaces:
 
     def _mesh(self, image: np.ndarray) -> Any:
         texture = {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True}
-        properties = mi.Properties()
-        properties["bsdf"] = mi.load_dict(
-            {"type": "diffuse", "reflectance": texture | {"wrap_mode": "clamp"}}
-        )
-        count = len(self.corners)
-        mesh = mi.Mesh(
-            "lit", 3 * count, count, has_vertex_texcoords=True, props=properties
-        )
-        parameters = mi.traverse(mesh)
+        material = {"type": "diffuse", "reflectance": texture | {"wrap_mode": "clamp"}}
+        faces = np.arange(3 * len(self.corners)).reshape(-1, 3)
         uv = self.fine.uv * [1, -1] + [0, 1]  # from the top left
-        parameters["vertex_positions"] = mi.Float(np.float32(self.corners.ravel()))
-        parameters["vertex_texcoords"] = mi.Float(np.float32(uv.ravel()))
-        parameters["faces"] = mi.UInt32(np.arange(3 * count, dtype=np.uint32))
-        parameters.update()
-        return mesh
+        arrays = MeshArrays(self.corners.reshape(-1, 3), faces, uv=uv.reshape(-1, 2))
+        return make_mesh("lit", arrays, mi.load_dict(material))
 
 
 def _reflectance(scene: Any, eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:

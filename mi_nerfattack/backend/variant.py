@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import sys
 
 import mitsuba as mi
 
@@ -26,8 +27,8 @@ def ensure() -> str:
     llvm_ad_rgb.
 
     Raises:
-        SetupError: the variant is unknown, cannot differentiate, is polarised, or
-            its backend (LLVM, CUDA) is missing or too old.
+        SetupError: the variant is unknown, the plugins do not run in it, or its
+            backend (LLVM, CUDA) is missing or too old.
     """
     name = mi.variant()
     if name is None:
@@ -44,7 +45,21 @@ def ensure() -> str:
 
 def usable() -> list[str]:
     """Name the variants of this Mitsuba that the plugins run in."""
-    return [name for name in mi.variants() if _is_usable(name)]
+    return [name for name in mi.variants() if obstacle(name) is None]
+
+
+def obstacle(name: str) -> str | None:
+    """Return why the plugins refuse a variant, what it "is" or "has"; None if not."""
+    if "_ad_" not in name:
+        return "has no derivatives"
+    if name.endswith("_polarized"):
+        return "is polarised"
+    if name.startswith("metal"):
+        return (
+            "is untried: nobody has run the plugins on Metal, which rounds the float64 "
+            "states of a drive to float32"
+        )
+    return None
 
 
 def install() -> None:
@@ -60,15 +75,11 @@ def _check_name(name: str) -> None:
         raise SetupError(
             f"{VARIABLE}: unknown variant {name!r}; allowed: {', '.join(usable())}"
         )
-    if not _is_usable(name):
+    if reason := obstacle(name):
         raise SetupError(
-            f"variant {name!r}: has no derivatives or is polarised; call "
-            f"mitsuba.set_variant('{DEFAULT}') or set {VARIABLE}={DEFAULT}"
+            f"variant {name!r} {reason}; call mitsuba.set_variant('{DEFAULT}') or set "
+            f"{VARIABLE}={DEFAULT}"
         )
-
-
-def _is_usable(name: str) -> bool:
-    return "_ad_" in name and not name.endswith("_polarized")
 
 
 def _check_backend(name: str) -> None:
@@ -84,24 +95,18 @@ def _check_backend(name: str) -> None:
 
 
 def _on_change(old: str | None, new: str) -> None:
-    """Register the plugins, or stubs that say why not; log errors, never raise.
+    """Import or reload the plugins, which register themselves; log errors, never raise.
 
-    Mitsuba calls all callbacks in no order, and an exception in one of them keeps
+    Mitsuba 3.9 calls all callbacks in no order, and an exception in one of them keeps
     the others from running.
     """
     del old
     try:
-        if not _is_usable(new):
-            importlib.import_module(_PLUGINS).refuse(new, usable())
-            return
-        if new.startswith("llvm"):
-            llvm.check_version()
-        _register()
+        if _PLUGINS in sys.modules:
+            importlib.reload(sys.modules[_PLUGINS])
+        else:
+            importlib.import_module(_PLUGINS)
     except NerfAttackError as err:
         _log.error("plugins not registered for %s: %s", new, err)
     except Exception:  # whatever it is, other callbacks are to run
         _log.exception("plugins not registered for %s", new)
-
-
-def _register() -> None:
-    importlib.import_module(_PLUGINS).register()

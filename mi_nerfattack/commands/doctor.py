@@ -17,11 +17,14 @@ class Doctor:
     json: bool = False
     """Print one line of JSON in place of the table."""
 
+    developer: bool = False
+    """Also list what only tests, checks of the code and the documentation need."""
+
     def run(self) -> Result:
         """Print the findings."""
         from mi_nerfattack.system import doctor
 
-        findings = doctor.examine()
+        findings = doctor.examine(self.developer)
         return Result(
             doctor.document(findings),
             lambda: doctor.print_table(findings),

@@ -26,6 +26,7 @@ from mi_nerfattack.system.extras import install_hint
 from mi_nerfattack.system.processes import module_command
 
 DISTRIBUTION = "mi-nerfattack"
+DEVELOPER_EXTRAS = ("docs", "test", "dev")
 MIN_MEMORY_BYTES = 4 << 30
 MIN_DISK_BYTES = 1 << 30
 PROBE_SECONDS = 120
@@ -49,11 +50,16 @@ class Finding:
     remedy: str = ""
 
 
-def examine() -> list[Finding]:
-    """Look at everything; no finding raises."""
+def examine(developer: bool = False) -> list[Finding]:
+    """Look at everything; no finding raises.
+
+    Args:
+        developer: also look for the packages that only tests, checks of the code and
+            the documentation need.
+    """
     return [
         Finding("python", f"{platform.python_version()} ({sys.executable})"),
-        *_packages(),
+        *_packages(developer),
         _llvm(),
         *_variants(),
         *_machine(),
@@ -88,14 +94,18 @@ def print_table(findings: Sequence[Finding]) -> None:
         table.add_row(escape(item.name), escape(item.value), state)
     console = Console()
     console.print(table)
+    remedies: dict[str, list[str]] = {}
     for item in findings:
-        if item.remedy:
-            console.print(f"{item.name}: {item.remedy}", markup=False, soft_wrap=True)
+        remedies.setdefault(item.remedy, []).append(item.name)
+    for remedy, names in remedies.items():
+        if remedy:
+            line = f"{', '.join(names)}: {remedy}"
+            console.print(line, markup=False, soft_wrap=True)
     verdict = "can" if can_run(findings) else "cannot"
     console.print(f"The main job {verdict} run on this machine.", highlight=False)
 
 
-def _packages() -> Iterator[Finding]:
+def _packages(developer: bool) -> Iterator[Finding]:
     try:
         own = importlib.metadata.version(DISTRIBUTION)
     except importlib.metadata.PackageNotFoundError:
@@ -110,6 +120,8 @@ def _packages() -> Iterator[Finding]:
             yield _package(item, "missing", f"run \"pip install '{_spec(item)}'\"")
     extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
     for extra in extras:
+        if extra in DEVELOPER_EXTRAS and not developer:
+            continue
         remedy = f"for {extra}, {install_hint(extra)}"
         for item in needed:
             if item.name != DISTRIBUTION and _belongs(item, extra):

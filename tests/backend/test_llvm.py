@@ -8,6 +8,7 @@ import sysconfig
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import pytest
 
 from mi_nerfattack import variant
@@ -223,12 +224,19 @@ print(str(top / "lib") in maps, "libc++.so.1.0" in maps)
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("scalar_rgb", "derivatives"), ("llvm_ad_mono_polarized", "polarised")],
+    [
+        ("scalar_rgb", "no derivatives"),
+        ("llvm_ad_mono_polarized", "polarised"),
+        ("metal_ad_rgb", "nobody has run the plugins on Metal"),
+    ],
 )
-def test_variant_without_derivatives_is_refused(monkeypatch, name, reason):
-    monkeypatch.setattr(variant.mi, "variant", lambda: name)
+def test_variants_that_the_plugins_do_not_run_in_are_refused(monkeypatch, name, reason):
+    known = [*mi.variants(), "metal_ad_rgb"]  # which Mitsuba has on macOS
+    monkeypatch.setattr(mi, "variants", lambda: known)
+    monkeypatch.setattr(mi, "variant", lambda: name)
     with pytest.raises(SetupError, match=f"{reason}.*llvm_ad_rgb"):
         variant.ensure()
+    assert name not in variant.usable()
 
 
 def test_unknown_variant_is_refused(monkeypatch):
@@ -255,10 +263,10 @@ def test_a_set_variant_is_kept(no_variant_left):
 def test_failing_registration_does_not_stop_the_change(
     monkeypatch, caplog, no_variant_left
 ):
-    def fail() -> None:
-        raise ValueError("broken plugin")
+    def fail(name: str) -> None:
+        raise ValueError(f"broken plugin in {name}")
 
-    monkeypatch.setattr(variant, "_register", fail)
+    monkeypatch.setattr(variant, "obstacle", fail)  # which the plugins ask first
     variant.mi.set_variant("llvm_ad_mono")
     variant.mi.set_variant("llvm_ad_rgb")
     assert variant.mi.variant() == "llvm_ad_rgb"

@@ -45,7 +45,7 @@ def test_a_picture_is_blurred_by_pixels_not_by_dozens():
     assert 0.5 < np.median(moved) < 4 and np.max(moved) < 15
 
 
-def floor() -> mi.Mesh:
+def floor() -> mi.Shape:
     corners = np.array([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])
     part = MeshPart(corners, np.array([[0, 1, 2], [0, 2, 3]]), (0.5, 0.4, 0.3))
     [shape] = mitsuba_shapes(TexturedMesh("floor", (part,))).values()

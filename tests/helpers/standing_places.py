@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh
 from mi_nerfattack.deploy.roadside.surroundings import Surroundings
 from mi_nerfattack.experiment.checks.standing import (
     Solid,
@@ -100,7 +101,7 @@ class Judge:
         return ray, hit.t.numpy(), len(poses)
 
 
-def faces(field: GridField, pose: Pose) -> mi.Mesh:
+def faces(field: GridField, pose: Pose) -> mi.Shape:
     """Return the outside of the solid cells of an object, of a lattice of 32."""
     cells, count = solid_cells(field), 32
     corners = np.concatenate(list(_quads(np.pad(cells, 1))))
@@ -108,12 +109,7 @@ def faces(field: GridField, pose: Pose) -> mi.Mesh:
     world = pose.scale * local @ pose.rotation.T + pose.translation
     quads = np.arange(len(world)).reshape(-1, 4)
     index = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    mesh = mi.Mesh("object", len(world), len(index))
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(world.ravel().tolist())
-    params["faces"] = mi.UInt32(index.ravel().tolist())
-    params.update()
-    return mesh
+    return make_mesh("object", MeshArrays(world, index))
 
 
 def solid_cells(field: GridField) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import signal
@@ -12,8 +13,10 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
+import mi_nerfattack.plugins
 from mi_nerfattack.backend import llvm
 from mi_nerfattack.backend import variant as variants
+from mi_nerfattack.errors import SetupError
 from mi_nerfattack.fields import GridField, GridLayout, save_field
 
 USE = """
@@ -61,8 +64,8 @@ for name in ("llvm_ad_rgb", "llvm_ad_mono", "scalar_rgb", "llvm_ad_spectral",
     mi.set_variant(name)
     if name.startswith("llvm") and not name.endswith("polarized"):
         use()
-import mi_nerfattack.plugins
-mi_nerfattack.plugins.register()
+import importlib, mi_nerfattack.plugins
+importlib.reload(mi_nerfattack.plugins)
 use()
 """,
 }
@@ -125,6 +128,19 @@ def test_other_variants_say_which_to_use(name: str) -> None:
                 mi.load_string(text, parallel=False)
             with pytest.raises(RuntimeError, match=message):
                 mi.load_dict({"type": plugin}, parallel=False)
+
+
+def test_metal_is_refused_with_its_reason(monkeypatch):
+    made = {}
+    for kind in ("texture", "emitter", "integrator", "sensor"):
+        monkeypatch.setattr(mi, f"register_{kind}", made.__setitem__)
+    monkeypatch.setattr(mi, "variant", lambda: "metal_ad_rgb")
+    importlib.reload(mi_nerfattack.plugins)
+    assert set(made) == {name for names in PLUGINS.values() for name in names}
+    for name, make in made.items():
+        message = f"{name}: variant metal_ad_rgb is untried.* llvm_ad_rgb"
+        with pytest.raises(SetupError, match=message):
+            make(None)
 
 
 def test_an_interrupt_waits_until_the_plugins_are_registered(monkeypatch):

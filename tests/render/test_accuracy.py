@@ -17,6 +17,7 @@ from helpers.exact_fields import (
     rays_towards,
 )
 
+from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh
 from mi_nerfattack.fields import save_field
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import DepthComposite
@@ -165,12 +166,7 @@ def window(path: Path, x: float) -> None:
     for i in range(4):
         j = (i + 1) % 4
         faces += [(i, j, 4 + j), (i, 4 + j, 4 + i)]
-    mesh = mi.Mesh("wall", 8, len(faces))
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = corners.ravel()
-    params["faces"] = np.array(faces, np.uint32).ravel()
-    params.update()
-    mesh.write_ply(str(path))
+    make_mesh("wall", MeshArrays(corners, np.array(faces))).write_ply(str(path))
 
 
 @pytest.mark.parametrize("x", [1.5, 0.2, -1.5], ids=["before", "within", "behind"])

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy, srgb_to_linear_numpy
+from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, make_mesh
 from mi_nerfattack.errors import InputError
 
 #: A cube's faces as seen from outside: outward normal, right and up of the picture.
@@ -208,33 +209,13 @@ def mitsuba_shapes(mesh: TexturedMesh) -> dict[str, Any]:
 
 
 def _mitsuba_shape(part: MeshPart) -> Any:
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_material(part))
-    properties["face_normals"] = part.normals is None
-    mesh = mi.Mesh(
-        "part",
-        vertex_count=len(part.vertices),
-        face_count=len(part.faces),
-        has_vertex_normals=part.normals is not None,
-        has_vertex_texcoords=part.uv is not None,
-        props=properties,
-    )
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(np.float32(part.vertices.ravel()))
-    parameters["faces"] = mi.UInt32(np.uint32(part.faces.ravel()))
-    if part.normals is not None:
-        parameters["vertex_normals"] = mi.Float(np.float32(part.normals.ravel()))
-    if part.uv is not None:
-        # Mitsuba's bitmaps have their origin at the top left
-        uv = np.float32(part.uv * [1, -1] + [0, 1])
-        parameters["vertex_texcoords"] = mi.Float(uv.ravel())
-    parameters.update()
-    if part.vertex_colour is not None:
-        # a texture holds the part's colour already
-        tint = np.array(part.colour) if part.texture is None else np.ones(3)
-        colour = part.vertex_colour * tint
-        mesh.add_attribute("vertex_color", 3, colour.ravel().tolist())
-    return mesh
+    colour = part.vertex_colour
+    if colour is not None and part.texture is None:
+        colour = colour * np.array(part.colour)  # a texture holds the part's already
+    # Mitsuba's bitmaps have their origin at the top left
+    uv = None if part.uv is None else part.uv * [1, -1] + [0, 1]
+    arrays = MeshArrays(part.vertices, part.faces, part.normals, uv, colour)
+    return make_mesh("part", arrays, mi.load_dict(_material(part)))
 
 
 def _material(part: MeshPart) -> dict[str, Any]:

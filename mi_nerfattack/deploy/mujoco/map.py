@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_uint8, srgb_to_linear_numpy
+from mi_nerfattack.capture.mesh.mitsuba_mesh import MeshArrays, read_mesh
 from mi_nerfattack.deploy.built_in import BuiltInObject
 from mi_nerfattack.deploy.mujoco.module import mujoco
 from mi_nerfattack.errors import InputError
@@ -167,17 +169,18 @@ def _read_shape(shape: Any) -> DrawnMesh:
     name, bsdf = shape.id(), shape.bsdf()
     # a rectangle calls itself a mesh, but has no arrays
     if shape.class_name() == "Rectangle":
-        vertices, faces, normals, uv = _rectangle_arrays(shape)
+        arrays = _rectangle_arrays(shape)
     elif shape.is_mesh():
-        vertices, faces, normals, uv = _mesh_arrays(shape)
+        arrays = read_mesh(shape)
     else:
         raise InputError(
             f"shape {name!r}: MuJoCo cannot draw a {shape.class_name()}; take a mesh "
             "or a rectangle"
         )
+    uv = np.zeros((len(arrays.vertices), 2)) if arrays.uv is None else arrays.uv
+    drawn = partial(DrawnMesh, name, arrays.vertices, arrays.faces, arrays.normals)
     if shape.is_emitter():
-        radiance = _emitted(shape)
-        return DrawnMesh(name, vertices, faces, normals, uv, radiance, False, True)
+        return drawn(uv, _emitted(shape), two_sided=False, shines=True)
     flags = bsdf.flags()
     if mi.has_flag(flags, mi.BSDFFlags.Transmission) or mi.has_flag(
         flags, mi.BSDFFlags.Null
@@ -196,26 +199,10 @@ def _read_shape(shape: Any) -> DrawnMesh:
         uv, albedo = _bake(bsdf, uv)
     except InputError as error:
         raise InputError(f"shape {name!r}: {error}") from error
-    two_sided = "TwoSided" in bsdf.class_name()
-    return DrawnMesh(name, vertices, faces, normals, uv, albedo, two_sided)
+    return drawn(uv, albedo, two_sided="TwoSided" in bsdf.class_name())
 
 
-def _mesh_arrays(shape: Any) -> tuple[Any, ...]:
-    parameters = mi.traverse(shape)
-
-    def rows(key: str, width: int) -> np.ndarray:
-        return np.array(parameters[key]).reshape(-1, width)
-
-    vertices, faces = rows("vertex_positions", 3), rows("faces", 3).astype(np.int64)
-    is_smooth = shape.has_vertex_normals() and not shape.has_face_normals()
-    normals = rows("vertex_normals", 3) if is_smooth else None
-    uv = np.zeros((len(vertices), 2))
-    if shape.has_vertex_texcoords():
-        uv = rows("vertex_texcoords", 2).astype(np.float64)
-    return vertices.astype(np.float64), faces, normals, uv
-
-
-def _rectangle_arrays(shape: Any) -> tuple[Any, ...]:
+def _rectangle_arrays(shape: Any) -> MeshArrays:
     to_world: Any = mi.traverse(shape)["to_world"]
     matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
     square = np.array([(-1, -1, 0, 1), (1, -1, 0, 1), (1, 1, 0, 1), (-1, 1, 0, 1)])
@@ -224,7 +211,7 @@ def _rectangle_arrays(shape: Any) -> tuple[Any, ...]:
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    return vertices, faces, None, uv
+    return MeshArrays(vertices, faces, uv=uv)
 
 
 def _emitted(shape: Any) -> np.ndarray:
