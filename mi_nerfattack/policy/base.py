@@ -7,8 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_nerfattack.errors import InputError
-
 #: What a policy carries from one control period to the next: arrays of its own kind.
 Memory = tuple[Any, ...]
 
@@ -63,29 +61,6 @@ class AbstractPolicy(ABC):
         """
         del memory, d_memory
         return self.vjp(image, goal, cotangent)[1], ()
-
-    def step_jvp(
-        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
-    ) -> tuple[Any, Memory]:
-        """Multiply the derivative of `step` by tangents (forward mode).
-
-        Args:
-            image: as given to `step`.
-            goal: likewise.
-            memory: likewise.
-            t_image: tangent of the image, a tensor of its shape.
-            t_memory: tangent of `memory`, of its structure; ``()`` stands for zeros.
-
-        Returns:
-            Tangents of the control, a row (n,), and of the memory that `step` returns.
-
-        Raises:
-            InputError: the policy has no forward derivative.
-        """
-        del image, goal, memory, t_image, t_memory
-        raise InputError(
-            f"{type(self).__name__}: has no forward derivative; implement step_jvp"
-        )
 
     def planes(self, image: Any, memory: Memory) -> np.ndarray:
         """Return what `step` makes of images before it looks at them.

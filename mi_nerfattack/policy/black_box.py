@@ -96,12 +96,6 @@ class AbstractBlackBox(AbstractPolicy):
         """Raise InputError."""
         self._refuse()
 
-    def step_jvp(
-        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
-    ) -> NoReturn:
-        """Raise InputError."""
-        self._refuse()
-
     def _refuse(self) -> NoReturn:
         raise InputError(
             f"{self.name}: is a black box, which has no derivatives; policies of the "

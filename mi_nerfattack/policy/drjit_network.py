@@ -1,4 +1,4 @@
-"""Networks of Dr.Jit (``drjit.nn``) as torch modules, with both derivatives."""
+"""Networks of Dr.Jit (``drjit.nn``) as torch modules, with their derivatives."""
 
 from __future__ import annotations
 
@@ -49,7 +49,6 @@ class _Call(torch.autograd.Function):
         del output
         ctx.network = inputs[0]
         ctx.save_for_backward(inputs[1])
-        ctx.save_for_forward(inputs[1])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[None, torch.Tensor]:
@@ -63,19 +62,6 @@ class _Call(torch.autograd.Function):
             dr.enqueue(dr.ADMode.Backward, result)
             dr.traverse(dr.ADMode.Backward)
             return None, _from_drjit(dr.grad(leaf), features)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> torch.Tensor:
-        """Evaluate again on dual numbers."""
-        (features,) = ctx.saved_tensors
-        leaf = _to_drjit(features)
-        with dr.resume_grad(), dr.isolate_grad():
-            dr.enable_grad(leaf)
-            result = _call(ctx.network, leaf)
-            dr.set_grad(leaf, _to_drjit(tangents[1]))
-            dr.enqueue(dr.ADMode.Forward, leaf)
-            dr.traverse(dr.ADMode.Forward)
-            return _from_drjit(dr.grad(result), features)
 
 
 def _call(network: Callable[[Any], Any], features: Any) -> Any:

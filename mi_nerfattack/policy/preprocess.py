@@ -1,7 +1,7 @@
 """From the camera's image to a network's input: differentiable transforms.
 
 A transform maps planes (n, c, h, w) to planes. All but the transfer function of
-`ToLinear` are linear or affine; all are differentiable in reverse and forward mode.
+`ToLinear` are linear or affine; all are differentiable.
 """
 
 from __future__ import annotations

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
 import torch
-from torch.autograd import forward_ad
 
 from mi_nerfattack.backend.torch_arrays import to_row, to_tensor, to_torch
 from mi_nerfattack.errors import InputError
@@ -109,22 +107,6 @@ class TorchPolicy(AbstractPolicy):
         _, (d_image, *rest) = self._pull_back(image, goal, memory, cotangent, d_memory)
         return to_tensor(d_image, image), tuple(rest)
 
-    def step_jvp(
-        self, image: Any, goal: Any, memory: Memory, t_image: Any, t_memory: Memory
-    ) -> tuple[Any, Memory]:
-        """Evaluate the module on dual numbers."""
-        self._check(image, goal, memory)
-        primals = (to_torch(image), *memory)
-        tangents = (to_torch(t_image), *(t_memory or map(torch.zeros_like, memory)))
-        with torch.no_grad(), forward_mode():
-            duals = [
-                forward_ad.make_dual(primal, tangent.to(primal))
-                for primal, tangent in zip(primals, tangents, strict=True)
-            ]
-            control, after = self._evaluate(duals[0], goal, tuple(duals[1:]))
-            t_control, *t_after = [_tangent(value) for value in (control, *after)]
-        return to_row(t_control, image), tuple(t_after)
-
     def _pull_back(
         self, image: Any, goal: Any, memory: Memory, cotangent: Any, d_memory: Memory
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
@@ -212,30 +194,6 @@ class TorchPolicy(AbstractPolicy):
         """Return the type of the module's parameters and buffers, if it has any."""
         tensors = (*self.module.parameters(), *self.module.buffers())
         return next((t.dtype for t in tensors if t.is_floating_point()), None)
-
-
-@contextmanager
-def forward_mode() -> Iterator[None]:
-    """Open a level of torch's forward mode.
-
-    The fused kernels of cuDNN and oneDNN have no forward derivative of recurrent
-    layers and are not used. Switching them, and opening the level, warns of nothing
-    that a caller could change.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
-        warnings.filterwarnings("ignore", "TF32 acceleration on top", UserWarning)
-        with (
-            torch.backends.mkldnn.flags(enabled=False),
-            torch.backends.cudnn.flags(enabled=False),
-            forward_ad.dual_level(),
-        ):
-            yield
-
-
-def _tangent(value: torch.Tensor) -> torch.Tensor:
-    tangent = forward_ad.unpack_dual(value).tangent
-    return torch.zeros_like(value) if tangent is None else tangent
 
 
 def _own_goal(module: torch.nn.Module) -> AbstractGoal:

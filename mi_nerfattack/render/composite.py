@@ -120,7 +120,6 @@ class AbstractComposite(ABC):
         rays: Rays,
         seen: Seen,
         stop: float,
-        t_rays: RayTangent | None = None,
     ) -> March:
         """Return the tangent of the total, from those of the fields' parameters.
 
@@ -129,7 +128,6 @@ class AbstractComposite(ABC):
             rays: likewise.
             seen: what it returned.
             stop: as given to :meth:`render`.
-            t_rays: tangents of origins and directions, if they have any.
         """
 
     def ahead(self, scene: Layer, stop: float) -> AbstractSceneMarch | None:
@@ -257,15 +255,12 @@ class DepthComposite(AbstractComposite):
         rays: Rays,
         seen: Seen,
         stop: float,
-        t_rays: RayTangent | None = None,
     ) -> March:
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
-        if t_rays is not None:
-            only_fields(posed, "a backdrop is not differentiated by rays", DETACH)
         tangents = [
-            march_derivative(mode, item, rays, layer, none, stop, t_rays)[0]
-            if item.has_gradients or t_rays is not None
+            march_derivative(mode, item, rays, layer, none, stop)[0]
+            if item.has_gradients
             else none
             for item, layer in zip(rays.light(posed), seen.layers, strict=True)
         ]

@@ -81,15 +81,9 @@ class InterleavedComposite(AbstractComposite):
         rays: Rays,
         seen: Seen,
         stop: float,
-        t_rays: RayTangent | None = None,
     ) -> March:
-        """See :meth:`AbstractComposite.forward`; not by the rays."""
+        """See :meth:`AbstractComposite.forward`."""
         fields, mode = _fields(posed), dr.ADMode.Forward
-        if t_rays is not None:
-            raise TypeError(
-                "InterleavedComposite: no forward mode by the rays; use the depth "
-                "composite, or keep the camera detached"
-            )
         if not any(item.has_gradients for item in fields):
             return March()
         with dr.suspend_grad():

@@ -51,7 +51,7 @@ PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
 
 #: Maps local points, directions in a form of its own, and a mask to density and colour.
 Evaluate = Callable[[Any, Any, Any], tuple[Any, Any]]
-#: Tangents or cotangents of origins and directions of n rays, `mi.Vector3f` each.
+#: Derivatives by origins and directions of n rays, `mi.Vector3f` each.
 RayTangent = tuple[Any, Any]
 
 
@@ -97,7 +97,6 @@ def march_derivative(  # noqa: D417  one entry describes three
     primal: March,
     cotangent: March,
     stop: float = STOP,
-    t_rays: RayTangent | None = None,
 ) -> tuple[March, mi.Vector3f, mi.Vector3f]:
     """Replay :func:`march` and propagate derivatives through the field.
 
@@ -117,8 +116,6 @@ def march_derivative(  # noqa: D417  one entry describes three
         primal: the result of :func:`march`.
         cotangent: derivative of the objective by radiance, opacity and moment;
             ignored in forward mode.
-        t_rays: tangents of origin and direction, (3, n) each, in forward mode; None
-            where the rays are constants.
 
     Returns:
         the tangent of the march (forward mode; zeros otherwise), and the objective's
@@ -126,9 +123,9 @@ def march_derivative(  # noqa: D417  one entry describes three
     """
     with dr.suspend_grad(), private_gradients():
         walk, active = Walk.start(posed, rays)
-        with_rays = mode == dr.ADMode.Backward or t_rays is not None
+        with_rays = mode == dr.ADMode.Backward
         fixed = [posed], walk, active, primal, cotangent, stop
-        tangent, ((by_origin, by_direction),) = replay(mode, *fixed, with_rays, t_rays)
+        tangent, ((by_origin, by_direction),) = replay(mode, *fixed, with_rays)
     return tangent, by_origin, by_direction
 
 
@@ -197,7 +194,6 @@ def replay(  # noqa: D417  one entry describes four
     cotangent: March,
     stop: float,
     with_rays: bool,
-    t_rays: RayTangent | None = None,
 ) -> tuple[March, list[RayTangent]]:
     """Replay :func:`integrate` of the fields, and propagate derivatives.
 
@@ -206,20 +202,18 @@ def replay(  # noqa: D417  one entry describes four
         posed, walk, active, stop: as given to :func:`integrate`.
         primal: what the rays gathered.
         cotangent: derivative of the objective by it; ignored in forward mode.
-        with_rays: differentiate by the rays, too.
-        t_rays: their tangents in forward mode.
+        with_rays: differentiate by the rays, too; in backward mode alone.
 
     Returns:
         as :func:`march_derivative`, the derivatives by rays for each field.
     """
     count = range(len(posed))
-    tangents = [walk.paths[k].tangents(posed[k], t_rays) for k in count]
     rest, tangent = Rest.of(primal), March()
     by_rays = [RayGradient() for _ in posed]
     while active:
         walk, here = walk.next(posed, active)
         with dr.resume_grad():
-            points, headings = _attach(walk.paths, here.t, with_rays, tangents)
+            points, headings = _attach(walk.paths, here.t, with_rays)
             densities, colours = _evaluate(
                 [item.eval for item in posed], points, headings, here
             )
@@ -247,15 +241,10 @@ def _evaluate(
     return [density for density, _ in values], [colour for _, colour in values]
 
 
-def _attach(
-    paths: list[Path], t: mi.Float, with_rays: bool, tangents: list
-) -> tuple[list, list]:
+def _attach(paths: list[Path], t: mi.Float, with_rays: bool) -> tuple[list, list]:
     """Return points and headings of a sample in each field, as leaves if asked for."""
     points = [path.at(t) for path in paths]
     headings = [mi.Vector3f(path.heading) for path in paths]
     if with_rays:
         dr.enable_grad(points, headings)
-        for k, (t_o, t_d, t_heading) in enumerate(tangents):
-            dr.set_grad(points[k], t_o + t * t_d)
-            dr.set_grad(headings[k], t_heading)
     return points, headings

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -75,19 +74,6 @@ class Path:
     def at(self, t: mi.Float) -> mi.Point3f:
         """Return points (3, n) at distances (n,) of the rays, in world metres."""
         return mi.Point3f(self.o + (t - self.begin) * self.d)
-
-    def tangents(self, posed: PosedField, t_rays: Any) -> list[mi.Vector3f]:
-        """Return those of o, d and heading (3, n), of rays with tangents; 0 for None.
-
-        Args:
-            posed: the field.
-            t_rays: tangents of origins and directions in the world, (3, n) each.
-        """
-        if t_rays is None:
-            return [mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)]
-        t_o, t_d = (posed.turn(tangent) for tangent in t_rays)
-        along = self.heading * dr.dot(self.heading, t_d)
-        return [t_o, t_d, (t_d - along) * dr.rcp(dr.norm(self.d))]
 
 
 @dataclass

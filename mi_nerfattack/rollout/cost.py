@@ -41,7 +41,3 @@ class Cost:
         by_rows = np.array(dr.grad(leaf), np.float64)
         shape = (len(leaf), history.count, history.horizon)
         return self.scale * by_rows.reshape(shape).transpose(2, 1, 0)
-
-    def tangent(self, drive: Trajectory, tangents: np.ndarray) -> float:
-        """Differentiate in the direction of tangents (T, n, m) of x_1 to x_T."""
-        return float((self.by_states(drive) * tangents).sum())

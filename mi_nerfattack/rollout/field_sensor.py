@@ -289,33 +289,6 @@ class FieldSensor(AbstractDifferentiableSensor):
         pairs = zip(np.array(wrenches).reshape(-1, 6), self._offsets, strict=True)
         return np.array([offset_gradient(*pair) for pair in pairs]).reshape(-1, 6)
 
-    def start_tangent(self, textures: list[Any]) -> None:
-        """See :meth:`AbstractDifferentiableSensor.start_tangent`."""
-        for field, tangent in zip(self.fields, textures, strict=True):
-            leaf = mi.Float(dr.detach(field.packed))
-            dr.enable_grad(leaf)
-            none = dr.zeros(mi.Float, field.n_vertices)
-            dr.set_grad(leaf, field.pack(mi.Float(tangent.array), none))
-            field.packed = leaf
-
-    def jvp(self, observation: Observation, state: Any, t_state: Any) -> Any:
-        """See :meth:`AbstractDifferentiableSensor.jvp`."""
-        rays, seen = observation.rays, observation.seen
-        assert rays is not None and seen is not None
-        if t_state is not None and observation.ends is not None:
-            raise InputError(f"attached: {ATTACHED}")
-        t_rays = None if t_state is None else self._ray_tangent(state, t_state)
-        tangent = self.composite.forward(self._fields, rays, seen, self.stop, t_rays)
-        with dr.resume_grad():
-            total, direction = seen.total.copy(), mi.Vector3f(rays.direction)
-            dr.enable_grad(total, direction)
-            dr.set_grad(total, tangent)
-            dr.set_grad(direction, 0 if t_rays is None else t_rays[1])
-            pixels = self._develop(total, direction, observation.ends)
-            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-            t_pixels: Any = dr.forward_to(pixels, flags=flags)
-        return self._tensor(t_pixels, dr.width(state))
-
     def _make_rays(
         self, state: Any, step: mi.UInt32, ends: Ends | None, count: int
     ) -> Rays:
@@ -384,14 +357,6 @@ class FieldSensor(AbstractDifferentiableSensor):
         result = dr.grad(leaf)
         dr.eval(result)
         return result
-
-    def _ray_tangent(self, state: Any, t_state: Any) -> RayTangent:
-        leaf = _pose(state)
-        dr.enable_grad(leaf)
-        dr.set_grad(leaf, _pose(t_state))
-        origin, direction = self._rays(leaf, dr.width(leaf))
-        t_origin, t_direction = dr.forward_to(origin, direction)
-        return mi.Vector3f(t_origin), t_direction
 
 
 def _pose(state: Any) -> Any:

@@ -20,7 +20,6 @@ from mi_nerfattack.rollout.sweep import (
     StepRecorder,
     backward_to_images,
     differentiable,
-    forward,
 )
 
 
@@ -132,28 +131,6 @@ class Rollout:
         """
         d_states = Cost(self.objective, self.reduction).by_states(drive)
         return backward_to_images(self.loop, drive, d_states, steps, self.attached)
-
-    def tangent(
-        self, evaluation: Evaluation, textures: Sequence[Any], initial: Any
-    ) -> float:
-        """Differentiate in one direction (forward mode); renders every frame again.
-
-        Args:
-            evaluation: from :meth:`run`.
-            textures: tangents, one tensor (n_vertices, 3) an object.
-            initial: (m, n), tangent of the initial states.
-
-        Returns:
-            the derivative of the value in that direction.
-
-        Raises:
-            TypeError: sensor or policy have no forward mode.
-        """
-        sensor = differentiable(self.loop)
-        sensor.start_tangent(list(textures))
-        drive = evaluation.trajectory
-        tangents = forward(self.loop, drive, initial, self.attached)
-        return Cost(self.objective, self.reduction).tangent(drive, tangents)
 
     def __call__(
         self, textures: Sequence[Any], initial: Any, offsets: Any = None

@@ -87,12 +87,6 @@ class ClosedLoop:
             return d_shown
         return self.disturbance.vjp(observation.image, step, d_shown)
 
-    def shown_jvp(self, observation: Observation, step: int, t_image: Any) -> Any:
-        """Return the tangent of the policy's image from that of the sensor's."""
-        if not self.disturbance:
-            return t_image
-        return self.disturbance.jvp(observation.image, step, t_image)
-
 
 @dataclass(frozen=True)
 class Step:

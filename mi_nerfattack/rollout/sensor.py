@@ -147,28 +147,3 @@ class AbstractDifferentiableSensor(AbstractSensor):
         """
         del state, step
         return kept
-
-    def jvp(self, observation: Observation, state: Any, t_state: Any) -> Any:
-        """Differentiate the image in the direction of the parameters' tangents.
-
-        Args:
-            observation: from ``observe`` with the same state and step.
-            state: (m, n), as given to ``observe``.
-            t_state: (m, n) tangent of the state; None when the image does not
-                follow it.
-
-        Returns:
-            tangent of the image, of its shape.
-
-        Raises:
-            TypeError: the sensor has no forward mode.
-        """
-        raise TypeError(f"{type(self).__name__}: has no forward mode; use gradient")
-
-    def start_tangent(self, textures: list[Any]) -> None:
-        """Set the textures' tangents for :meth:`jvp`, each (n_vertices, 3).
-
-        Raises:
-            TypeError: the sensor has no forward mode.
-        """
-        raise TypeError(f"{type(self).__name__}: has no forward mode; use gradient")

@@ -1,4 +1,4 @@
-"""The backward and the forward sweep through a drive: costates and tangents."""
+"""The backward sweep through a drive: costates and gradients."""
 
 from __future__ import annotations
 
@@ -297,47 +297,6 @@ def backward_to_images(
             d_before = sweep.back_blindly(index, state, d_after)
             dr.eval(d_before, sweep.pending)
     return found
-
-
-def forward(
-    loop: ClosedLoop, drive: Trajectory, initial: Any, attached: bool
-) -> np.ndarray:
-    """Push tangents of the parameters and initial states through a drive.
-
-    Renders every frame again. The textures' tangents are those that the sensor was
-    given by `start_tangent`.
-
-    Args:
-        loop: as it was when it drove.
-        drive: what it did.
-        initial: (m, n) tangent of the initial states.
-        attached: keep the derivative of the image by the state.
-
-    Returns:
-        (T, n, m), tangents of x_1 to x_T.
-
-    Raises:
-        TypeError: sensor or policy have no forward mode.
-    """
-    sensor, tangent, controls, tangents = differentiable(loop), initial, [], []
-    memory = loop.policy.initial_memory(drive.count)
-    t_memory: tuple[Any, ...] = ()
-    for index in range(drive.horizon):
-        state = drive.states[index]
-        seen = sensor.observe(state, index)
-        t_image = sensor.jvp(seen, state, tangent if attached else None)
-        t_image = loop.shown_jvp(seen, index, t_image)
-        image = loop.shown(seen, index)
-        t_control, t_memory = loop.policy.step_jvp(
-            image, loop.goal, memory, t_image, t_memory
-        )
-        _, memory = loop.policy.step(image, loop.goal, memory)
-        controls.append(dr.value_t(type(state))(t_control))
-        pair = loop.transition.controls(drive.controls[: index + 1], index, state)
-        t_pair = loop.transition.controls(controls, index, state)
-        tangent = loop.transition.jvp((state, *pair), (tangent, *t_pair))
-        tangents.append(np.array(tangent).T)
-    return np.stack(tangents)
 
 
 def _batch(parts: tuple[Any, ...]) -> Any:

@@ -49,10 +49,10 @@ class Transition:
         self.substeps = substeps
         self.lag: int = delay // substeps
         self.late: int = delay % substeps
-        calls = (self._advance, self._vjp, self._jvp)
+        calls = (self._advance, self._vjp)
         if dynamics.recordable:
             calls = tuple(freeze_method(call, self._sizes) for call in calls)
-        self._advance_call, self._vjp_call, self._jvp_call = calls
+        self._advance_call, self._vjp_call = calls
 
     def sources(self, period: int) -> tuple[int, int]:
         """Return the indices of the older and the newer control of a period.
@@ -95,12 +95,6 @@ class Transition:
         dr.eval(result)
         return result
 
-    def jvp(self, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
-        """Return the tangent (m, n) from those of state, older and newer control."""
-        result = self._jvp_call(primals, tangents)
-        dr.eval(result)
-        return result
-
     def _advance(self, state: Any, older: Any, newer: Any) -> list[Any]:
         path = [state]
         for i in range(self.substeps):
@@ -116,24 +110,9 @@ class Transition:
             dr.backward_from(_inner(after, cotangent))
             return tuple(dr.grad(leaf) for leaf in leaves)
 
-    def _jvp(self, primals: tuple, tangents: tuple) -> Any:
-        with dr.resume_grad():
-            leaves = tuple(type(x)(x) for x in primals)
-            dr.enable_grad(leaves)
-            for leaf, tangent in zip(leaves, tangents, strict=True):
-                dr.set_grad(leaf, tangent)
-            after = self._advance(*leaves)[-1]
-            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-            return dr.forward_to(after, flags=flags)
-
     def _sizes(self, *arguments: Any) -> list[int]:
         """Return what a recording depends on beside the arguments: their sizes."""
-        flat = [x for item in arguments for x in _flat(item)]
-        return [dr.width(x) for x in flat]
-
-
-def _flat(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, tuple) else [value]
+        return [dr.width(x) for x in arguments]
 
 
 def _inner(a: Any, b: Any) -> Any:

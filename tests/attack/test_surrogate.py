@@ -152,9 +152,6 @@ def test_attached_with_surfaces_is_refused(folder):
     drive = whole.run(whole.loop.initial(STATES))
     with pytest.raises(InputError, match="constants of a frame.*set attached to false"):
         whole.gradient(drive)
-    tangents = [mi.TensorXf(np.ones(t.shape)) for t in sensor.textures()]
-    with pytest.raises(InputError, match="constants of a frame"):
-        whole.tangent(drive, tangents, drive.trajectory.states[0])
 
 
 def test_the_scene_shows_what_the_sensor_wears(folder):

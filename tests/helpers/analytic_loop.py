@@ -72,7 +72,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
     def __init__(self, textures: list[np.ndarray]) -> None:
         self._textures = [tensor(texture) for texture in textures]
         self._offsets = np.zeros((len(textures), 6))
-        self._tangents: list[Any] = []
         self.renders = 0
         self.start_gradient()
 
@@ -98,20 +97,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
         dr.eval(result, self._gradients)
         return result if attached else None
 
-    def jvp(self, observation: Any, state: Any, t_state: Any) -> Any:
-        with dr.resume_grad():
-            leaf = state_type()(*[row_type()(dr.detach(state[i])) for i in range(3)])
-            textures = [type(t)(dr.detach(t)) for t in self._textures]
-            dr.enable_grad(leaf, textures)
-            for texture, tangent in zip(textures, self._tangents, strict=True):
-                dr.set_grad(texture, tangent)
-            if t_state is not None:
-                dr.set_grad(leaf, state_type()(*[t_state[i] for i in range(3)]))
-            image = self._image(leaf, observation.shift, textures, None)
-            return dr.forward_to(
-                image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-            )
-
     def start_gradient(self, poses: bool = False) -> None:
         self._gradients = [dr.zeros(tensor_type(), t.shape) for t in self._textures]
         self._by_offsets = np.zeros_like(self._offsets)
@@ -124,9 +109,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
 
     def set_textures(self, textures: list[Any]) -> None:
         self._textures = [tensor(dr.detach(texture)) for texture in textures]
-
-    def start_tangent(self, textures: list[Any]) -> None:
-        self._tangents = [tensor(dr.detach(texture)) for texture in textures]
 
     def offsets(self) -> np.ndarray:
         return self._offsets.copy()

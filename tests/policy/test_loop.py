@@ -108,19 +108,6 @@ def test_gradients_go_through_the_memory(name, attached, adjoint):
     assert_close(flat(rollout.gradient(evaluation, offsets=True)), expected, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["recurrent", "stacked"])
-def test_forward_mode_goes_through_the_memory(name, rng):
-    loop, twin, initial = make(name)
-    _, expected = expected_gradient(loop, twin, initial, HORIZON, True)
-    by_texture, by_state, _ = expected
-    texture, start = (rng.normal(size=x.shape) for x in (by_texture, by_state))
-    rollout = Rollout(loop, Wave(), HORIZON, attached=True)
-    evaluation = rollout.run(to_state(initial))
-    found = rollout.tangent(evaluation, [analytic.tensor(texture)], to_state(start))
-    right = (by_texture * texture).sum() + (by_state * start).sum()
-    assert found == pytest.approx(right, rel=1e-9)
-
-
 def test_black_boxes_drive_and_are_refused():
     loop, _, initial = make("recurrent")
     policy = CallablePolicy(lambda image, *_: image.mean((1, 2, 3)) - 0.5, "mine")

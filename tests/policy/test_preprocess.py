@@ -26,7 +26,6 @@ from mi_nerfattack.policy.preprocess import (
     to_grey,
     to_yuv,
 )
-from mi_nerfattack.policy.torch_policy import forward_mode
 
 STAGES = {
     "crop": Crop(1, 2, 3, 0),
@@ -50,12 +49,8 @@ def test_derivatives_in_float64(stage):
     result = stage.apply(leaf)
     weight = torch.randn_like(result)
     (gradient,) = torch.autograd.grad(result, leaf, weight)
-    with forward_mode():
-        dual = stage.apply(torch.autograd.forward_ad.make_dual(planes, tangent))
-        forward = torch.autograd.forward_ad.unpack_dual(dual).tangent
     reverse = (gradient * tangent).sum().item()
     scale = (gradient * tangent).abs().sum().item()
-    assert (forward * weight).sum().item() == pytest.approx(reverse, abs=1e-13 * scale)
     step = 1e-6
     change = stage.apply(planes + step * tangent) - stage.apply(planes - step * tangent)
     numeric = (change * weight).sum().item() / (2 * step)

@@ -135,32 +135,6 @@ def test_gradient_by_the_pose_through_the_interleaved_composite():
     assert central_difference(value, 1e-3) == pytest.approx(found, rel=2e-2)
 
 
-def test_the_interleaved_composite_has_no_ray_tangents():
-    loop, _ = toy.make_loop(composite=InterleavedComposite())
-    rollout = make_rollout(loop, 2, attached=True)
-    evaluation = rollout.run(loop.initial(INITIAL))
-    with pytest.raises(TypeError, match="keep the camera detached"):
-        zero = [0 * texture for texture in loop.sensor.textures()]
-        rollout.tangent(evaluation, zero, loop.initial(INITIAL))
-
-
-@pytest.mark.parametrize("attached", [True, False])
-def test_forward_and_reverse_mode_are_transposes(rng, attached):
-    loop, _ = toy.make_loop(disturbance=DISTURBANCE)
-    rollout = make_rollout(loop, 4, attached)
-    evaluation = rollout.run(loop.initial(INITIAL))
-    found = rollout.gradient(evaluation)
-    by_texture = found.textures[0].numpy().astype(float)
-    direction = unit(by_texture) + 0.3 * unit(rng.normal(size=by_texture.shape))
-    start = np.array([[0.1, -0.3, 0.05]])
-    expected = (by_texture * direction).sum() + (
-        np.array(found.initial).T * start
-    ).sum()
-    tensor = mi.TensorXf(direction.astype(np.float32))
-    tangent = rollout.tangent(evaluation, [tensor], loop.initial(start))
-    assert tangent == pytest.approx(float(expected), rel=1e-5)
-
-
 def test_euler_needs_two_steps_to_feel_a_control():
     loop, _ = toy.make_loop()
     found = gradient(make_rollout(loop, 1, attached=True))

@@ -90,14 +90,6 @@ class Disturbance:
         dr.eval(result)
         return result
 
-    def jvp(self, image: Any, step: int, t_image: Any) -> Any:
-        """Return the tangent of what is shown from the one of the image."""
-        with dr.resume_grad():
-            leaf = type(image)(dr.detach(image))
-            dr.enable_grad(leaf)
-            dr.set_grad(leaf, t_image)
-            return dr.forward_to(self.apply(leaf, step))
-
 
 def disturbed(
     image: Any,

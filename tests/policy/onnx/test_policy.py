@@ -75,12 +75,8 @@ def test_a_driving_network_and_its_derivatives(rng, variant, tmp_path):
 
     numeric = (objective(1e-5) - objective(-1e-5)) / 2e-5
     products = gradient.numpy() * direction
-    near = pytest.approx(numeric, abs=1e-6 * np.abs(products).sum())
-    assert np.sum(products) == near
-    tangent = mi.TensorXf(direction.astype("f4"))
-    t_control, _ = policy.step_jvp(mi.TensorXf(image), [0, 1, 1], (), tangent, ())
-    forward = float(np.dot(t_control.numpy(), weight.numpy()))
-    assert forward == near
+    scale = np.abs(products).sum()
+    assert np.sum(products) == pytest.approx(numeric, abs=1e-6 * scale)
 
 
 def refused(made, tmp_path, match):
