@@ -1,5 +1,4 @@
 from .gradient import GradientAttack as GradientAttack
-from .nominal import open_loop as open_loop
 from .objectives import AbsoluteDeviation as AbsoluteDeviation
 from .objectives import CrossTrackDeviation as CrossTrackDeviation
 from .objectives import DepartureTime as DepartureTime

@@ -156,7 +156,7 @@ class AbstractAttack(ABC):
             self.sensor.set_offsets(self.best_offsets)
 
     def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
-        """Drive with what the objects look like, seen by another sensor.
+        """Drive in a closed loop through another sensor, with the present textures.
 
         Args:
             sensor: that shows the same objects.
@@ -165,7 +165,8 @@ class AbstractAttack(ABC):
             mean distance from the lane centre, metres.
         """
         loop = replace(self.rollout.loop, sensor=sensor)
-        seen = replace(self.rollout, loop=loop).measure(self.initial)
+        closed = replace(self.rollout, loop=loop, camera_path=None)
+        seen = closed.measure(self.initial)
         return float(distances(self.route, seen).mean())
 
     @abstractmethod

@@ -6,6 +6,7 @@ from .drive import Drive as Drive
 from .field_sensor import FieldSensor as FieldSensor
 from .function import Evaluation as Evaluation
 from .function import Rollout as Rollout
+from .loop import CameraPath as CameraPath
 from .loop import ClosedLoop as ClosedLoop
 from .loop import Trajectory as Trajectory
 from .loop import simulate as simulate

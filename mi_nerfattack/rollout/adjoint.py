@@ -72,9 +72,8 @@ class Replay(AbstractAdjoint):
     def visit(self, loop: ClosedLoop, drive: Trajectory) -> Iterator[Step]:
         """See :meth:`AbstractAdjoint.visit`."""
         for index in reversed(range(drive.horizon)):
-            state = drive.states[index]
-            seen = loop.sensor.observe(state, index)
-            yield Step(index, state, seen, drive.kept[index])
+            seen = drive.observe(loop.sensor, index)
+            yield Step(index, drive.states[index], seen, drive.kept[index])
 
 
 @dataclass(frozen=True)
@@ -98,8 +97,8 @@ class KeptBackgrounds(AbstractAdjoint):
         sensor = differentiable(loop)
         for index in reversed(range(drive.horizon)):
             kept, memory = drive.kept[index]
-            state = drive.states[index]
-            yield Step(index, state, sensor.restore(state, index, kept), memory)
+            seen = drive.restore(sensor, index, kept)
+            yield Step(index, drive.states[index], seen, memory)
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class Checkpointed(AbstractAdjoint):
             end = min(start + self.segment, drive.horizon)
             memory, kept = drive.kept[start], []
             for index in range(start, end):
-                seen = sensor.observe(drive.states[index], index)
+                seen = drive.observe(sensor, index)
                 kept.append((sensor.keep(seen), memory))
                 if index + 1 < end:
                     image = loop.shown(seen, index)
@@ -139,5 +138,5 @@ class Checkpointed(AbstractAdjoint):
                 del seen
             for index in reversed(range(start, end)):
                 view, memory = kept.pop()
-                state = drive.states[index]
-                yield Step(index, state, sensor.restore(state, index, view), memory)
+                seen = drive.restore(sensor, index, view)
+                yield Step(index, drive.states[index], seen, memory)

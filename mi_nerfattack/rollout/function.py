@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.adjoint import AbstractAdjoint, Replay
 from mi_nerfattack.rollout.cost import Cost
-from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory, simulate
+from mi_nerfattack.rollout.loop import (
+    CameraPath,
+    ClosedLoop,
+    OnStep,
+    Step,
+    Trajectory,
+    simulate,
+)
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.reduction import AbstractReduction, Mean
 from mi_nerfattack.rollout.sweep import (
@@ -54,6 +62,8 @@ class Rollout:
         adjoint: how derivatives are made; each states what it costs.
         attached: keep the derivative of the image by the state. By default it is
             stopped (A.12); only attached derivatives are those of the whole loop.
+        camera_path: where frames are rendered from, if not from the vehicles; see
+            :meth:`open_loop`.
     """
 
     loop: ClosedLoop
@@ -62,11 +72,33 @@ class Rollout:
     reduction: AbstractReduction = field(default_factory=Mean)
     adjoint: AbstractAdjoint = field(default_factory=Replay)
     attached: bool = False
+    camera_path: CameraPath | None = None
 
     @property
     def frames(self) -> int:
         """Frames that are rendered for a drive of one vehicle."""
-        return self.loop.sensor.frames(self.horizon)
+        path = self.camera_path
+        return self.horizon if path is None or path.frame is None else 1
+
+    def open_loop(self, initial: Any, frame: int | None = None) -> Rollout:
+        """Return this rollout with the camera path of the present textures' drive.
+
+        Textures change what the policy sees, but not from where: the vehicle still
+        answers to the policy, the policy no longer to the vehicle.
+
+        Args:
+            initial: (m, n) initial states; one drive is made from them.
+            frame: show this one alone, at all times, rendered once; None for all.
+
+        Raises:
+            InputError: the frame lies beyond the drive.
+            TypeError: sensor or policy have no derivatives.
+        """
+        if frame is not None and not 0 <= frame < self.horizon:
+            raise InputError(f"frame: {frame}; the drive has {self.horizon}, from 0 on")
+        differentiable(self.loop)
+        states = self.measure(initial).trajectory.states[:-1]
+        return replace(self, camera_path=CameraPath(states, frame))
 
     def run(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
         """Drive with the textures and offsets that the sensor has.
@@ -79,9 +111,7 @@ class Rollout:
         def keep(step: Step) -> Any:
             return self.adjoint.keep(self.loop, step)
 
-        drive = simulate(self.loop, initial, self.horizon, on_step, keep)
-        value, costs = Cost(self.objective, self.reduction).of(drive)
-        return Evaluation(value, costs, drive)
+        return self._evaluate(initial, on_step, keep)
 
     def measure(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
         """Drive as :meth:`run` does, without keeping what a derivative needs.
@@ -90,7 +120,22 @@ class Rollout:
             initial: (m, n) from :meth:`ClosedLoop.initial`.
             on_step: called after each control period with its index.
         """
-        drive = simulate(self.loop, initial, self.horizon, on_step)
+        return self._evaluate(initial, on_step, None)
+
+    def _evaluate(
+        self,
+        initial: Any,
+        on_step: OnStep | None,
+        keep: Callable[[Step], Any] | None,
+    ) -> Evaluation:
+        drive = simulate(
+            self.loop,
+            initial,
+            self.horizon,
+            on_step=on_step,
+            keep=keep,
+            camera_path=self.camera_path,
+        )
         value, costs = Cost(self.objective, self.reduction).of(drive)
         return Evaluation(value, costs, drive)
 

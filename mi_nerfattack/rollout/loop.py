@@ -8,7 +8,7 @@ everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,11 @@ import numpy as np
 
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.objective import StateHistory
-from mi_nerfattack.rollout.sensor import AbstractSensor, Observation
+from mi_nerfattack.rollout.sensor import (
+    AbstractDifferentiableSensor,
+    AbstractSensor,
+    Observation,
+)
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
 from mi_nerfattack.vehicle.state import to_state
@@ -89,6 +93,24 @@ class ClosedLoop:
 
 
 @dataclass(frozen=True)
+class CameraPath:
+    """States that frames are rendered from, wherever the vehicle is: an open loop.
+
+    Attributes:
+        states: (m, n) of each control period.
+        frame: control period whose frame all periods show; None for each its own.
+    """
+
+    states: Sequence[Any]
+    frame: int | None = None
+
+    def at(self, period: int) -> tuple[Any, int]:
+        """Return the state, and the index of its period, for a period's frame."""
+        index = period if self.frame is None else self.frame
+        return self.states[index], index
+
+
+@dataclass(frozen=True)
 class Step:
     """What happened in one control period, for those who keep parts of it.
 
@@ -114,12 +136,16 @@ class Trajectory:
         controls: horizon rows (n,), the policy's raw outputs, evaluated.
         dt: control period, seconds.
         kept: what `keep` returned for each control period.
+        camera_path: None where the camera was on the vehicle.
+        still: the only frame, where the camera path shows a single one.
     """
 
     states: tuple[Any, ...]
     controls: tuple[Any, ...]
     dt: float
     kept: tuple[Any, ...] = ()
+    camera_path: CameraPath | None = None
+    still: Observation | None = None
 
     @property
     def horizon(self) -> int:
@@ -130,6 +156,27 @@ class Trajectory:
     def count(self) -> int:
         """Number of vehicles."""
         return dr.width(self.states[0])
+
+    def camera(self, period: int) -> tuple[Any, int]:
+        """Return state and index of the period that a frame was rendered from."""
+        path = self.camera_path or CameraPath(self.states)
+        return path.at(period)
+
+    def observe(self, sensor: AbstractSensor, period: int) -> Observation:
+        """Return the frame of a period, rendered again unless it is `still`."""
+        if self.still is not None:
+            return self.still
+        state, index = self.camera(period)
+        return sensor.observe(state, index)
+
+    def restore(
+        self, sensor: AbstractDifferentiableSensor, period: int, kept: Any
+    ) -> Observation:
+        """Return the frame of a period from what the sensor kept of it."""
+        if self.still is not None:
+            return self.still
+        state, index = self.camera(period)
+        return sensor.restore(state, index, kept)
 
     def states_numpy(self) -> np.ndarray:
         """States as (n, horizon + 1, m) float64."""
@@ -152,6 +199,7 @@ def simulate(
     horizon: int,
     on_step: OnStep | None = None,
     keep: Callable[[Step], Any] | None = None,
+    camera_path: CameraPath | None = None,
 ) -> Trajectory:
     """Drive a batch of vehicles.
 
@@ -162,6 +210,7 @@ def simulate(
         on_step: called after each with its index.
         keep: called in each; what it returns is kept for a backward pass. Otherwise
             nothing but states and controls is.
+        camera_path: render frames from there; by default from the vehicles.
 
     Raises:
         ValueError: horizon below 1, or a state of the wrong size.
@@ -176,8 +225,12 @@ def simulate(
         )
     states, controls, kept = [initial], [], []
     memory = loop.policy.initial_memory(dr.width(initial))
+    camera = camera_path or CameraPath(states)  # which grow as the vehicles drive
+    still: Observation | None = None
     for index in range(horizon):
-        seen = loop.sensor.observe(states[-1], index)
+        view, period = camera.at(index)
+        seen = still or loop.sensor.observe(view, period)
+        still = None if camera.frame is None else seen
         step = Step(index, states[-1], seen, memory)
         image = loop.shown(seen, index)
         control, memory = loop.policy.step(image, loop.goal, memory)
@@ -189,4 +242,11 @@ def simulate(
             kept.append(keep(step))
         if on_step is not None:
             on_step(index)
-    return Trajectory(tuple(states), tuple(controls), loop.dt, tuple(kept))
+    return Trajectory(
+        states=tuple(states),
+        controls=tuple(controls),
+        dt=loop.dt,
+        kept=tuple(kept),
+        camera_path=camera_path,
+        still=still,
+    )

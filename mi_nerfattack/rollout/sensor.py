@@ -46,10 +46,6 @@ class AbstractSensor(ABC):
             step: index of the control period, from 0; seeds what is random.
         """
 
-    def frames(self, horizon: int) -> int:
-        """Return how many frames are rendered for a drive of so many periods."""
-        return horizon
-
 
 class AbstractDifferentiableSensor(AbstractSensor):
     """Sensor whose image can be differentiated by its parameters and by the state.

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from mi_nerfattack.backend.concat import concat, split
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.system.heap import release_heap
@@ -137,6 +138,14 @@ class Sweep:
     pending: dict[int, Any] = field(default_factory=dict)
     d_memory: tuple[Any, ...] = ()
     _waiting: list[tuple[Step, Any, Any]] = field(default_factory=list)
+    _d_still: Any = None  # by the only frame of a drive, of all periods so far
+
+    def __post_init__(self) -> None:
+        if self.attached and self.drive.camera_path is not None:
+            raise InputError(
+                "attached: images along a camera path do not follow the vehicle; set "
+                "attached to false"
+            )
 
     def back(self, step: Step, d_after: Any) -> Any:
         """Return the derivative by the state before a period.
@@ -200,10 +209,23 @@ class Sweep:
             d_seen = loop.shown_vjp(step.observation, step.index, d_image)
             if self.on_image is not None:
                 self.on_image(step.index, d_seen)
-            by_pose = differentiable(loop).vjp(
-                step.observation, step.state, d_seen, self.attached
-            )
+            if self.drive.still is None:
+                state, _ = self.drive.camera(step.index)
+                by_pose = differentiable(loop).vjp(
+                    step.observation, state, d_seen, self.attached
+                )
+            else:  # the only frame: all periods go back through the sensor at once
+                previous = self._d_still
+                self._d_still = d_seen if previous is None else previous + d_seen
+                dr.eval(self._d_still)
         return by_pose
+
+    def finish_still(self) -> None:
+        """Go back through the sensor from the only frame, for all periods so far."""
+        d_still, self._d_still = self._d_still, None
+        if d_still is not None and self.drive.still is not None:
+            state, _ = self.drive.camera(0)
+            differentiable(self.loop).vjp(self.drive.still, state, d_still, False)
 
 
 def backward(
@@ -224,6 +246,7 @@ def backward(
 
     Raises:
         TypeError: sensor or policy have no such derivatives.
+        InputError: attached, along a camera path.
     """
     sensor = differentiable(loop)
     alone = options.attached or options.recorder is not None
@@ -236,10 +259,12 @@ def backward(
         d_before = sweep.back(step, d_after)
         costates.append(-np.array(d_after).T)
         if options.recorder is not None:
+            sweep.finish_still()
             options.recorder.add(step.index, sensor.texture_gradients())
         if options.on_step is not None:
             options.on_step(step.index)
     sweep.finish()
+    sweep.finish_still()
     textures = sensor.texture_gradients()
     dr.eval(textures)
     return Gradient(
@@ -276,6 +301,7 @@ def backward_to_images(
 
     Raises:
         TypeError: sensor or policy have no such derivatives.
+        InputError: attached, along a camera path.
     """
     sensor, found = differentiable(loop), {}
 
@@ -291,7 +317,7 @@ def backward_to_images(
         state = drive.states[index]
         d_after = d_before + to_state(d_states[index])
         if linked or index in steps:
-            seen = sensor.observe(state, index)
+            seen = drive.observe(sensor, index)
             d_before = sweep.back(Step(index, state, seen, drive.kept[index]), d_after)
         else:
             d_before = sweep.back_blindly(index, state, d_after)

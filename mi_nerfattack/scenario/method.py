@@ -17,7 +17,6 @@ from mi_nerfattack.attack.black_box.search import AbstractSearch
 from mi_nerfattack.attack.black_box.surrogate import SurrogateSearch, textured
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.nominal import open_loop
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture.colours import Colours
 from mi_nerfattack.errors import InputError
@@ -118,7 +117,7 @@ class GradientMethod(AbstractGradientMethod):
     def _rollout(self, task: Task) -> Rollout:
         if self.method == "gradient":
             return task.rollout
-        return open_loop(task.rollout, task.initial)
+        return task.rollout.open_loop(task.initial)
 
 
 class FrameMethod(AbstractGradientMethod):
@@ -133,7 +132,7 @@ class FrameMethod(AbstractGradientMethod):
         return 1
 
     def _rollout(self, task: Task) -> Rollout:
-        return open_loop(task.rollout, task.initial, self.frame)
+        return task.rollout.open_loop(task.initial, self.frame)
 
 
 class AbstractSearchMethod(AbstractMethod):

@@ -19,8 +19,8 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
 from mi_nerfattack.rollout.function import Rollout
+from mi_nerfattack.rollout.loop import CameraPath
 from mi_nerfattack.rollout.objective import StageSum
-from mi_nerfattack.rollout.sensor import AbstractSensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -83,17 +83,6 @@ def rollout(sensor, horizon, attached=False, adjoint=None):
     return Rollout(loop, cost, horizon, adjoint=adjoint or Replay(), attached=attached)
 
 
-class Held(AbstractSensor):
-    """Sees what a sensor would see along another drive."""
-
-    def __init__(self, sensor, drive):
-        self.sensor, self.states = sensor, drive.states
-
-    def observe(self, state, step):
-        del state
-        return self.sensor.observe(self.states[step], step)
-
-
 def difference(value, sensor, directions, h):
     """Differentiate a function of the sensor's textures along a direction."""
     base = [texture.numpy().copy() for texture in sensor.textures()]
@@ -129,8 +118,7 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
     assert again.value == drive.value
     gradient = replayed.gradient(again).textures
     assert along(gradient, directions) == pytest.approx(along(found, directions), 1e-5)
-    loop = replace(whole.loop, sensor=Held(sensor, drive.trajectory))
-    held = replace(replayed, loop=loop)
+    held = replace(replayed, camera_path=CameraPath(drive.trajectory.states))
     wanted = difference(lambda: held.run(initial).value, sensor, directions, 0.05)
     assert along(found, directions) == pytest.approx(wanted, 1e-3)
 

@@ -30,6 +30,7 @@ from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.rollout import sweep
 from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.loop import CameraPath
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.vehicle.integrators import RK4, ImplicitMidpoint
 from mi_nerfattack.vehicle.state import to_state
@@ -61,28 +62,18 @@ def test_attached_gradient_is_that_of_the_whole_loop(horizon, changes, rng):
         assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)
 
 
-class HeldSensor(AbstractSensor):
-    """Sees from where a drive was, whatever the state is."""
-
-    def __init__(self, sensor, drive):
-        self.sensor, self.states = sensor, drive.states
-
-    def observe(self, state, step):
-        return self.sensor.observe(self.states[step], step)
-
-
 def test_detached_gradient_of_disturbed_drives_holds_the_camera_path(rng):
     loop, item = toy.make_loop(jitter_seed=7, disturbance=DISTURBANCE)
     rollout = make_rollout(loop, 4)
     evaluation = rollout.run(loop.initial(POSES))
     found = rollout.gradient(evaluation).textures[0].numpy().astype(float)
-    held = replace(loop, sensor=HeldSensor(loop.sensor, evaluation.trajectory))
+    held = replace(rollout, camera_path=CameraPath(evaluation.trajectory.states))
     base, direction = toy.texture_of(item), unit(rng.normal(size=found.shape))
     direction = unit(unit(found) + 0.5 * direction)
 
     def value(s):
         loop.sensor.set_textures([(base + s * direction).astype(np.float32)])
-        return objective(make_rollout(held, 4), POSES)
+        return objective(held, POSES)
 
     expected = float((found * direction).sum())
     assert central_difference(value, 0.2) == pytest.approx(expected, rel=1e-3)

@@ -1,18 +1,22 @@
-"""Attacks on the observations along an unattacked drive."""
+"""Rollouts, and attacks, on the observations along an unattacked drive."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers import toy_loop as toy
+from helpers.rollouts import ADJOINTS
 
+from mi_nerfattack.attack.base import distances
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
-from mi_nerfattack.attack.nominal import open_loop
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.objective import StageSum
+from mi_nerfattack.rollout.sweep import StepRecorder
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -29,7 +33,7 @@ def closed():
 
 def test_unattacked_it_is_the_closed_loop(closed):
     rollout, initial, _ = closed
-    opened = open_loop(rollout, initial)
+    opened = rollout.open_loop(initial)
     first, second = (r.run(initial).trajectory for r in (rollout, opened))
     np.testing.assert_allclose(first.states_numpy(), second.states_numpy(), atol=1e-6)
 
@@ -37,7 +41,7 @@ def test_unattacked_it_is_the_closed_loop(closed):
 def test_images_do_not_follow_the_vehicle(closed):
     """From another start, the policy does the same as along the nominal path."""
     rollout, initial, _ = closed
-    opened = open_loop(rollout, initial)
+    opened = rollout.open_loop(initial)
     elsewhere = rollout.loop.initial(np.array([[0.0, -0.7, 0.1], [0.0, 0.6, -0.2]]))
     expected = opened.measure(initial).trajectory.controls_numpy()
     found = opened.measure(elsewhere).trajectory.controls_numpy()
@@ -49,55 +53,67 @@ def test_images_do_not_follow_the_vehicle(closed):
 def test_one_frame_is_shown_at_all_times(closed):
     rollout, initial, _ = closed
     nominal = rollout.measure(initial).trajectory.controls_numpy()
-    controls = open_loop(rollout, initial, 3).measure(initial).trajectory
+    controls = rollout.open_loop(initial, 3).measure(initial).trajectory
     expected = np.repeat(nominal[:, 3:4], HORIZON, axis=1)
     np.testing.assert_allclose(controls.controls_numpy(), expected, atol=1e-6)
 
 
-def test_one_frame_is_rendered_once(closed):
+@pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS)
+def test_one_frame_is_rendered_once(closed, adjoint):
+    """Also for the gradient, whatever the adjoint keeps."""
     rollout, initial, _ = closed
     sensor = rollout.loop.sensor
-    opened = open_loop(rollout, initial, 3)
+    opened = replace(rollout.open_loop(initial, 3), adjoint=adjoint)
     before = sensor.renders
-    opened.measure(initial)
+    opened.gradient(opened.run(initial))
     assert (sensor.renders - before, opened.frames) == (2, 1)  # two vehicles
-    assert open_loop(rollout, initial).frames == rollout.frames == HORIZON
+    assert rollout.open_loop(initial).frames == rollout.frames == HORIZON
 
 
+@pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS)
 @pytest.mark.parametrize("frame", [None, 2])
-def test_its_gradient_is_its_derivative(closed, frame):
+def test_its_gradient_is_its_derivative(closed, frame, adjoint):
     rollout, initial, field = closed
-    opened = open_loop(rollout, initial, frame)
+    opened = replace(rollout.open_loop(initial, frame), adjoint=adjoint)
     texture = toy.texture_of(field)
     gradient = opened.gradient(opened.run(initial)).textures[0].numpy()
     rng = np.random.default_rng(2)
     way = rng.normal(size=texture.shape).astype(np.float32)
+    recorder = StepRecorder([way])
+    parts = opened.gradient(opened.run(initial), recorder=recorder).attribution
+    assert np.count_nonzero(parts.along) > 1
+    total = float((gradient * way).sum())
+    assert parts.along.sum() == pytest.approx(total, rel=1e-4)
     values = []
     for sign in (1, -1):
         rollout.loop.sensor.set_textures([texture + sign * 0.02 * way])
         values.append(opened.measure(initial).value)
     slope = (values[0] - values[1]) / 0.04
-    assert slope == pytest.approx(float((gradient * way).sum()), rel=0.02)
+    assert slope == pytest.approx(total, rel=0.02)
 
 
 def test_an_attack_by_it_makes_the_closed_loop_worse(closed):
     rollout, initial, field = closed
-    opened = open_loop(rollout, initial)
+    opened = rollout.open_loop(initial)
     before = rollout.measure(initial).value
     attack = GradientAttack(opened, toy.ROUTE, initial, Freedom(0.3))
     for _ in range(5):
         attack.step()
     attack.restore_best()
-    assert rollout.measure(initial).value < before - 0.01 * abs(before)
+    evaluation = rollout.measure(initial)
+    assert evaluation.value < before - 0.01 * abs(before)
+    through = attack.measure_through(rollout.loop.sensor)  # in the closed loop
+    assert through == distances(toy.ROUTE, evaluation).mean()
 
 
 def test_what_makes_no_sense_is_refused(closed):
     rollout, initial, _ = closed
     with pytest.raises(InputError, match="frame: 6; the drive has 6"):
-        open_loop(rollout, initial, HORIZON)
-    opened = open_loop(rollout, initial)
-    from dataclasses import replace
-
+        rollout.open_loop(initial, HORIZON)
+    opened = rollout.open_loop(initial)
     attached = replace(opened, attached=True)
+    evaluation = attached.run(initial)
     with pytest.raises(InputError, match="set attached to false"):
-        attached.gradient(attached.run(initial))
+        attached.gradient(evaluation)
+    with pytest.raises(InputError, match="set attached to false"):
+        attached.by_images(evaluation.trajectory, {1})
