@@ -87,7 +87,8 @@ class Training:
         sky = options.sky and not bank.has_alpha
         source = BatchSource(bank, options.loss, radiance_field, sky)
         self._march: MarchStep | PointStep = MarchStep(radiance_field, source)
-        if isinstance(radiance_field, NGPField) and radiance_field.collects_points:
+        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        if isinstance(radiance_field, NGPField) and on_cpu:
             room = options.samples
             self._march = PointStep(radiance_field, source, _LISTED * room, room)
         elif options.loss.spread > 0:
