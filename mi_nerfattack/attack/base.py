@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -204,6 +204,39 @@ class AbstractAttack(ABC):
         offsets = self.sensor.offsets()
         count = len(self.sensor.fields)
         return np.zeros((count, 6)) if offsets is None else offsets
+
+
+def history_tensors(history: Sequence[IterationRecord]) -> dict[str, np.ndarray]:
+    """Return n records as arrays.
+
+    Returns:
+        ``history`` (n, 4), the numbers of :class:`IterationRecord`; ``costs``, those of
+        all iterations end to end; ``cost_counts`` (n,), how many each has.
+    """
+    rows = [astuple(record)[:-1] for record in history]
+    costs = [cost for record in history for cost in record.costs]
+    return {
+        "history": np.array(rows, np.float64).reshape(-1, 4),
+        "costs": np.array(costs, np.float64),
+        "cost_counts": np.array([len(record.costs) for record in history], np.int64),
+    }
+
+
+def read_history(tensors: dict[str, np.ndarray]) -> list[IterationRecord]:
+    """Return the records that :func:`history_tensors` made arrays of.
+
+    Raises:
+        InputError: the arrays do not fit each other.
+        KeyError: an array is missing.
+    """
+    rows, counts, costs = (tensors[k] for k in ("history", "cost_counts", "costs"))
+    if counts.shape != rows.shape[:1] or counts.sum() != len(costs):
+        raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
+    parts = np.split(costs, np.cumsum(counts)[:-1])
+    return [
+        IterationRecord(int(iteration), *numbers, costs=tuple(part.tolist()))
+        for (iteration, *numbers), part in zip(rows.tolist(), parts, strict=False)
+    ]
 
 
 def best_so_far(

@@ -16,10 +16,13 @@ from mi_nerfattack.attack.base import (
     IterationRecord,
     best_so_far,
     distances,
+    history_tensors,
+    read_history,
 )
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring
+from mi_nerfattack.backend.adam import adam_tensors, load_adam
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
@@ -141,9 +144,9 @@ class GradientAttack(AbstractAttack):
         if not self.history:
             return []
         found = np.zeros(len(self.sensor.fields), bool)
+        tensors = adam_tensors(self.optimiser)
         for key in self.optimiser:
-            value, _, _, (_, first, _, _) = self.optimiser.state[key]
-            moment = _numpy(first, value.shape)  # of all gradients so far
+            moment = tensors[f"first.{key}"]  # of all gradients so far
             if key == OFFSETS:
                 found |= moment.any(axis=1)
             else:
@@ -214,34 +217,14 @@ class GradientAttack(AbstractAttack):
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Return the complete state as arrays."""
-        rows = [
-            (
-                one.iteration,
-                one.objective,
-                one.cross_track_mean_m,
-                one.cross_track_max_m,
-            )
-            for one in self.history
-        ]
-        costs = [cost for record in self.history for cost in record.costs]
-        counts = [len(record.costs) for record in self.history]
-        result: dict[str, np.ndarray] = {
-            "history": np.array(rows, np.float64).reshape(-1, 4),
-            "costs": np.array(costs, np.float64),  # of all iterations, end to end
-            "cost_counts": np.array(counts, np.int64),
+        return {
+            **history_tensors(self.history),
+            **adam_tensors(self.optimiser),
+            **{f"best.{key}": best for key, best in self._best.items()},
             "best_mean_m": np.array([self.best_mean_m]),
             "best_objective": np.array([self.best_objective]),
             "best_offsets": self.best_offsets,
         }
-        result |= {f"best.{key}": best for key, best in self._best.items()}
-        for key in self.optimiser:
-            value, _, _, (count, first, second, _) = self.optimiser.state[key]
-            result[f"texture.{key}"] = value.numpy().copy()
-            result[f"count.{key}"] = np.array([_scalar(count)], np.int64)
-            if first is not None:
-                result[f"first.{key}"] = _numpy(first, value.shape)
-                result[f"second.{key}"] = _numpy(second, value.shape)
-        return result
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
         """Take over a state written by :meth:`tensors`, and install its best.
@@ -250,7 +233,7 @@ class GradientAttack(AbstractAttack):
             InputError: the entries do not fit each other, or what is allowed.
             KeyError: an entry is missing.
         """
-        self._load_history(tensors)
+        self.history = read_history(tensors)
         self.best_mean_m = float(tensors["best_mean_m"][0])
         self.best_objective = float(tensors["best_objective"][0])
         self.best_offsets = np.array(tensors["best_offsets"])
@@ -259,8 +242,7 @@ class GradientAttack(AbstractAttack):
             change = np.abs(self._colourings[key].project(best) - best)
             if not change.max(initial=0) < 1e-3:  # nor NaN
                 raise InputError(f"best.{key}: colours that the attack may not have")
-        for key in list(self.optimiser):
-            self._load_parameter(key, tensors)
+        load_adam(self.optimiser, tensors)
         self.restore_best()
 
     def go_on_from(self, tensors: dict[str, np.ndarray]) -> None:
@@ -276,42 +258,17 @@ class GradientAttack(AbstractAttack):
         Raises:
             KeyError: an entry is missing.
         """
-        self._load_history(tensors)
+        self.history = read_history(tensors)
         self.best_objective = np.inf
-        for key in [key for key in self.optimiser if f"texture.{key}" in tensors]:
-            name, moved = f"texture.{key}", key == OFFSETS
+        for key in [key for key in self.optimiser if f"value.{key}" in tensors]:
+            name, moved = f"value.{key}", key == OFFSETS
             project = (self.freedom if moved else self._colourings[key]).project
-            self._load_parameter(key, {**tensors, name: project(tensors[name])})
+            allowed = {**tensors, name: project(tensors[name])}
+            load_adam(self.optimiser, allowed, [key])
             if moved:
                 self.best_offsets = project(tensors["best_offsets"])
             else:
                 self._best[key] = project(tensors[f"best.{key}"])
-
-    def _load_history(self, tensors: dict[str, np.ndarray]) -> None:
-        counts, rows = tensors["cost_counts"], tensors["history"]
-        if counts.shape != rows.shape[:1] or counts.sum() != len(tensors["costs"]):
-            raise InputError(f"{len(rows)} iterations, costs of {len(counts)}")
-        costs = np.split(tensors["costs"], np.cumsum(counts)[:-1])
-        self.history = [
-            IterationRecord(
-                int(row[0]), *map(float, row[1:]), costs=tuple(map(float, part))
-            )
-            for row, part in zip(rows, costs, strict=False)
-        ]
-
-    def _load_parameter(self, key: str, tensors: dict[str, np.ndarray]) -> None:
-        self.optimiser[key] = _tensor(tensors[f"texture.{key}"])
-        state: Any = self.optimiser.state[key]
-        value, promoted, rate, extra = state
-        if f"first.{key}" in tensors:
-            count = type(extra[0])([int(tensors[f"count.{key}"][0])])
-            for name in (f"first.{key}", f"second.{key}"):
-                if tensors[name].shape != tensors[f"texture.{key}"].shape:
-                    raise InputError(f"{name} has shape {tensors[name].shape}")
-            first = _like(extra[1], value, tensors[f"first.{key}"])
-            second = _like(extra[2], value, tensors[f"second.{key}"])
-            extra = (count, first, second, extra[3])
-        self.optimiser.state[key] = (value, promoted, rate, extra)
 
     def _record(
         self, seen: Evaluation, colours: Parameters | None = None
@@ -335,18 +292,3 @@ class GradientAttack(AbstractAttack):
 
 def _tensor(value: np.ndarray) -> Any:
     return mi.TensorXf(np.ascontiguousarray(value, np.float32))
-
-
-def _scalar(value: Any) -> int:
-    return int(np.array(value).ravel()[0])
-
-
-def _numpy(value: Any, shape: Any) -> np.ndarray:
-    return np.array(value, np.float32).reshape(shape).copy()
-
-
-def _like(sample: Any, value: Any, array: np.ndarray) -> Any:
-    kind = type(sample) if sample is not None else type(value)
-    if dr.is_tensor_v(kind):
-        return kind(np.array(array, np.float32))
-    return kind(np.array(array, np.float32).ravel())

@@ -18,7 +18,7 @@ from mi_nerfattack.io.resumable import (
     misfits_told,
 )
 
-FORMAT = "mi_nerfattack attack checkpoint 7"
+FORMAT = "mi_nerfattack attack checkpoint 8"
 REMEDY = (
     "resume with the scenario.toml of the run folder and the same files and versions, "
     "start a new run folder, or ignore this (--force)"

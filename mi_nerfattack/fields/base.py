@@ -13,53 +13,6 @@ from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fields.window import Window
 
 
-class AbstractPoints(ABC):
-    """Points of a field, collected in a kernel to be differentiated together.
-
-    Attributes:
-        capacity: number of points that fit.
-    """
-
-    capacity: int
-
-    @abstractmethod
-    def eval(
-        self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Color3f, Any]:
-        """Evaluate as :meth:`AbstractField.eval`; also return what `append` needs."""
-
-    @abstractmethod
-    def append(
-        self,
-        evaluated: Any,
-        d_density: mi.Float,
-        d_radiance: mi.Color3f,
-        ray: mi.UInt32,
-        active: mi.Bool,
-    ) -> None:
-        """Collect points; those beyond the capacity are only counted.
-
-        Args:
-            evaluated: the third value of :meth:`eval`.
-            d_density: (n,) derivative of an objective by the density.
-            d_radiance: (3, n) its derivative by the radiance.
-            ray: (n,) index of the ray that the point lies on.
-            active: (n,) mask.
-        """
-
-    @abstractmethod
-    def count(self) -> int:
-        """Evaluate, and return the number of points, also of those that did not fit."""
-
-    @abstractmethod
-    def accumulate(self, heading: mi.Vector3f) -> None:
-        """Add to the gradients of the field's parameters that ask for them.
-
-        Args:
-            heading: (3, rays), unit vectors in the field's frame.
-        """
-
-
 class AbstractField(ABC):
     """Radiance field in its own frame: density and linear radiance at a point.
 
@@ -168,19 +121,6 @@ class AbstractField(ABC):
         """Replace a parameter; shape and type must be those of the present one."""
         del value
         raise KeyError(f"{name}: a {self.kind} has no parameters")
-
-    @property
-    def collects_points(self) -> bool:
-        """Whether :meth:`points` is faster than the derivative of :meth:`eval`."""
-        return False
-
-    def points(self, capacity: int) -> AbstractPoints:
-        """Return an empty collection, where `collects_points` is true.
-
-        Args:
-            capacity: number of points that fit.
-        """
-        raise NotImplementedError(f"{self.kind} with room for {capacity} points")
 
     def arrays(self) -> list[Any]:
         """Return the Dr.Jit arrays that :meth:`eval` and the occupancy read."""

@@ -13,7 +13,6 @@ from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.fields.cpu.points import NGPPoints
 from mi_nerfattack.fields.grid import (
     box_metadata,
     check_box,
@@ -176,22 +175,15 @@ class NGPField(AbstractField):
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Color3f]:
         """See :meth:`AbstractField.eval_everywhere`."""
-        features = self.encoding(self.clipped(point), active)
-        density, radiance = self.decode(features, direction)
+        geometry = self._geometry(point, active)
+        harmonics = dr.sh_eval(mi.Vector3f(direction), SH_ORDER)
+        raw = [mi.Float(x) for x in self.colour_net(self._coop(geometry, harmonics))]
+        density, radiance = self.activate(geometry[0], raw)
         return density & active, radiance & active
 
     def clipped(self, point: mi.Point3f) -> mi.Point3f:
         """Map a point of the field's frame to where the encoding is looked up."""
         return dr.clip(self.unit(point), 0.0, 1.0 - 1e-6)
-
-    def decode(
-        self, features: list[mi.Float], direction: mi.Vector3f
-    ) -> tuple[mi.Float, mi.Color3f]:
-        """Run the networks, from features (n,) each to density and radiance."""
-        geometry = [mi.Float(x) for x in self.density_net(self._coop(features))]
-        harmonics = dr.sh_eval(mi.Vector3f(direction), SH_ORDER)
-        raw = [mi.Float(x) for x in self.colour_net(self._coop(geometry, harmonics))]
-        return self.activate(geometry[0], raw)
 
     def activate(
         self, geometry: mi.Float, raw: list[mi.Float]
@@ -203,15 +195,6 @@ class NGPField(AbstractField):
         """See :meth:`AbstractField.density_everywhere`."""
         raw = self._geometry(point, active)[0]
         return (self.density_scale * dr.exp(dr.minimum(raw, 15.0))) & active
-
-    @property
-    def collects_points(self) -> bool:
-        """True on a CPU, where networks are products of matrices."""
-        return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-
-    def points(self, capacity: int) -> NGPPoints:
-        """Return an empty collection."""
-        return NGPPoints(self, capacity)
 
     def density_bound(self) -> float:
         """Estimate a bound: twice the largest density at a million random points.

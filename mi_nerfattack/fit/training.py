@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.adam import adam_tensors, load_adam
 from mi_nerfattack.capture.inputs import depth_rays
 from mi_nerfattack.capture.posed_images import PosedImages, held_out
 from mi_nerfattack.errors import InputError
@@ -86,7 +87,8 @@ class Training:
         sky = options.sky and not bank.has_alpha
         source = BatchSource(bank, options.loss, radiance_field, sky)
         self._march: MarchStep | PointStep = MarchStep(radiance_field, source)
-        if isinstance(radiance_field, NGPField) and radiance_field.collects_points:
+        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        if isinstance(radiance_field, NGPField) and on_cpu:
             room = options.samples
             self._march = PointStep(radiance_field, source, _LISTED * room, room)
         elif options.loss.spread > 0:
@@ -218,13 +220,8 @@ class Training:
             "cells": np.packbits(self.field.occupancy.cells.ravel()),
             "state": np.array([getattr(self, name) for name in _STATE], np.int64),
         }
-        for name, value in self.optimiser.items():
-            time, first, second, _ = self.optimiser.state[name][3]
-            result[f"value.{name}"] = dr.detach(value).numpy()
-            result[f"first.{name}"] = first.numpy()
-            result[f"second.{name}"] = second.numpy()
-            result[f"time.{name}"] = np.array(time)
-        return {name: np.array(value) for name, value in result.items()}
+        copies = {name: np.array(value) for name, value in result.items()}
+        return copies | adam_tensors(self.optimiser)
 
     def load_tensors(self, tensors: dict[str, np.ndarray]) -> None:
         """Continue from what :meth:`tensors` returned."""
@@ -235,17 +232,7 @@ class Training:
         self.occupancy.restore(tensors["density"], tensors["cells"])
         for name, value in zip(_STATE, tensors["state"], strict=True):
             setattr(self, name, int(value))
-        for name in list(self._values()):
-            _, promoted, rate, _ = self.optimiser.state[name]
-            kinds = {"first": mi.Float, "second": mi.Float, "time": mi.UInt32}
-            first, second, time = (
-                kind(tensors[f"{part}.{name}"].copy()) for part, kind in kinds.items()
-            )
-            fresh = mi.Float(tensors[f"value.{name}"].copy())
-            dr.make_opaque(fresh, first, second)
-            dr.enable_grad(fresh)
-            moments = (time, first, second, None)
-            self.optimiser.state[name] = fresh, promoted, rate, moments
+        load_adam(self.optimiser, tensors)
 
 
 def unpack(grid: GridField, packed: Any) -> None:

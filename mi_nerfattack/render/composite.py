@@ -12,11 +12,12 @@ import mitsuba as mi
 
 from mi_nerfattack.backend.concat import concat
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
-from mi_nerfattack.render.batched import FIRST_RAYS, march_gradient
 from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
+
+FIRST_RAYS = 1 << 13  # that tasks wait for before a launch
 
 #: What to do where a backdrop has no derivative by the rays.
 DETACH = "keep the camera detached"
@@ -296,7 +297,8 @@ class DepthComposite(AbstractComposite):
     def accumulate(self, posed: Sequence[Layer], task: Task, stop: float) -> None:
         """See :meth:`AbstractComposite.accumulate`."""
         (item,) = task.rays.light(posed)
-        march_gradient(item, task.rays, task.primal, task.cotangent, stop)
+        mode = dr.ADMode.Backward
+        march_derivative(mode, item, task.rays, task.primal, task.cotangent, stop)
 
     def backward_rays(
         self,
@@ -314,7 +316,7 @@ class DepthComposite(AbstractComposite):
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [
-            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop)[1]
+            march_derivative(mode, item, rays, seen.layers[k], parts[k], stop, True)[1]
             for k, item in zip(wanted, fields, strict=True)
         ]
 

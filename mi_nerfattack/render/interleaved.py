@@ -16,7 +16,6 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.backdrop import Layer, only_fields
-from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
@@ -29,6 +28,7 @@ from mi_nerfattack.render.march import (
     RayGradient,
     integrate,
     march,
+    march_derivative,
     private_gradients,
     replay,
 )
@@ -111,7 +111,7 @@ class InterleavedComposite(AbstractComposite):
         mode, rays, fields = dr.ADMode.Backward, task.rays, _fields(posed)
         if len(posed) == 1:
             (item,) = rays.light(posed)
-            march_gradient(item, rays, task.primal, task.cotangent, stop)
+            march_derivative(mode, item, rays, task.primal, task.cotangent, stop)
             return
         with dr.suspend_grad(), private_gradients():
             _replay(mode, fields, rays, task.primal, task.cotangent, stop, False)

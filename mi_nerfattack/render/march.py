@@ -51,8 +51,6 @@ PRIVATE_BYTES = 1 << 29  # of all threads' copies of one gradient buffer
 
 #: Maps local points, directions in a form of its own, and a mask to density and colour.
 Evaluate = Callable[[Any, Any, Any], tuple[Any, Any]]
-#: Derivatives by origins and directions of n rays, `mi.Vector3f` each.
-RayTangent = tuple[Any, Any]
 
 
 @contextmanager
@@ -97,6 +95,7 @@ def march_derivative(  # noqa: D417  one entry describes three
     primal: March,
     cotangent: March,
     stop: float = STOP,
+    with_rays: bool = False,
 ) -> tuple[March, RayGradient]:
     """Replay :func:`march` and propagate derivatives through the field.
 
@@ -116,14 +115,14 @@ def march_derivative(  # noqa: D417  one entry describes three
         primal: the result of :func:`march`.
         cotangent: derivative of the objective by radiance, opacity and moment;
             ignored in forward mode.
+        with_rays: differentiate by the rays, too; in backward mode alone.
 
     Returns:
         the tangent of the march (forward mode; zeros otherwise), and the objective's
-        derivatives by the rays (backward mode; zeros otherwise).
+        derivatives by the rays (with them; zeros otherwise).
     """
     with dr.suspend_grad(), private_gradients():
         walk, active = Walk.start(posed, rays)
-        with_rays = mode == dr.ADMode.Backward
         fixed = [posed], walk, active, primal, cotangent, stop
         tangent, (by_rays,) = replay(mode, *fixed, with_rays)
     return tangent, by_rays
@@ -237,13 +236,14 @@ def replay(  # noqa: D417  one entry describes four
             change = slope.change(depths, colours)
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                 dr.backward_from(cotangent.pair(change))
+            else:
+                tangent = tangent.plus(dr.forward_to(change), here.active)
+            if dr.hint(with_rays, mode="scalar"):
                 growth = slope.growth(cotangent, dr.detach(depths), dr.detach(colours))
                 by_rays = [
                     by_rays[k].plus(points[k], headings[k], growth[k], here)
                     for k in count
                 ]
-            else:
-                tangent = tangent.plus(dr.forward_to(change), here.active)
         active = here.active & (dr.exp(-rest.tau) > stop)
     return tangent, list(map(RayGradient.in_world, by_rays, posed, walk.paths))
 

@@ -33,7 +33,7 @@ def test_the_seed_decides_all_that_is_drawn(folder):
             assert attack.rollout.loop.disturbance == Disturbance(0.5, 0.8, 0.02, seed)
             assert world.surrogate.jitter_seed == seed
             attack.step()
-            found.append([attack.tensors()["texture.0"], np.array(attack.initial)])
+            found.append([attack.tensors()["value.0"], np.array(attack.initial)])
     for a, b, c in zip(*found, strict=True):
         assert np.array_equal(a, b) and not np.array_equal(a, c)
 

@@ -93,7 +93,6 @@ def test_whatever_evaluates_a_field_sees_the_same(make, rng) -> None:
     expected *= window(cells, unit.astype(float))
     found = [field.eval(place, heading, active)[0], field.density(place, active)]
     if field.kind == "ngp_field":
-        found.append(field.points(len(unit)).eval(place, heading, active)[0])
         packed = PackedNGP(field)
         found.append(packed.eval(place, packed.view(heading), active)[0])
     for density in found:

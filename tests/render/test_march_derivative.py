@@ -57,7 +57,8 @@ class Setting:
         primal = self.march()
         rays = (self.origin, self.direction)
         fixed = small.arguments(self.posed, *rays, self.t_max)
-        result = march_derivative(mode, *fixed, primal, self.cotangent, 0.0)
+        with_rays = mode == dr.ADMode.Backward
+        result = march_derivative(mode, *fixed, primal, self.cotangent, 0.0, with_rays)
         dr.eval(result)
         return result
 

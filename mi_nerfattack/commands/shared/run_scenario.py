@@ -67,7 +67,7 @@ def _run(
 ) -> dict[str, Any]:
     """Run a scenario in a folder that is claimed, as `Job.run_claimed` is told."""
     from mi_nerfattack import variant
-    from mi_nerfattack.backend.threads import one_thread
+    from mi_nerfattack.backend.torch_arrays import one_thread
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.job import Job
     from mi_nerfattack.scenario.scenario import load_scenario

@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fit.batch import STOP, BatchSource, Draw, Score
-from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.march import march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays
@@ -58,17 +57,21 @@ class MarchStep:
     ) -> None:
         # rays of a packet rarely meet in a vertex: adding them up first is no gain
         with dr.scoped_set_flag(dr.JitFlag.ScatterReduceLocal, False):
-            if not self.source.learns_poses:
-                march_gradient(self.posed, rays, found, cotangent, STOP)
-                return
             _, by_rays = march_derivative(
-                dr.ADMode.Backward, self.posed, rays, found, cotangent, STOP
+                dr.ADMode.Backward,
+                self.posed,
+                rays,
+                found,
+                cotangent,
+                STOP,
+                with_rays=self.source.learns_poses,
             )
-        self.source.backward_rays(
-            draw,
-            _put_back(by_rays.origin, order),
-            _put_back(by_rays.direction, order),
-        )
+        if self.source.learns_poses:
+            self.source.backward_rays(
+                draw,
+                _put_back(by_rays.origin, order),
+                _put_back(by_rays.direction, order),
+            )
 
 
 def _put_back(value: Any, order: mi.UInt32) -> Any:

@@ -86,7 +86,8 @@ def expected_surface(shape: PosedField, rays: Rays, stop: float) -> Surface:
         depth = dr.select(active, primal.moment * rate, 0)
         by_depth = March(mi.Color3f(0), -depth * rate, rate)
         mode = dr.ADMode.Backward
-        slope = march_derivative(mode, shape, rays, primal, by_depth, stop)[1].origin
+        fixed = shape, rays, primal, by_depth, stop
+        slope = march_derivative(mode, *fixed, with_rays=True)[1].origin
         slope += rate * _entry_slope(shape, rays, depth, active)
         length = dr.norm(slope)
         clear = (length > 0) & (length < dr.inf) & (primal.opacity > FAINT)

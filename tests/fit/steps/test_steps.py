@@ -135,7 +135,10 @@ def test_gradient_by_the_poses_equals_that_of_the_march(rng):
     np.testing.assert_allclose(found[POSES], expected[POSES], atol=1e-4 * scale)
 
 
-def test_networks_against_central_differences(rng):
+@pytest.mark.parametrize("block", [1 << 12, 4])
+def test_networks_against_central_differences(rng, monkeypatch, block):
+    monkeypatch.setattr("mi_nerfattack.fields.cpu.matrices.BLOCK", block)
+
     def layers(*sizes: int) -> MLP:
         pairs = zip(sizes[1:], sizes[:-1], strict=True)
         return MLP([rng.normal(size=pair) for pair in pairs])
