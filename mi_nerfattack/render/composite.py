@@ -11,15 +11,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.backend.concat import concat
-from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
+from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, fields_by_rays
 from mi_nerfattack.render.batched import FIRST_RAYS, march_gradient
 from mi_nerfattack.render.march import RayTangent, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
-
-#: What to do where a backdrop has no derivative by the rays.
-DETACH = "keep the camera detached"
 
 
 @dataclass
@@ -262,7 +259,7 @@ class DepthComposite(AbstractComposite):
         """See :meth:`AbstractComposite.forward`."""
         mode, none = dr.ADMode.Forward, March()
         if t_rays is not None:
-            only_fields(posed, "a backdrop is not differentiated by rays", DETACH)
+            fields_by_rays(posed)
         tangents = [
             march_derivative(mode, item, rays, layer, none, stop, t_rays)[0]
             if item.has_gradients or t_rays is not None
@@ -309,8 +306,7 @@ class DepthComposite(AbstractComposite):
     ) -> list[RayTangent]:
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
-        purpose = "a backdrop is not differentiated by rays"
-        fields = only_fields([lit[k] for k in wanted], purpose, DETACH)
+        fields = fields_by_rays([lit[k] for k in wanted])
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [

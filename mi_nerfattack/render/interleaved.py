@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.render.backdrop import Layer, only_fields
+from mi_nerfattack.render.backdrop import Layer, fields_by_rays, only_fields
 from mi_nerfattack.render.batched import march_gradient
 from mi_nerfattack.render.composite import (
     AbstractComposite,
@@ -129,6 +129,7 @@ class InterleavedComposite(AbstractComposite):
         wanted: Sequence[int],
     ) -> list[RayTangent]:
         """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
+        fields_by_rays([posed[k] for k in wanted])
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
             by_field = _replay(mode, fields, rays, seen.total, cotangent, stop, True)[1]
