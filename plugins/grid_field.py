@@ -19,7 +19,8 @@ class GridFieldVolume(AbstractFieldVolume):
 
      * - filename
        - |string|
-       - Field file, of ``mi-nerfattack asset``
+       - Field file, of ``mi-nerfattack asset``: relative to the scene file, or
+         :monosp:`bundled:FILE`
 
      * - to_world
        - |transform|
@@ -76,9 +77,9 @@ class GridFieldVolume(AbstractFieldVolume):
                 "to_world": mi.ScalarTransform4f().scale(2),
             }
 
-    Media step by the largest density: where an object is as opaque as fitted ones are
-    (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass
-    more than a centimetre (0.7 %).
+    Media step by the largest density: in an object as opaque as fitted ones are
+    (7,700/metre), a path takes thousands of steps. ``density_limit`` 500 still lets no
+    light pass more than a centimetre (0.7 %).
 
     Where the file calls space empty, the density is 0 whatever ``density`` says: see
     ``fields.window``. Not differentiable: the pose.

@@ -21,7 +21,8 @@ Mask: TypeAlias = "mi.Bool | bool"
 def read_filename(props: mi.Properties) -> str:
     """Find the file that `filename` names: bundled, or beside the scene's."""
     resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  # no stub
-    return str(resolver.resolve(str(resolve(props["filename"]))))
+    name: Any = props["filename"]
+    return str(resolver.resolve(str(resolve(name))))
 
 
 def read_pose(props: mi.Properties) -> Pose:

@@ -73,8 +73,8 @@ def read_planes(level: GridLevel, cells: np.ndarray) -> Iterator[np.ndarray]:
     x, y, z = [_readers(level, count) for count in cells.shape]
     layers = cells.transpose(2, 1, 0)
     for first, stop in zip(*z, strict=True):
-        rows = _any_of(layers[first:stop].any(0).T, *x)
-        yield _any_of(rows.T, *y)
+        layer = np.logical_or.reduce(layers[first:stop])
+        yield _any_of(_any_of(layer.T, *x).T, *y)
 
 
 def count_read(levels: Sequence[GridLevel], cells: np.ndarray) -> int:

@@ -8,8 +8,14 @@ import pytest
 from helpers import small_fields as small
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
-from mi_nerfattack.fields import load_grid
+from mi_nerfattack.fields import (
+    GridField,
+    GridLayout,
+    NGPField,
+    NGPLayout,
+    Occupancy,
+    load_grid,
+)
 from mi_nerfattack.fields.levels import count_read
 from mi_nerfattack.scenes import bundled
 
@@ -68,7 +74,7 @@ def test_read_vertices_are_the_corners_of_cells_with_points(shape, rng) -> None:
 
 
 def crossings(field: GridField) -> np.ndarray:
-    """Return where planes through vertices meet in occupied cells, (n, 3) of the box."""
+    """Return where planes of vertices meet in occupied cells, (n, 3) of the box."""
     planes = [np.arange(x.resolution) / x.scale for x in field.levels()]
     found = []
     for cell in np.argwhere(field.window.cells):

@@ -126,13 +126,10 @@ def test_a_frozen_function_may_set_a_texture(grid) -> None:
         np.testing.assert_array_equal(colours, k)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
-@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("towards", [(np.inf, -np.inf, 0), (0, 0.6, np.nan)])
 def test_a_direction_that_is_no_number_reads_inside_of_the_sky(
-    axis: int, bad: float, monkeypatch
+    towards, monkeypatch
 ) -> None:
-    towards = [0.0, 0.6, 0.8]
-    towards[axis] = bad
     direction = mi.Vector3f(*[mi.Float([v, 0.6]) for v in towards])
     indices, gather = [], dr.gather
 
@@ -141,6 +138,7 @@ def test_a_direction_that_is_no_number_reads_inside_of_the_sky(
         return gather(kind, source, dr.minimum(index, 5), *more)
 
     monkeypatch.setattr(dr, "gather", record)
-    sky_colour(dr.ones(mi.Float, 2 * 3 * 3), (2, 3), direction)
+    colour = sky_colour(dr.ones(mi.Float, 2 * 3 * 3), (2, 3), direction)
     assert len(indices) == 4
     assert max(index.max() for index in indices) < 2 * 3
+    np.testing.assert_array_equal(np.isfinite(colour.numpy()), [[False, True]] * 3)
