@@ -269,14 +269,17 @@ class FieldIntegrator(FilmIntegrator):
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
     ) -> State:
         """March the fields, and see what lies behind them."""
-        rays.gains, shadow = self._relight(scene, sampler, ray, rays)
+        light = self.relighting
+        if light is not None:
+            rays.gains = light.gains(scene, sampler, self.posed, rays)
         seen = self.composite.render(self.posed, rays, self.stop)
         if self.behind is None:
             return State(seen, rays.gains)
         behind, valid, aovs, *inner = sample_nested(
             self.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
         )
-        if shadow is not None:
+        if light is not None:
+            shadow = light.behind(scene, sampler, self.posed, ray, rays.active)
             behind *= spectrum.reflectance(shadow, ray.wavelengths)
         return State(seen, rays.gains, behind, valid, list(aovs), *inner)
 
@@ -327,16 +330,22 @@ class FieldIntegrator(FilmIntegrator):
             self.composite.backward(self.posed, rays, state.seen, cotangent, self.stop)
             return
         # Fields, camera and poses in one march
+        wanted = [
+            k
+            for k, item in enumerate(self.posed)
+            if by_camera or item.has_gradients or item.has_pose_gradients
+        ]
         found = self.composite.backward_rays(
-            self.posed, rays, state.seen, cotangent, self.stop, range(len(self.posed))
+            self.posed, rays, state.seen, cotangent, self.stop, wanted
         )
-        with dr.resume_grad():
-            for item, by_ray in zip(self.posed, found, strict=True):
-                item.backward_pose(rays, by_ray)
-            if by_camera:
-                by_origin = sum((part.origin for part in found), mi.Vector3f(0))
-                by_direction = sum((part.direction for part in found), by_sky)
-                dr.backward_from(dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction))
+        for k, by_rays in zip(wanted, found, strict=True):
+            self.posed[k].backward_pose(rays, by_rays)
+        if by_camera:
+            by_origin = sum((part.origin for part in found), mi.Vector3f(0))
+            by_direction = sum((part.direction for part in found), by_sky)
+            with dr.resume_grad():
+                result = dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction)
+                dr.backward_from(result)
 
     def _forward(
         self,
@@ -370,18 +379,6 @@ class FieldIntegrator(FilmIntegrator):
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             colour, alpha, aovs = dr.forward_to(found, flags=flags)
         return colour, (alpha, aovs)
-
-    def _relight(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
-    ) -> tuple[list[mi.Color3f], mi.Color3f | None]:
-        """Return the fields' gains, and that of what lies behind; none if not relit."""
-        if self.relighting is None:
-            return [], None
-        gains = self.relighting.gains(scene, sampler, self.posed, rays)
-        if self.behind is None:
-            return gains, None
-        shadow = self.relighting.behind(scene, sampler, self.posed, ray, rays.active)
-        return gains, shadow
 
     def _over(self, total: March, rays: Rays, behind: Any, wavelengths: Any) -> Any:
         """Lay the fields over what is behind, as a spectrum."""

@@ -23,7 +23,8 @@ class GridFieldVolume(AbstractFieldVolume):
 
      * - filename
        - |string|
-       - Field file, of ``mi-nerfattack asset``
+       - Field file, of ``mi-nerfattack asset``: relative to the scene file, or
+         :monosp:`bundled:FILE`
 
      * - to_world
        - |transform|
@@ -81,9 +82,9 @@ class GridFieldVolume(AbstractFieldVolume):
                 "to_world": mi.ScalarTransform4f().scale(2),
             }
 
-    Media step by the largest density: where an object is as opaque as fitted ones are
-    (100,000/metre), they never arrive. ``density_limit`` 500 still lets no light pass
-    more than a centimetre (0.7 %).
+    Media step by the largest density: in an object as opaque as fitted ones are
+    (7,700/metre), a path takes thousands of steps. ``density_limit`` 500 still lets no
+    light pass more than a centimetre (0.7 %).
 
     ``colour`` stands for the texture of all levels: a step of an optimiser is a change
     of colour by that step. Keep it within 0 and 1, for instance by ``dr.clip``. Where

@@ -19,7 +19,8 @@ class NGPFieldVolume(AbstractFieldVolume):
 
      * - filename
        - |string|
-       - Field file, of ``mi-nerfattack fit``
+       - Field file, of ``mi-nerfattack fit``: relative to the scene file, or
+         :monosp:`bundled:FILE`
 
      * - to_world
        - |transform|

@@ -12,15 +12,17 @@ from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.composite import AbstractComposite
 from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.march import STOP
+from mi_nerfattack.scenes import resolve
 
 # Which lanes are active: Mitsuba passes an array, or leaves the default.
 Mask: TypeAlias = "mi.Bool | bool"
 
 
 def read_filename(props: mi.Properties) -> str:
-    """Find the file that `filename` names beside the scene's."""
+    """Find the file that `filename` names: bundled, or beside the scene's."""
     resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  # no stub
-    return str(resolver.resolve(props["filename"]))
+    name: Any = props["filename"]
+    return str(resolver.resolve(str(resolve(name))))
 
 
 def read_pose(props: mi.Properties) -> Pose:

@@ -9,7 +9,9 @@ from mi_nerfattack.errors import InputError
 
 from .listing import ROOT, data_files
 
-__all__ = ["bundled"]
+__all__ = ["BUNDLED", "bundled", "resolve"]
+
+BUNDLED = "bundled:"
 
 
 def bundled(name: str) -> Path:
@@ -27,3 +29,18 @@ def bundled(name: str) -> Path:
         return path.resolve()
     known = ", ".join(data_files(ROOT))
     raise InputError(f"{name}: not a bundled file or folder; there are {known}")
+
+
+def resolve(name: str, folder: str | Path = "") -> Path:
+    """Find a file that a command, a scenario or a scene file names.
+
+    Args:
+        name: ``bundled:FILE``, or a path relative to `folder`.
+        folder: that relative paths start from.
+
+    Raises:
+        InputError: nothing of this name is bundled.
+    """
+    if name.startswith(BUNDLED):
+        return bundled(name[len(BUNDLED) :])
+    return Path(folder) / Path(name).expanduser()

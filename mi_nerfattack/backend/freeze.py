@@ -10,6 +10,8 @@ from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.errors import NerfAttackError
+
 
 def freeze_method(
     method: Callable[..., Any], state: Callable[..., Any]
@@ -24,6 +26,9 @@ def freeze_method(
         method: bound; arguments and result are PyTrees.
         state: bound; called with the same arguments, returns everything else that
             `method` reads or depends on.
+
+    Returns:
+        what does the same; errors of ours leave it as they are, not as Dr.Jit's.
     """
     call, read = weakref.WeakMethod(method), weakref.WeakMethod(state)
 
@@ -37,7 +42,12 @@ def freeze_method(
 
     def replay(*arguments: Any) -> Any:
         with _no_garbage_collection():
-            return recorded(*arguments)
+            try:
+                return recorded(*arguments)
+            except RuntimeError as err:
+                if isinstance(err.__cause__, NerfAttackError):
+                    raise err.__cause__ from None
+                raise
 
     return replay
 

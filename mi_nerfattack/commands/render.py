@@ -65,14 +65,14 @@ class Render:
         from mi_nerfattack import variant
         from mi_nerfattack.render.pathtrace.frames import FrameRenderer
         from mi_nerfattack.render.pathtrace.sequence import Shot
-        from mi_nerfattack.scenario.named_file import resolve
+        from mi_nerfattack.scenes import resolve
 
         is_path = self.path is not None or self.route is not None
         self._check_output(is_path)
         variant.ensure()
         poses = self._poses() if is_path else None
         renderer = FrameRenderer(
-            resolve(self.scene, Path()),
+            resolve(self.scene),
             self.sensor,
             self.spp,
             self._parameters(),
@@ -127,13 +127,13 @@ class Render:
     def _poses(self) -> np.ndarray:
         from mi_nerfattack.capture.camera_path import read_path, route_path
         from mi_nerfattack.render.camera.intrinsics import CameraMount
-        from mi_nerfattack.scenario.named_file import resolve
+        from mi_nerfattack.scenes import resolve
         from mi_nerfattack.vehicle.route.route import Route
 
         if self.path is not None:
             return read_path(self.path)
         assert self.route is not None and self.routes is not None
-        route = Route.from_file(resolve(self.routes, Path()), self.route)
+        route = Route.from_file(resolve(self.routes), self.route)
         return route_path(route, CameraMount(*self.mount), self.fps)
 
     def _run_frame(self, renderer: FrameRenderer) -> Result:

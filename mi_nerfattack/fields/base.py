@@ -30,9 +30,12 @@ class AbstractField(ABC):
         occupancy: grid by which a march skips empty space and, where it has octants,
             what is thin.
         window: factor of the density that is 0 in empty space.
+        differentiable_by_position: whether density and radiance are continuous, so that
+            derivatives by rays are those of the picture.
     """
 
     kind: str
+    differentiable_by_position = True
     lower: np.ndarray
     upper: np.ndarray
     step_m: float

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.backend.upload import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import box_metadata, check_box, check_positive
@@ -98,7 +99,11 @@ class BrickField(AbstractField):
     A brick divides its cell into n^3 parts, n = 1, 2, 4 or 8, and has (n + 1)^3
     vertices. What they keep (``Codes``) is interpolated trilinearly, and becomes
     density and radiance then. The radiance does not depend on the direction. Made by
-    `fit.bake`; there is nothing to optimise, but it is differentiable by the position.
+    `fit.bake`; there is nothing to optimise.
+
+    Not differentiable by the position: each brick rounds the values at its faces by
+    itself, and neighbours may have other numbers of parts, so that density and radiance
+    jump from brick to brick. Inside of a part, Dr.Jit's derivatives are right.
 
     Costs four bytes a vertex, and four a cell for where its brick begins.
 
@@ -119,6 +124,7 @@ class BrickField(AbstractField):
     """
 
     kind = "brick_field"
+    differentiable_by_position = False
 
     def __init__(
         self,
@@ -141,21 +147,21 @@ class BrickField(AbstractField):
         check_positive("step_m", self.step_m)
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
-        _check_bricks(occupancy, subdivisions, vertices, sky)
+        check_bricks(int(occupancy.cells.sum()), subdivisions, vertices, sky)
         self.codes = codes
         self.info: dict[str, str] = dict(info or {})
         self.occupy(occupancy)
-        self.subdivisions = subdivisions
-        self.vertices = mi.UInt32(np.ascontiguousarray(vertices, np.uint32))
+        self.subdivisions = subdivisions.copy()
+        self.vertices = upload(mi.UInt32, vertices)
         level = np.log2(FINEST // subdivisions).astype(np.uint32)
         # without a brick: one part, at the first vertex, and no density
         none = len(_LEVELS) - 1 << _LEVEL_SHIFT
         pointers = np.full(occupancy.shape, none, np.uint32)
         starts = brick_starts(subdivisions)[:-1]
         pointers[occupancy.cells] = starts | level << _LEVEL_SHIFT
-        self._pointers = mi.UInt32(pointers.ravel())
+        self._pointers = upload(mi.UInt32, pointers)
         self._sky_shape = sky.shape[0], sky.shape[1]
-        self._sky = mi.Float(np.ascontiguousarray(sky, np.float32).ravel())
+        self._sky = upload(mi.Float, sky)
         dr.make_opaque(self.vertices, self._pointers, self._sky)
 
     def corners(
@@ -246,10 +252,17 @@ class BrickField(AbstractField):
         }
 
 
-def _check_bricks(
-    occupancy: Occupancy, subdivisions: np.ndarray, vertices: np.ndarray, sky: Any
+def check_bricks(
+    bricks: int, subdivisions: np.ndarray, vertices: np.ndarray, sky: Any
 ) -> None:
-    bricks = int(occupancy.cells.sum())
+    """Raise InputError unless arrays belong to as many bricks.
+
+    Args:
+        bricks: number of occupied cells.
+        subdivisions: see :class:`BrickField`.
+        vertices: likewise.
+        sky: likewise.
+    """
     if not bricks:
         raise InputError("occupancy: no cell is occupied; at least one has a brick")
     good = subdivisions.shape == (bricks,) and subdivisions.dtype == np.uint8

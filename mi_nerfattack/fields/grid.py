@@ -13,14 +13,20 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
 from mi_nerfattack.backend.colour import srgb_to_linear
+from mi_nerfattack.backend.upload import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.levels import (
+    GridLevel,
+    largest_sum,
+    lay_out_levels,
+    level_growth,
+    read_planes,
+)
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fields.vertex_colours import VertexColours
 
-_ROUNDING = (
-    1e-3  # cells of a level, more than single precision errs by; files rely on it
-)
+_MOST_VERTICES = (1 << 30) - 1  # four numbers each, which kernels index by 32 bits
 
 
 @dataclass(frozen=True)
@@ -45,26 +51,37 @@ class GridLayout:
                 f"resolutions: {self.base_resolution} to {self.max_resolution}; "
                 "allowed is 2 <= base <= max <= 512"
             )
+        if self.n_vertices > _MOST_VERTICES:
+            raise InputError(
+                f"levels: {self.levels}, from {self.base_resolution} to "
+                f"{self.max_resolution}, have {self.n_vertices} vertices; at most "
+                f"{_MOST_VERTICES} are allowed, take fewer levels"
+            )
 
     @property
     def growth(self) -> float:
         """Factor between the resolutions of neighbouring levels."""
         return level_growth(self.levels, self.base_resolution, self.max_resolution)
 
+    @property
+    def grid_levels(self) -> list[GridLevel]:
+        """The levels, the coarsest first."""
+        return self._laid_out[0]
 
-@dataclass(frozen=True)
-class GridLevel:
-    """One level of a grid field.
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices of all levels, with what aligns them."""
+        return self._laid_out[1]
 
-    Attributes:
-        scale: its vertex i lies at i / scale along an edge of the unit cube.
-        resolution: vertices along an edge.
-        vertices: which of the field's they are, x the fastest.
-    """
+    @property
+    def hashmap_size(self) -> int:
+        """Most vertices of a level; so many that nothing is hashed."""
+        return self.max_resolution**3 * 4
 
-    scale: float
-    resolution: int
-    vertices: slice
+    @property
+    def _laid_out(self) -> tuple[list[GridLevel], int]:
+        resolutions = self.base_resolution, self.max_resolution
+        return lay_out_levels(self.levels, *resolutions, 4, self.hashmap_size)
 
 
 class GridField(AbstractField):
@@ -124,17 +141,22 @@ class GridField(AbstractField):
             3,
             n_levels=layout.levels,
             n_features_per_level=4,
-            hashmap_size=layout.max_resolution**3 * 4,
+            hashmap_size=layout.hashmap_size,
             base_resolution=layout.base_resolution,
             per_level_scale=layout.growth,
             align_corners=True,
             init_scale=0.0,
         )
-        self.n_vertices: int = self.encoding.n_params // 4
+        self.n_vertices: int = layout.n_vertices
         self._density = flat_parameter(density, (self.n_vertices,), "density")
         self._texture = flat_parameter(texture, (self.n_vertices, 3), "texture")
         self._colours: VertexColours | None = None
         self._pack()
+
+    def occupy(self, occupancy: Occupancy) -> None:
+        """See :meth:`AbstractField.occupy`."""
+        super().occupy(occupancy)
+        self._bound: float | None = None
 
     @property
     def texture(self) -> mi.TensorXf:
@@ -208,35 +230,19 @@ class GridField(AbstractField):
 
     def levels(self) -> list[GridLevel]:
         """Return the levels, the coarsest first."""
-        found = []
-        for index in range(self.layout.levels):
-            scale = self.encoding._level_scale(index)
-            n = self.encoding._resolution(scale)
-            start = self.encoding.level_offset(index)
-            found.append(GridLevel(scale, n, slice(start, start + n**3)))
-        return found
+        return self.layout.grid_levels
 
     def density_bound(self) -> float:
-        """Bound the density by the vertices around each block of a 64^3 partition.
+        """Return the largest density in occupied cells before the window's factor.
 
-        Interpolation never exceeds its vertices, so the sum over levels of the
-        largest vertex near a block bounds the field there.
+        Exact but for rounding. Kept until the density or the occupancy changes, since
+        media ask for it after every change of a parameter.
         """
-        raw = self._density.numpy()
-        blocks = 64
-        edges = np.arange(blocks + 1) / blocks
-        total = np.zeros((blocks,) * 3)
-        for level in self.levels():
-            scale, n = level.scale, level.resolution
-            values = raw[level.vertices].reshape(n, n, n)
-            low = np.floor(edges[:-1] * scale).astype(int)
-            high = np.minimum(np.floor(edges[1:] * scale).astype(int) + 1, n - 1)
-            for axis in range(3):
-                width = int((high - low).max()) + 1
-                picks = [np.minimum(low + k, high) for k in range(width)]
-                values = np.max([values.take(p, axis) for p in picks], axis=0)
-            total += values
-        return self.density_scale * float(np.exp(min(total.max(), 15.0)))
+        if self._bound is None:
+            raw = dr.detach(self._density).numpy()
+            largest = largest_sum(self.levels(), raw, self.window.cells)
+            self._bound = self.density_scale * float(np.exp(min(largest, 15.0)))
+        return self._bound
 
     def arrays(self) -> list[Any]:
         """Return `packed`, occupancy and window."""
@@ -253,17 +259,15 @@ class GridField(AbstractField):
         return {"texture": self.texture, "density": self._density}
 
     def set_parameter(self, name: str, value: Any) -> None:
-        """Replace ``texture``, ``colour`` or ``density``.
-
-        ``colour`` (n, 3) are the sRGB colours of :attr:`colours`.
-        """
+        """Replace ``texture``, ``colour`` (that of :attr:`colours`) or ``density``."""
         if name == "colour":
             self._texture = self.colours.replace(value)
         elif name == "texture":
             self._texture = flat_parameter(value, (self.n_vertices, 3), name)
         elif name == "density":
-            density = flat_parameter(value, (self.n_vertices,), name)
-            mi.set_property(self._density, density)
+            value = flat_parameter(value, (self.n_vertices,), name)
+            mi.set_property(self._density, value)
+            self._bound = None
         else:
             raise KeyError(
                 f"{name}: a grid field has 'texture', 'colour' and 'density'"
@@ -290,13 +294,10 @@ class GridField(AbstractField):
 
     def held_vertices(self) -> np.ndarray:
         """Tell which vertices are read anywhere in an occupied cell, (n_vertices,)."""
-        cells = self.window.cells
         held = np.zeros(self.n_vertices, bool)
         for level in self.levels():
-            found = cells.astype(np.float32)
-            for count in cells.shape:  # takes the first axis, puts vertices last
-                found = np.tensordot(found, _reads(level, count), axes=(0, 0))
-            held[level.vertices] = found.T.ravel() > 0
+            planes = read_planes(level, self.window.cells)
+            held[level.vertices] = np.concatenate([plane.ravel() for plane in planes])
         return held
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -321,14 +322,6 @@ class GridField(AbstractField):
         }
 
 
-def _reads(level: GridLevel, count: int) -> np.ndarray:
-    """Tell which vertices along an axis each of `count` cells reads, (count, n)."""
-    edges = np.arange(count + 1)[:, None] / count * level.scale
-    vertex = np.arange(level.resolution)
-    low, high = np.floor(edges[:-1] - _ROUNDING), np.floor(edges[1:] + _ROUNDING) + 1
-    return ((low <= vertex) & (vertex <= high)).astype(np.float32)
-
-
 def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
     """Return the header entries that every kind of field file shares."""
     return {
@@ -344,22 +337,52 @@ def box_metadata(field: AbstractField, info: dict[str, str]) -> dict[str, str]:
 
 
 def flat_parameter(value: Any, shape: tuple[int, ...], name: str) -> mi.Float:
-    """Turn an array of a given shape (or its flat form) into a flat Dr.Jit array."""
+    """Turn an array of a given shape (or its flat form) into a flat Dr.Jit array.
+
+    Memory of NumPy is copied.
+
+    Raises:
+        InputError: another shape, or a value that is not finite.
+    """
     if value is None:
         value = np.zeros(shape, np.float32)
     found = tuple(value.shape)
     if found not in (shape, (int(np.prod(shape)),)):
         raise InputError(f"{name}: shape {found}; expected {shape}")
     if isinstance(value, np.ndarray):
-        flat = mi.Float(np.ascontiguousarray(value, np.float32).ravel())
+        flat = upload(mi.Float, value)
     else:
         flat = mi.Float(value.array if dr.is_tensor_v(value) else value)
+    check_finite(name, flat, int(np.prod(shape[1:])))
     return flat
 
 
-def level_growth(levels: int, base: int, largest: int) -> float:
-    """Return the factor between neighbouring levels that leads from base to largest."""
-    return 1.0 if levels == 1 else float((largest / base) ** (1 / (levels - 1)))
+def check_finite(
+    name: str, flat: Any, channels: int = 1, place: str = "vertex"
+) -> None:
+    """Raise InputError if a parameter holds NaN or infinity.
+
+    Nothing is checked while a kernel or a frozen function is recorded, since there are
+    no values yet.
+
+    Args:
+        name: of the parameter.
+        flat: its values, vertex by vertex; may be attached.
+        channels: values per vertex.
+        place: what messages call a vertex.
+    """
+    if dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope):
+        return
+    values = dr.detach(flat)
+    dr.schedule(values)  # or what gives them is computed twice
+    if dr.all(dr.isfinite(values)):
+        return
+    bad = ~np.isfinite(values.numpy())
+    raise InputError(
+        f"{name}: {np.count_nonzero(bad)} of {bad.size} values are NaN or infinite, "
+        f"the first at {place} {bad.argmax() // channels}; lower the learning rate, "
+        "and look for the first gradient that is not finite"
+    )
 
 
 def check_box(lower: np.ndarray, upper: np.ndarray) -> None:

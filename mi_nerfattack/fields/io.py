@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.bricks import BrickField, Codes
+from mi_nerfattack.fields.bricks import BrickField, Codes, check_bricks
 from mi_nerfattack.fields.grid import GridField, GridLayout
+from mi_nerfattack.fields.levels import count_read
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.io import files
@@ -21,6 +23,7 @@ T = TypeVar("T", int, float)
 AnyField: TypeAlias = GridField | NGPField | BrickField
 
 FORMAT = "mi_nerfattack field 1"
+_CHANNELS = {"density": (), "texture": (3,)}  # of a grid field's parameters
 
 
 def save_field(path: str | Path, field: AnyField) -> None:
@@ -87,29 +90,34 @@ def _check_finite(path: str | Path, tensors: Mapping[str, np.ndarray]) -> None:
 def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridField:
     names = ("levels", "base_resolution", "max_resolution")
     layout = GridLayout(**{name: _number(meta, name, int) for name in names})
+    cells, octants = _cells(tensors, meta)
+    count = count_read(layout.grid_levels, cells)
+    for name, channels in _CHANNELS.items():
+        shape, number = tensors[name].shape, tensors[name].dtype
+        if number.kind != "f":
+            raise ValueError(f"{name}: type {number}; expected float16 or float32")
+        # files of earlier versions hold all vertices
+        if shape not in ((count, *channels), (layout.n_vertices, *channels)):
+            raise ValueError(
+                f"{name}: shape {shape}; {count} vertices are held by the occupied "
+                f"cells, of {layout.n_vertices}; the file is damaged, make or copy it "
+                "again"
+            )
     field = GridField(
         layout,
         _vector(meta, "lower"),
         _vector(meta, "upper"),
-        occupancy=_occupancy(tensors, meta),
+        occupancy=Occupancy(cells, octants),
         density_scale=_number(meta, "density_scale", float),
         step_m=_number(meta, "step_m", float),
         info=_info(meta),
     )
     held = field.held_vertices()
-    for name, more in {"density": (), "texture": (3,)}.items():
-        given, count = tensors[name], int(held.sum())
-        if given.shape == (count, *more):
-            values = np.zeros((len(held), *more), np.float32)
-            values[held] = given
-        elif given.shape == (len(held), *more):  # as earlier versions wrote them
-            values = given
-        else:
-            raise ValueError(
-                f"{name}: shape {given.shape}; {count} vertices are held by the "
-                f"occupied cells, of {len(held)}; the file is damaged, make or copy it "
-                "again"
-            )
+    for name, channels in _CHANNELS.items():
+        values = tensors[name]
+        if len(values) < len(held):
+            values = np.zeros((len(held), *channels), np.float32)
+            values[held] = tensors[name]
         field.set_parameter(name, values)
     return field
 
@@ -117,12 +125,13 @@ def _grid(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> GridFie
 def _ngp(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> NGPField:
     names = NGPLayout.__dataclass_fields__
     layout = NGPLayout(**{name: _number(meta, name, int) for name in names})
+    layout.check(tensors)  # before the occupancy takes memory
     return NGPField(
         layout,
         _vector(meta, "lower"),
         _vector(meta, "upper"),
         tensors=dict(tensors),
-        occupancy=_occupancy(tensors, meta),
+        occupancy=Occupancy(*_cells(tensors, meta)),
         step_m=_number(meta, "step_m", float),
         cone=_number(meta, "cone", float),
         info=_info(meta),
@@ -133,14 +142,18 @@ def _bricks(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Brick
     codes = _vector(meta, "log_density").tolist()
     if len(codes) != len(fields(Codes)):
         raise ValueError(f"log_density: {len(codes)} numbers; expected low and high")
+    cells, octants = _cells(tensors, meta)
+    bricks = [tensors[name] for name in ("subdivisions", "vertices", "sky")]
+    check_bricks(int(cells.sum()), *bricks)  # before the occupancy takes memory
+    subdivisions, vertices, sky = bricks
     return BrickField(
         _vector(meta, "lower"),
         _vector(meta, "upper"),
-        _occupancy(tensors, meta),
-        tensors["subdivisions"],
-        tensors["vertices"],
+        Occupancy(cells, octants),
+        subdivisions,
+        vertices,
         Codes(*codes),
-        tensors["sky"],
+        sky,
         _number(meta, "step_m", float),
         _number(meta, "cone", float),
         _info(meta),
@@ -160,19 +173,22 @@ def _number(meta: Mapping[str, str], name: str, kind: type[T]) -> T:
         ) from err
 
 
-def _occupancy(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Occupancy:
+def _cells(
+    tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return which cells are occupied, and their octants, (rx, ry, rz) each."""
     bits = tensors["occupancy"]
     name = "occupancy_shape"
     shape = tuple(_number({name: v}, name, int) for v in meta[name].split())
-    count = int(np.prod(shape))
+    count = math.prod(shape)
     good = len(shape) == 3 and min(shape) > 0 and bits.dtype == np.uint8
     if not good or bits.size != (count + 7) // 8:
         raise ValueError(
             f"occupancy: {bits.size} bytes for a grid of {shape}; the file is damaged"
         )
-    cells = np.unpackbits(bits, count=count).reshape(shape).astype(bool)
+    cells = np.unpackbits(bits, count=count).view(bool).reshape(shape)
     if "octants" not in tensors:
-        return Occupancy(cells)
+        return cells, None
     given = tensors["octants"]
     if given.shape != (cells.sum(),) or given.dtype != np.uint8:
         raise ValueError(
@@ -181,7 +197,7 @@ def _occupancy(tensors: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> Oc
         )
     octants = np.zeros(shape, np.uint8)
     octants[cells] = given
-    return Occupancy(cells, octants)
+    return cells, octants
 
 
 def _info(meta: Mapping[str, str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,15 +12,17 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
+from mi_nerfattack.backend.upload import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.grid import (
     box_metadata,
     check_box,
+    check_finite,
     check_positive,
     flat_parameter,
-    level_growth,
 )
+from mi_nerfattack.fields.levels import lay_out_levels, level_growth
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fields.sky import activate, check_sky, sky_colour
 
@@ -62,6 +65,12 @@ class NGPLayout:
                 )
         if self.features not in (2, 4, 8):
             raise InputError(f"features: {self.features}; allowed are 2, 4 and 8")
+        if self.n_params >= 1 << 32:
+            raise InputError(
+                f"log2_table: {self.log2_table}, with {self.levels} levels of "
+                f"{self.features} features, gives {self.n_params} values; fewer than "
+                "2^32 are allowed"
+            )
 
     @staticmethod
     def small() -> NGPLayout:
@@ -72,6 +81,36 @@ class NGPLayout:
     def growth(self) -> float:
         """Factor between the resolutions of neighbouring levels."""
         return level_growth(self.levels, self.base_resolution, self.max_resolution)
+
+    @property
+    def n_params(self) -> int:
+        """Number of values in the hash grid's table."""
+        resolutions = self.base_resolution, self.max_resolution
+        sizes = self.features, 2**self.log2_table
+        return self.features * lay_out_levels(self.levels, *resolutions, *sizes)[1]
+
+    def check(self, tensors: Mapping[str, np.ndarray]) -> None:
+        """Raise InputError unless the tensors of a file have this layout's shapes.
+
+        Raises:
+            KeyError: one is missing.
+        """
+        width, inputs = self.width, GEOMETRY_FEATURES + (SH_ORDER + 1) ** 2
+        shapes = {
+            "table": (self.n_params,),
+            "density_net.0": (width, self.levels * self.features),
+            "density_net.1": (GEOMETRY_FEATURES, width),
+            "colour_net.0": (width, inputs),
+            "colour_net.1": (width, width),
+            "colour_net.2": (3, width),
+        }
+        for name, shape in shapes.items():
+            if tensors[name].shape != shape:
+                raise InputError(
+                    f"{name}: shape {tensors[name].shape}; expected {shape} by the "
+                    "layout of the header; the file is damaged, make or copy it again"
+                )
+        check_sky(tensors["sky"])
 
 
 class NGPField(AbstractField):
@@ -126,6 +165,8 @@ class NGPField(AbstractField):
         if not 0 <= self.cone <= 1:
             raise InputError(f"cone: {self.cone}; allowed is 0 to 1")
         self.info: dict[str, str] = dict(info or {})
+        if tensors is not None:
+            layout.check(tensors)
         self.occupy(occupancy or Occupancy.full())
         rng = dr.rng(seed=seed)
         self.encoding: HashGridEncoding = HashGridEncoding(
@@ -159,17 +200,11 @@ class NGPField(AbstractField):
             for index, key in enumerate(module):
                 name = f"{prefix}.{index}"
                 value = np.asarray(tensors[name])
-                if value.shape != tuple(module[key].shape):
-                    raise InputError(
-                        f"{name}: shape {value.shape}; expected "
-                        f"{tuple(module[key].shape)}"
-                    )
                 bound = _bound(name, value, bound)
                 module[key] = type(module[key])(value.astype(np.float32))
-        sky = np.asarray(tensors["sky"], np.float32)
-        check_sky(sky)
+        sky = tensors["sky"]
         self.sky_shape = (sky.shape[0], sky.shape[1])
-        self.sky = mi.Float(sky.ravel())
+        self.sky = upload(mi.Float, sky)
 
     def eval_everywhere(
         self, point: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
@@ -245,6 +280,7 @@ class NGPField(AbstractField):
             raise InputError(
                 f"{name}: {dr.width(value)} values; expected {dr.width(old)}"
             )
+        check_finite(name, value, place="value")
         if name == "table":
             self.encoding.data = value
         elif name == "sky":

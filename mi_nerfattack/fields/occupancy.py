@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.upload import upload
+
 MAX_DISTANCE = 255
 
 
@@ -47,7 +49,7 @@ class Occupancy:
         grids = [distance] if self.octants is None else [distance, self.octants]
         byte = dr.uint8_array_t(mi.Float)
         #: What :meth:`query` reads, (rx ry rz,) each.
-        self.arrays: list[Any] = [byte(grid.ravel()) for grid in grids]
+        self.arrays: list[Any] = [upload(byte, grid) for grid in grids]
         dr.make_opaque(self.arrays)
 
     @staticmethod

@@ -45,6 +45,7 @@ def sky_colour(
             column = mi.Int32(u0) + du
             column = dr.select(column < 0, column + width, column)
             column = dr.select(column >= width, column - width, column)
+            column = dr.clip(column, 0, width - 1)  # where it is NaN
             row = dr.clip(mi.Int32(v0) + dv, 0, height - 1)
             index = mi.UInt32(row * width + column)
             colour += weight * dr.gather(mi.Color3f, image, index)

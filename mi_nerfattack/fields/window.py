@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.upload import upload
+
 _SHARPNESS = 8.0
 
 _TOUCHED = ((0, 1), (1,), (1, 2))  # padded neighbours of a vertex, along one axis
@@ -39,7 +41,7 @@ class Window:
     def __init__(self, cells: np.ndarray) -> None:
         self.cells = cells
         self.is_open: bool = bool(cells.all())
-        self._vertices = mi.UInt32(_vertex_bits(cells, self.is_open).ravel())
+        self._vertices = upload(mi.UInt32, _vertex_bits(cells, self.is_open))
         dr.make_opaque(self._vertices)
 
     @property

@@ -23,10 +23,12 @@ class AbstractBackdrop(ABC):
     Attributes:
         name: for messages.
         has_gradients: false; as of a field, whether derivatives are asked for.
+        has_pose_gradients: likewise.
     """
 
     name: str
     has_gradients = False
+    has_pose_gradients = False
 
     @abstractmethod
     def march(self, rays: Rays, stop: float) -> March:
@@ -49,6 +51,10 @@ class AbstractBackdrop(ABC):
 Layer = PosedField | AbstractBackdrop
 
 
+#: What to do where a layer has no derivative by the rays.
+DETACH = "keep the camera detached"
+
+
 def only_fields(layers: Sequence[Layer], purpose: str, remedy: str) -> list[PosedField]:
     """Return the layers, all of which must be fields.
 
@@ -59,4 +65,21 @@ def only_fields(layers: Sequence[Layer], purpose: str, remedy: str) -> list[Pose
     for item in layers:
         if isinstance(item, AbstractBackdrop):
             raise InputError(f"{item.name}: {purpose}; {remedy}")
+    return fields
+
+
+def fields_by_rays(layers: Sequence[Layer]) -> list[PosedField]:
+    """Return the layers, all of which must have derivatives by the rays.
+
+    Raises:
+        InputError: one of them is a backdrop or a field that is not continuous.
+    """
+    fields = only_fields(layers, "a backdrop is not differentiated by rays", DETACH)
+    for item in fields:
+        if not item.field.differentiable_by_position:
+            raise InputError(
+                f"{item.field.kind}: its values jump at the faces of bricks, so that "
+                f"it has no derivatives by rays; {DETACH}, or give the field that it "
+                "was baked from"
+            )
     return fields

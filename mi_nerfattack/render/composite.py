@@ -11,16 +11,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.backend.concat import concat
-from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, only_fields
+from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, fields_by_rays
 from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays, pick_rays, shares_by_depth
 from mi_nerfattack.render.scene_march import AbstractSceneMarch, scene_march
 
 FIRST_RAYS = 1 << 13  # that tasks wait for before a launch
-
-#: What to do where a backdrop has no derivative by the rays.
-DETACH = "keep the camera detached"
 
 
 @dataclass
@@ -311,8 +308,7 @@ class DepthComposite(AbstractComposite):
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`."""
         lit = rays.light(posed)
-        purpose = "a backdrop is not differentiated by rays"
-        fields = only_fields([lit[k] for k in wanted], purpose, DETACH)
+        fields = fields_by_rays([lit[k] for k in wanted])
         parts = self._cotangents(seen, cotangent)
         mode = dr.ADMode.Backward
         return [

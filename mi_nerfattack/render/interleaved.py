@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.render.backdrop import Layer, only_fields
+from mi_nerfattack.render.backdrop import Layer, fields_by_rays, only_fields
 from mi_nerfattack.render.composite import (
     AbstractComposite,
     DepthComposite,
@@ -126,6 +126,7 @@ class InterleavedComposite(AbstractComposite):
         wanted: Sequence[int],
     ) -> list[RayGradient]:
         """See :meth:`AbstractComposite.backward_rays`; always evaluates all fields."""
+        fields_by_rays([posed[k] for k in wanted])
         fields, mode = _fields(posed), dr.ADMode.Backward
         with dr.suspend_grad(), private_gradients():
             whole = _whole(seen, cotangent)

@@ -21,8 +21,7 @@ from mi_nerfattack.scenario.user_code import (
     load_function,
     module_file,
 )
-
-BUNDLED = "bundled:"
+from mi_nerfattack.scenes import BUNDLED, resolve
 
 
 @dataclass(frozen=True)
@@ -97,20 +96,6 @@ class NamedFile:
         return {"file": shown, "sha256": digest.hexdigest()}
 
 
-def resolve(name: str, folder: str | Path) -> Path:
-    """Find a file.
-
-    Args:
-        name: ``bundled:FILE``, or a path relative to `folder`.
-        folder: that relative paths start from.
-    """
-    if name.startswith(BUNDLED):
-        from mi_nerfattack.scenes import bundled
-
-        return bundled(name[len(BUNDLED) :])
-    return Path(folder) / Path(name).expanduser()
-
-
 def _file(value: Any, info: ValidationInfo) -> NamedFile:
     """Find a file; the folder of relative paths is in the validation's context."""
     if isinstance(value, NamedFile):
@@ -147,7 +132,7 @@ def _files_in(xml: bytes, folder: Path, seen: set[Path]) -> Iterator[Path]:
     """Yield the files that an XML text names, and those that included ones name."""
     text = xml.decode("utf-8", "replace")
     for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
-        inner = folder / name
+        inner = resolve(name) if name.startswith(BUNDLED) else folder / name
         if inner not in seen and os.path.isfile(inner):
             seen.add(inner)
             yield inner

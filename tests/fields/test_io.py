@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -222,7 +224,7 @@ def test_texture_that_is_not_finite(stored, bad: float) -> None:
         load_field(path)
 
 
-@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e5])
+@pytest.mark.parametrize("bad", [1e5, -1e5])
 def test_fields_that_no_file_can_hold_are_not_written(tmp_path, bad: float) -> None:
     path = tmp_path / "f.safetensors"
     field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
@@ -255,3 +257,94 @@ def test_ngp_matrix_of_another_shape(tmp_path: Path) -> None:
     files.write_safetensors(path, tensors, header)
     with pytest.raises(InputError, match=r"colour_net\.1: shape \(3, 3\); expected"):
         load_field(path)
+
+
+def test_tensors_that_are_no_numbers_with_fractions(stored) -> None:
+    path, tensors, header = stored
+    tensors["density"] = np.zeros(tensors["density"].shape, np.int32)
+    files.write_safetensors(path, tensors, header)
+    with pytest.raises(InputError, match=f"{path}: density: type int32; expected"):
+        load_field(path)
+
+
+#: Loads files named on standard input; prints how far the peak of memory rose, bytes.
+MEASURE = """
+import sys
+from mi_nerfattack import InputError, variant
+from mi_nerfattack.fields import load_field
+
+def peak():
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(x.split()[1]) for x in lines if x.startswith("VmHWM")) * 1024
+
+variant.ensure()
+good, *damaged = sys.stdin.read().split()
+load_field(good)
+for path in damaged:
+    before = peak()
+    try:
+        load_field(path)
+    except InputError as err:
+        print(peak() - before, err)
+"""
+
+#: Changes of header entries and tensors: what is left of a file claims large arrays.
+MANY = {"occupancy_shape": "192 192 192"}
+BITS = {"occupancy": np.full(192**3 // 8, 255, np.uint8)}
+DAMAGED = {
+    "grid of two large levels": (
+        small.homogeneous,
+        {"levels": "2", "base_resolution": "230", "max_resolution": "240"},
+        {},
+        "density",
+    ),
+    "grid too large for kernels": (
+        small.homogeneous,
+        {"levels": "32", "base_resolution": "256", "max_resolution": "512"},
+        {},
+        "levels",
+    ),
+    "grid of many cells": (
+        small.homogeneous,
+        MANY,
+        {**BITS, "density": np.zeros(3, np.float16)},
+        "density",
+    ),
+    "ngp of a large table": (
+        small.small_ngp,
+        {"log2_table": "22", "max_resolution": "2048"},
+        {},
+        "table",
+    ),
+    "ngp of wide networks": (small.small_ngp, {"width": "256"}, {}, "density_net.0"),
+    "ngp of many cells": (small.small_ngp, MANY | {"levels": "5"}, BITS, "table"),
+    "bricks of many cells": (
+        lambda: small.small_bricks(np.random.default_rng(0)),
+        MANY,
+        BITS,
+        "subdivisions",
+    ),
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells peaks")
+def test_damaged_files_are_refused_before_they_take_memory(tmp_path: Path) -> None:
+    good = tmp_path / "good.safetensors"
+    save_field(good, small.homogeneous())
+    paths = [good]
+    for make, entries, arrays, _ in DAMAGED.values():
+        path = tmp_path / f"{len(paths)}.safetensors"
+        save_field(path, make())
+        tensors, header = files.read_safetensors(path)
+        tensors.pop("octants", None)
+        files.write_safetensors(path, tensors | arrays, header | entries)
+        paths.append(path)
+    names = "\n".join(map(str, paths))
+    command = [sys.executable, "-c", MEASURE]
+    result = subprocess.run(command, input=names, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    for line, path, row in zip(lines, paths[1:], DAMAGED.values(), strict=True):
+        grown, message = line.split(" ", 1)
+        assert message.startswith(f"{path}: {row[-1]}: "), message
+        assert int(grown) < 20e6, line

@@ -23,7 +23,8 @@ from mi_nerfattack.attack.texture.constraints import Allowed, Constraints, verte
 from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField, GridLevel
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.levels import GridLevel
 
 _BINOMIAL = (0.25, 0.5, 0.25)
 

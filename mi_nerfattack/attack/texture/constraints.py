@@ -21,7 +21,8 @@ import numpy as np
 
 from mi_nerfattack.attack.texture.gamut import Gamut
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField, GridLevel
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.levels import GridLevel
 from mi_nerfattack.ranges import NonNegative, Positive, Share, checked
 
 #: Colours stay so far from 0 and 1, where no raw value reaches.

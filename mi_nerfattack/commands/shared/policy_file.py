@@ -103,7 +103,7 @@ def is_toml(policy: str | None) -> TypeGuard[str]:
 def read_toml(policy: str) -> tuple[dict[str, Any], Path]:
     """Read a policy's TOML file, bundled or not, and return where it is."""
     from mi_nerfattack.io import files
-    from mi_nerfattack.scenario.named_file import resolve
+    from mi_nerfattack.scenes import resolve
 
-    path = resolve(policy, "")
+    path = resolve(policy)
     return files.read_toml(path), path

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.upload import upload
+
 _BIAS = 2.0**-102  # takes 2^-24 to the smallest normal number of single precision
 _SIGN, _MAGNITUDE = 1 << 31, 0x7FFF << 13
 
@@ -54,8 +56,7 @@ class LongWords(AbstractWords):
     scale = 1.0
 
     def __init__(self, values: np.ndarray) -> None:
-        # a copy: memory that Dr.Jit knows as another type would keep that type
-        self.array = mi.UInt64(values.copy().view("<u8"))
+        self.array = upload(mi.UInt64, values.view("<u8"))
         dr.make_opaque(self.array)
 
     def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
@@ -78,7 +79,7 @@ class ShortWords(AbstractWords):
     scale = 1 / _BIAS
 
     def __init__(self, codes: np.ndarray) -> None:
-        self.array = mi.UInt32(codes.view("<u4"))
+        self.array = upload(mi.UInt32, codes.view("<u4"))
         dr.make_opaque(self.array)
 
     def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
