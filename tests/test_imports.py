@@ -19,8 +19,8 @@ ORDER = (
     "capture plugins attack deploy fit scenario evaluation training report experiment "
     "robot commands cli bench"
 ).split()
-# Parts that can be used without torch; `vehicle` and `rollout` wrap it for its users.
-WITHOUT_TORCH = "errors io scenes fields render capture plugins deploy".split()
+# Parts that can be used without torch; `vehicle` wraps it for its users.
+WITHOUT_TORCH = "errors io scenes fields render rollout capture plugins deploy".split()
 
 
 def modules() -> Iterator[tuple[str, Path]]:

@@ -25,7 +25,6 @@ from bench.loop.setting import (
 )
 from bench.render.sides import Clock
 from mi_nerfattack.attack.surrogate import surrogate_sensor
-from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.goals import NoGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -155,7 +154,7 @@ class PlainLoop(AbstractLoop):
             view = camera_at((x, y, heading), self.width, self.height)
             sensor: Any = mi.load_dict(view, parallel=False)
             image = mi.render(self.scene, self.parameters, sensor=sensor, spp=1)
-            seen = linear_to_srgb(image[..., :3])
+            seen = dr.linear_to_srgb(image[..., :3])
             dr.eval(seen)
             control = CAR.saturate(mi.Float64(self.steer(seen).array))
             state = RK4().step(CAR, state, control, PERIOD_S)

@@ -15,6 +15,7 @@ from bench.render.sides import STOP, AbstractSide, pinhole_rays, route_rays
 from mi_nerfattack.fields import GridField, GridLayout, load_grid
 from mi_nerfattack.render.camera.intrinsics import look_at
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -86,7 +87,7 @@ class OurSide(AbstractSide):
             dr.set_grad(read(), dr.opaque(mi.Float, 0, dr.width(leaf)))
         by_opacity = -dr.dot(self.cotangent, self.behind)
         total = March(self.cotangent, by_opacity, dr.opaque(mi.Float, 0))
-        self.composite.backward([self.posed], self.rays, self.seen, total, STOP)
+        self.composite.backward([self.posed], self.rays, self.seen, Seen(total), STOP)
         dr.eval([dr.grad(read()) for read, _ in self.leaves])
         dr.sync_thread()
         alone = time.perf_counter() - start

@@ -1,12 +1,13 @@
 """Attack a PyTorch policy of one's own by autograd through the closed loop."""
 
+import drjit as dr
 import mitsuba as mi
 import torch
 from torch import nn
 
 from mi_nerfattack import attack, policy, rollout, scenario, scenes
 from mi_nerfattack.policy.goals import IntegerGoal
-from mi_nerfattack.rollout.torch_rollout import torch_rollout
+from mi_nerfattack.vehicle.state import state_type
 
 mi.set_variant("llvm_ad_rgb")
 HORIZON, ITERATIONS = 25, 4  # control periods of 0.1 s, steps of Adam
@@ -34,7 +35,13 @@ drives = rollout.Rollout(
     HORIZON,
     adjoint=rollout.KeptBackgrounds(),
 )
-objective = torch_rollout(drives)  # smaller where the policy is farther from its lane
+
+
+@dr.wrap(source="torch", target="drjit")
+def objective(texture, start):
+    """Sum up costs; smaller where the policy is farther from its lane."""
+    return drives([texture], state_type()(start))
+
 
 texture = torch.tensor(world.fields[0].texture.numpy(), requires_grad=True)
 # x, y in metres, heading in radians; several rows are several drives at once
@@ -42,7 +49,7 @@ start = torch.tensor(world.route.pose_at([20.0]), requires_grad=True)
 adam = torch.optim.Adam([texture], lr=0.05)
 for iteration in range(ITERATIONS + 1):
     adam.zero_grad()
-    value = objective(texture, start)
+    value = objective(texture, start.T)
     value.backward()
     adam.step()
     print(f"iteration {iteration}: mean error {-value.item() / HORIZON:.3f} m")

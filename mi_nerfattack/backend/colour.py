@@ -1,55 +1,16 @@
-"""The sRGB curve (IEC 61966-2-1), for Dr.Jit arrays and for NumPy arrays.
+"""The sRGB curve (IEC 61966-2-1) for NumPy arrays, and images in eight bits.
 
-Everything rendered is linear Rec.709 RGB; files and policies see sRGB.
-
-Clip policy, the same in both directions and both libraries: values below 0 map to
-0 and values above 1 map to 1, with derivative zero outside [0, 1] and the one of
-the curve at 0 and 1 themselves; a NaN stays a NaN. `drjit.linear_to_srgb` is not used
-because its derivative is NaN at 0 and because it maps NaN to a colour.
+Everything rendered is linear Rec.709 RGB; files and policies see sRGB. Dr.Jit's arrays
+have `drjit.linear_to_srgb` and `drjit.srgb_to_linear`. Both libraries map values below
+0 to 0 and values above 1 to 1; a NaN stays a NaN.
 """
 
 from __future__ import annotations
 
-from typing import TypeVar
-
-import drjit as dr
 import numpy as np
-
-ArrayT = TypeVar("ArrayT", bound=dr.ArrayBase)
 
 _LINEAR_KNEE = 0.0031308
 _SRGB_KNEE = 0.04045
-
-
-def linear_to_srgb(value: ArrayT) -> ArrayT:
-    """Encode linear values of any Dr.Jit array type; differentiable.
-
-    Args:
-        value: linear, any shape; clipped to [0, 1].
-
-    Returns:
-        sRGB in [0, 1], same shape. The derivative is finite everywhere, at most 12.92.
-    """
-    is_dark = value <= _LINEAR_KNEE
-    # the unused branch must stay away from 0, where its derivative is infinite
-    bright = dr.select(is_dark, _LINEAR_KNEE, value)
-    curve = dr.select(is_dark, value * 12.92, 1.055 * dr.power(bright, 1 / 2.4) - 0.055)
-    return dr.select(value < 0, 0, dr.select(value > 1, 1, curve))
-
-
-def srgb_to_linear(value: ArrayT) -> ArrayT:
-    """Decode sRGB values of any Dr.Jit array type; differentiable.
-
-    Args:
-        value: sRGB, any shape; clipped to [0, 1].
-
-    Returns:
-        Linear values in [0, 1], same shape. The derivative is at most 2.28.
-    """
-    is_dark = value <= _SRGB_KNEE
-    bright = dr.select(is_dark, _SRGB_KNEE, value)
-    curve = dr.select(is_dark, value / 12.92, dr.power((bright + 0.055) / 1.055, 2.4))
-    return dr.select(value < 0, 0, dr.select(value > 1, 1, curve))
 
 
 def linear_to_srgb_numpy(value: np.ndarray) -> np.ndarray:

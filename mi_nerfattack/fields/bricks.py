@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
 from mi_nerfattack.backend.upload import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
@@ -69,7 +68,7 @@ class Codes:
         """Return what vertices interpolate: four times (n,), 0 to 255."""
         logarithm = dr.log(dr.maximum(density, 1e-30))
         first = (logarithm - self.low) * (_TOP / (self.high - self.low))
-        colour = linear_to_srgb(mi.Color3f(radiance)) * _TOP
+        colour = dr.linear_to_srgb(mi.Color3f(radiance)) * _TOP
         numbers = first, colour.x, colour.y, colour.z
         return [dr.clip(mi.Float(x), 0, _TOP) for x in numbers]
 
@@ -77,7 +76,7 @@ class Codes:
         """Return density and linear radiance of interpolated numbers."""
         first, *colour = numbers
         density = dr.exp(first * ((self.high - self.low) / _TOP) + self.low)
-        return density, srgb_to_linear(mi.Color3f(*colour) * (1 / _TOP))
+        return density, dr.srgb_to_linear(mi.Color3f(*colour) * (1 / _TOP))
 
 
 def pack_word(numbers: list[mi.Float]) -> mi.UInt32:

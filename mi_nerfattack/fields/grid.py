@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
-from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.backend.upload import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
@@ -226,7 +225,7 @@ class GridField(AbstractField):
         ]
         density = self.density_scale * dr.exp(dr.minimum(d, 15.0))
         colour = mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in (r, g, b)])
-        return density & active, srgb_to_linear(colour) & active
+        return density & active, dr.srgb_to_linear(colour) & active
 
     def levels(self) -> list[GridLevel]:
         """Return the levels, the coarsest first."""

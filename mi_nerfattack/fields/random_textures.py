@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy import ndimage
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields.grid import GridField
 
 #: Kinds that "mixed" chooses from.
 KINDS = ("noise", "blobs", "flat")
@@ -18,7 +17,7 @@ SPREAD = 1.8
 BLOB_RESOLUTION = (2, 7)
 
 
-def random_texture(field: Any, kind: str, seed: int) -> np.ndarray:
+def random_texture(field: GridField, kind: str, seed: int) -> np.ndarray:
     """Draw raw colour values for every vertex of a grid field.
 
     The colour at a point is the sigmoid of the sum over all levels of interpolated
@@ -33,7 +32,7 @@ def random_texture(field: Any, kind: str, seed: int) -> np.ndarray:
     - `"mixed"`: one of these, by seed.
 
     Args:
-        field: a GridField; only its `layout`, `encoding` and `n_vertices` are read.
+        field: only its `levels` and `n_vertices` are read.
         kind: one of the four above.
         seed: non-negative integer; the same seed gives the same texture.
 
@@ -51,27 +50,14 @@ def random_texture(field: Any, kind: str, seed: int) -> np.ndarray:
     if kind == "mixed":
         kind = KINDS[rng.integers(len(KINDS))]
     texture = np.zeros((field.n_vertices, 3), np.float32)
+    coarsest = field.levels()[0]
     if kind == "flat":
-        _level(field, texture, 0)[:] = _logit(rng.uniform(0.02, 0.98, 3))
+        texture[coarsest.vertices] = _logit(rng.uniform(0.02, 0.98, 3))
     elif kind == "blobs":
-        _level(field, texture, 0)[:] = _blobs(level_resolution(field, 0), rng)
+        texture[coarsest.vertices] = _blobs(coarsest.resolution, rng)
     else:
         _add_noise(field, texture, rng)
     return texture
-
-
-def level_resolution(field: Any, level: int) -> int:
-    """Return the number of vertices along an edge of a level of a grid field."""
-    offset = field.encoding.level_offset
-    count = offset(level + 1) - offset(level)
-    # a level is padded to a multiple of four vertices
-    return int(np.floor(np.cbrt(count + 0.5)))
-
-
-def _level(field: Any, texture: np.ndarray, level: int) -> np.ndarray:
-    """View the vertices of one level, (resolution^3, 3), x fastest."""
-    start = field.encoding.level_offset(level)
-    return texture[start : start + level_resolution(field, level) ** 3]
 
 
 def _blobs(resolution: int, rng: np.random.Generator) -> np.ndarray:
@@ -87,20 +73,17 @@ def _blobs(resolution: int, rng: np.random.Generator) -> np.ndarray:
     return np.stack(channels, axis=-1).reshape(-1, 3)
 
 
-def _add_noise(field: Any, texture: np.ndarray, rng: np.random.Generator) -> None:
+def _add_noise(field: GridField, texture: np.ndarray, rng: np.random.Generator) -> None:
     """Add white noise to one, a quarter or none but the coarsest of the levels."""
-    levels = field.layout.levels
-    chosen = (
-        range(levels - 1, levels),
-        range(levels - max(1, levels // 4), levels),
-        range(1),
-    )[rng.integers(3)]
+    levels = field.levels()
+    quarter = max(1, len(levels) // 4)
+    chosen = (levels[-1:], levels[-quarter:], levels[:1])[rng.integers(3)]
     for level in chosen:
-        part = _level(field, texture, level)
         spread = 1.4 * SPREAD / np.sqrt(len(chosen))
-        part += rng.normal(0, spread, part.shape).astype(np.float32)
+        noise = rng.normal(0, spread, (level.resolution**3, 3))
+        texture[level.vertices] += noise.astype(np.float32)
     mean = _logit(rng.uniform(0.15, 0.85, 3))
-    _level(field, texture, 0)[:] += mean.astype(np.float32)
+    texture[levels[0].vertices] += mean.astype(np.float32)
 
 
 def _logit(colour: np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.errors import InputError
 
 
@@ -18,7 +17,7 @@ def check_sky(image: np.ndarray) -> None:
 
 def activate(raw: list[mi.Float]) -> mi.Color3f:
     """Turn raw colours, 3 x (n,), into linear ones."""
-    return srgb_to_linear(mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in raw]))
+    return dr.srgb_to_linear(mi.Color3f(*[1 / (1 + dr.exp(-x)) for x in raw]))
 
 
 def sky_colour(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ class VertexColours:
             linear = self.field.eval_everywhere(
                 self._points, mi.Vector3f(0, 0, 1), mi.Bool(True)
             )[1]
-            colours = dr.clip(linear_to_srgb(linear), _MARGIN, 1 - _MARGIN)
+            colours = dr.clip(dr.linear_to_srgb(linear), _MARGIN, 1 - _MARGIN)
             flat = dr.ravel(mi.Color3f(colours))
             self._raw = _logit(flat)
             shape = (dr.width(flat) // 3, 3)

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.fit.rays import RayBatch
 from mi_nerfattack.ranges import NonNegative, Positive, checked
 from mi_nerfattack.render.rays import March
@@ -71,27 +71,26 @@ def loss_and_cotangent(
         loss (n,) and squared sRGB error (n,), both detached, and the derivative of the
         objective by radiance, opacity and moment.
     """
-    seen = March(
-        mi.Color3f(primal.radiance), mi.Float(primal.opacity), mi.Float(primal.moment)
-    )
-    leaves = (seen.radiance, seen.opacity, seen.moment)
-    dr.enable_grad(leaves)
     behind = dr.detach(background)
-    wanted = linear_to_srgb(
-        batch.alpha * srgb_to_linear(batch.colour) + (1 - batch.alpha) * behind
+    wanted = dr.linear_to_srgb(
+        batch.alpha * dr.srgb_to_linear(batch.colour) + (1 - batch.alpha) * behind
     )
-    linear = seen.radiance + (1 - seen.opacity) * background
-    if gain is not None:
-        linear *= gain
-    error = linear_to_srgb(linear * _BELOW_WHITE) - wanted
-    terms = [huber(channel, weights.huber) for channel in error]
-    loss = (terms[0] + terms[1] + terms[2]) / 3
-    if batch.depth is not None:
-        loss += _geometry_loss(seen, batch.depth, weights)
-    square = dr.detach(dr.squared_norm(mi.Vector3f(error))) / 3
-    dr.backward(loss * share)
-    cotangent = March(*(dr.grad(leaf) for leaf in leaves))
-    return dr.detach(loss), square, cotangent
+
+    def compare(seen: March) -> tuple[Any, Any]:
+        linear = seen.radiance + (1 - seen.opacity) * background
+        if gain is not None:
+            linear *= gain
+        error = dr.linear_to_srgb(linear * _BELOW_WHITE) - wanted
+        terms = [huber(channel, weights.huber) for channel in error]
+        loss = (terms[0] + terms[1] + terms[2]) / 3
+        if batch.depth is not None:
+            loss += _geometry_loss(seen, batch.depth, weights)
+        return loss, dr.squared_norm(mi.Vector3f(error)) / 3
+
+    with dr.suspend_grad():
+        loss, square = compare(primal)
+    cotangent = vjp(lambda seen: compare(seen)[0], primal, share)
+    return loss, square, cotangent
 
 
 def _geometry_loss(seen: March, depth: Any, weights: LossWeights) -> Any:

@@ -29,7 +29,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.colour import srgb_to_linear
 from mi_nerfattack.fields.splats import Splats
 from mi_nerfattack.render.backdrop import AbstractBackdrop
 from mi_nerfattack.render.camera.pose import Pose
@@ -159,7 +158,7 @@ class SplatBackground(AbstractBackdrop):
             active &= more & (passed > stop) & (hits < MAX_HITS)
         opacity = 1 - passed
         seen = opacity > 0
-        colour = srgb_to_linear(display / dr.select(seen, opacity, 1))
+        colour = dr.srgb_to_linear(display / dr.select(seen, opacity, 1))
         return March(opacity * colour, opacity, moment)
 
     def _enter(

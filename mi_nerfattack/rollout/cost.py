@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import drjit as dr
 import numpy as np
 
+from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.rollout.loop import Trajectory
 from mi_nerfattack.rollout.objective import AbstractObjective, StateHistory
 from mi_nerfattack.rollout.reduction import AbstractReduction
@@ -34,10 +35,11 @@ class Cost:
     def by_states(self, drive: Trajectory) -> np.ndarray:
         """Differentiate by x_1 to x_T: (T, n, m)."""
         history = drive.history()
-        leaf = type(history.rows)(history.rows)
-        dr.enable_grad(leaf)
-        attached = StateHistory(leaf, history.count, history.horizon, history.dt)
-        dr.backward_from(self.reduction.reduce(self.objective.evaluate(attached)))
-        by_rows = np.array(dr.grad(leaf), np.float64)
-        shape = (len(leaf), history.count, history.horizon)
-        return self.scale * by_rows.reshape(shape).transpose(2, 1, 0)
+
+        def cost(rows: Any) -> Any:
+            states = StateHistory(rows, history.count, history.horizon, history.dt)
+            return self.reduction.reduce(self.objective.evaluate(states))
+
+        by_rows = np.array(vjp(cost, history.rows, self.scale), np.float64)
+        shape = (len(by_rows), history.count, history.horizon)
+        return by_rows.reshape(shape).transpose(2, 1, 0)

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -338,7 +337,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         self, total: March, direction: mi.Vector3f, ends: Ends | None
     ) -> mi.Color3f:
         behind = self._behind(direction, ends)
-        return linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
+        return dr.linear_to_srgb(total.radiance + (1 - total.opacity) * behind)
 
     def _tensor(self, pixels: mi.Color3f, count: int) -> mi.TensorXf:
         shape = (count, self.camera.height, self.camera.width, 3)

@@ -50,9 +50,9 @@ class Evaluation:
 class Rollout:
     """``J(textures, initial states, offsets)`` of a batch of drives.
 
-    Call it with Dr.Jit arrays and differentiate by `dr.backward`; with torch tensors
-    see `rollout.torch_rollout`. Or, without either's graph, :meth:`run` and
-    :meth:`gradient`.
+    Call it with Dr.Jit arrays and differentiate by `dr.backward`; for torch tensors
+    wrap it by ``dr.wrap(source="torch", target="drjit")``. Or, without either's graph,
+    :meth:`run` and :meth:`gradient`.
 
     Attributes:
         loop: the closed loop; its sensor's textures are replaced.

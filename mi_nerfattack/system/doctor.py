@@ -171,7 +171,7 @@ def _llvm() -> Finding:
 
 def _variants() -> Iterator[Finding]:
     """Try the variants in a process of their own; it may be aborted."""
-    command = module_command("mi_nerfattack.backend.probe")
+    command = module_command("mi_nerfattack.system.probe")
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False

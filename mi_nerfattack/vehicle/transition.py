@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.vehicle.dynamics import AbstractDynamics
 from mi_nerfattack.vehicle.integrators import AbstractIntegrator
@@ -103,17 +104,8 @@ class Transition:
         return path
 
     def _vjp(self, state: Any, older: Any, newer: Any, cotangent: Any) -> tuple:
-        with dr.resume_grad():
-            leaves = tuple(type(x)(x) for x in (state, older, newer))
-            dr.enable_grad(leaves)
-            after = self._advance(*leaves)[-1]
-            dr.backward_from(_inner(after, cotangent))
-            return tuple(dr.grad(leaf) for leaf in leaves)
+        return vjp(lambda x: self._advance(*x)[-1], (state, older, newer), cotangent)
 
     def _sizes(self, *arguments: Any) -> list[int]:
         """Return what a recording depends on beside the arguments: their sizes."""
         return [dr.width(x) for x in arguments]
-
-
-def _inner(a: Any, b: Any) -> Any:
-    return sum((a[i] * b[i] for i in range(1, len(a))), a[0] * b[0])

@@ -26,13 +26,13 @@ from bench.torch.loop import (
 from bench.torch.ngp import TorchNGP
 from bench.torch.object import BagLookup, ObjectData, SelectLookup, TorchObject
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
-from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.fields import NGPLayout, Occupancy, save_field
 from mi_nerfattack.fit.loss import huber
 from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -184,11 +184,11 @@ def test_the_peer_has_the_gradients_of_our_renderer(rng, data, pictures, grid):
     dr.enable_grad(radiance, opacity)
     image = radiance + (1 - opacity) * field.background(rays.direction)
     wanted = mi.Color3f(pictures.colour.reshape(-1, 3).T.astype(np.float32) / 255)
-    error = linear_to_srgb(image * BELOW_WHITE) - wanted
+    error = dr.linear_to_srgb(image * BELOW_WHITE) - wanted
     objective = dr.mean(sum(huber(channel, 0.1) for channel in error)) / 3
     dr.backward(objective)
     total = March(dr.grad(radiance), dr.grad(opacity), dr.zeros(mi.Float, len(index)))
-    composite.backward(posed, rays, seen, total, STOP)
+    composite.backward(posed, rays, seen, Seen(total), STOP)
 
     assert loss == pytest.approx(float(objective[0]), rel=1e-3)
     ours = {name: dr.grad(field.parameters()[name]).numpy() for name in names}

@@ -56,6 +56,16 @@ def test_masked_lanes_are_zero(rng: np.random.Generator) -> None:
         assert (radiance.numpy()[:, 0] == 0).all()
 
 
+@pytest.mark.parametrize("layout", [(3, 5, 12), (1, 7, 7), (4, 16, 33)])
+def test_levels_have_the_cells_that_the_layout_asks_for(layout) -> None:
+    field = GridField(GridLayout(*layout), -small.ONES, small.ONES)
+    for k, level in enumerate(field.levels()):
+        scale = layout[1] * field.layout.growth**k - 1
+        # the encoding has ceil(scale) cells along an edge, up to rounding
+        assert scale - 1e-4 <= level.resolution - 1 < scale + 1 + 1e-4
+    assert field.levels()[0].resolution == layout[1]
+
+
 def test_default_layout_has_the_size_of_the_appendix() -> None:
     field = GridField(GridLayout(), -small.ONES, small.ONES)
     assert 4 * field.n_vertices == pytest.approx(4.4e6, rel=0.02)

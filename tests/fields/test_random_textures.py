@@ -9,8 +9,8 @@ from helpers.roadside import small_grid
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.grid import GridField, GridLayout
-from mi_nerfattack.fields.random_textures import KINDS, level_resolution, random_texture
+from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.random_textures import KINDS, random_texture
 
 
 @pytest.fixture
@@ -26,17 +26,6 @@ def colours(field: GridField, texture: np.ndarray) -> np.ndarray:
     up = mi.Vector3f(0, 0, 1)
     _, radiance = field.eval(mi.Point3f(point.astype(np.float32)), up, mi.Bool(True))
     return linear_to_srgb_numpy(radiance.numpy())
-
-
-@pytest.mark.parametrize("layout", [(3, 5, 12), (1, 7, 7), (4, 16, 33)])
-def test_level_resolution_is_that_of_the_encoding(layout, variant):
-    field = GridField(GridLayout(*layout), -np.ones(3), np.ones(3))
-    for level in range(layout[0]):
-        scale = layout[1] * field.layout.growth**level - 1
-        # the encoding has ceil(scale) cells along an edge, up to rounding
-        cells = level_resolution(field, level) - 1
-        assert scale - 1e-4 <= cells < scale + 1 + 1e-4
-    assert level_resolution(field, 0) == layout[1]
 
 
 @pytest.mark.parametrize("kind", KINDS)

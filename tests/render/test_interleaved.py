@@ -11,7 +11,7 @@ from helpers.derivatives import central_difference
 from helpers.variants import later
 
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import DepthComposite
+from mi_nerfattack.render.composite import DepthComposite, Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.march import march
 from mi_nerfattack.render.posed import PosedField
@@ -129,11 +129,11 @@ def test_parameters_against_differences(rng, which: int) -> None:
         return leaf
 
     leaf = attach()
-    composite.backward(fields, rays, seen, cotangent, 0.0)
+    composite.backward(fields, rays, seen, Seen(cotangent), 0.0)
     backward = float(np.dot(dr.grad(leaf).numpy().astype(float), tangent))
     leaf = attach()
     dr.set_grad(leaf, mi.Float(tangent.astype(np.float32)))
-    forward = small.pairing(composite.forward(fields, rays, seen, 0.0), cotangent)
+    forward = small.pairing(composite.forward(fields, rays, seen, 0.0).total, cotangent)
     assert forward == pytest.approx(backward, rel=1e-4)
     assert backward == pytest.approx(expected, rel=1e-3)
 
@@ -144,7 +144,7 @@ def test_rays_against_differences(rng: np.random.Generator) -> None:
     composite = InterleavedComposite()
     cotangent = small.random_march(rng, COUNT)
     seen = composite.render(fields, rays, 0.0)
-    layers = composite.backward_rays(fields, rays, seen, cotangent, 0.0, [0, 1])
+    layers = composite.backward_rays(fields, rays, seen, Seen(cotangent), 0.0, [0, 1])
     first, second = layers
     slopes = first.origin + second.origin, first.direction + second.direction
     tangent = rng.normal(size=(3, COUNT)).astype(np.float32)

@@ -16,7 +16,7 @@ from helpers.kernels import nothing_compiled
 from mi_nerfattack.backend.colour import srgb_to_linear_numpy
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.composite import DepthComposite
+from mi_nerfattack.render.composite import DepthComposite, Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -71,7 +71,7 @@ def gradient(layers: list, index: int, rays: Rays, cotangent: March) -> np.ndarr
     field.packed = leaf
     composite = DepthComposite()
     seen = composite.render(layers, rays, 0.0)
-    composite.backward(layers, rays, seen, cotangent, 0.0)
+    composite.backward(layers, rays, seen, Seen(cotangent), 0.0)
     result = field.texture_gradient(dr.grad(field.packed)).numpy().copy()
     dr.disable_grad(field.packed)
     return result
@@ -135,7 +135,7 @@ def test_forward_mode_is_the_transpose(rng) -> None:
     composite = DepthComposite()
     seen = composite.render(layers, rays, 0.0)
     dr.set_grad(field.packed, mi.Float(along))
-    tangent = composite.forward(layers, rays, seen, 0.0)
+    tangent = composite.forward(layers, rays, seen, 0.0).total
     dr.disable_grad(field.packed)
     expected = float((found * along.reshape(-1, 4)[:, 1:]).sum())
     assert small.pairing(tangent, cotangent) == pytest.approx(expected, rel=1e-3)
@@ -153,7 +153,7 @@ def test_what_needs_a_density_or_a_camera_path_refuses_by_name() -> None:
         InterleavedComposite().render(layers, rays, 0.0)
     seen = DepthComposite().render(layers, rays, 0.0)
     with pytest.raises(InputError, match="splats: .* keep the camera detached"):
-        DepthComposite().backward_rays(layers, rays, seen, March(), 0.0, [0, 1])
+        DepthComposite().backward_rays(layers, rays, seen, Seen(March()), 0.0, [0, 1])
 
 
 # The sensor

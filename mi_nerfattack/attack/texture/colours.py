@@ -15,12 +15,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import convolve1d
 
 from mi_nerfattack.attack.texture.constraints import Allowed, Constraints, vertex_points
-from mi_nerfattack.backend.colour import linear_to_srgb
 from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
@@ -146,7 +146,7 @@ def vertex_colours(
     """
     points = upload_rows(mi.Point3f, vertex_points(field, level, chosen))
     linear: Any = field.eval_everywhere(points, mi.Vector3f(0, 0, 1), mi.Bool(True))[1]
-    return linear_to_srgb(linear).numpy().T
+    return dr.linear_to_srgb(linear).numpy().T
 
 
 def _logit(colour: np.ndarray) -> np.ndarray:

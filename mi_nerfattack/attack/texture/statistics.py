@@ -52,7 +52,8 @@ def seen_weights(
 ) -> list[np.ndarray]:
     """Weigh the vertices of each object's finest level, (n, n, n) by z, y, x.
 
-    Textures are left as they are. Costs a march and its derivative a state.
+    Textures are left as they are, also when this fails. Costs a march and its
+    derivative a state.
 
     Args:
         sensor: sees the objects.
@@ -61,14 +62,16 @@ def seen_weights(
     """
     textures = sensor.textures()
     grey = [mi.TensorXf(np.zeros(texture.shape, np.float32)) for texture in textures]
-    sensor.set_textures(grey)  # where colours change by equal amounts
-    sensor.start_gradient()
-    for step, state in enumerate(states):
-        seen = sensor.observe(state, step)
-        ones = dr.ones(mi.TensorXf, seen.image.shape)
-        sensor.vjp(seen, state, ones, False)
-    gradients = sensor.texture_gradients()
-    sensor.set_textures(textures)
+    try:
+        sensor.set_textures(grey)  # where colours change by equal amounts
+        sensor.start_gradient()
+        for step, state in enumerate(states):
+            seen = sensor.observe(state, step)
+            ones = dr.ones(mi.TensorXf, seen.image.shape)
+            sensor.vjp(seen, state, ones, False)
+        gradients = sensor.texture_gradients()
+    finally:
+        sensor.set_textures(textures)
     return [
         _finest(field, np.array(gradient).sum(axis=1))
         for field, gradient in zip(fields, gradients, strict=True)
@@ -81,7 +84,7 @@ def texture_statistics(
     """Judge a texture.
 
     Args:
-        field: with the texture; has it again afterwards.
+        field: with the texture; has it again afterwards, also when this fails.
         original: (n_vertices, 3) raw colours to compare with.
         weights: from :func:`seen_weights`.
     """
@@ -90,9 +93,11 @@ def texture_statistics(
     if not seen.any():
         return TextureStatistics(0.0, 0.0, 0.0, 0.0, [])
     colour = vertex_colours(field, field.levels()[-1], seen)
-    field.set_parameter("texture", original)
-    change = colour - vertex_colours(field, field.levels()[-1], seen)
-    field.set_parameter("texture", texture)
+    try:
+        field.set_parameter("texture", original)
+        change = colour - vertex_colours(field, field.levels()[-1], seen)
+    finally:
+        field.set_parameter("texture", texture)
     weight = weights[seen] / weights[seen].sum()
     saturated = np.minimum(colour, 1 - colour) < SATURATED
     return TextureStatistics(

@@ -173,9 +173,8 @@ def bake(
         )
         progress(0, options.passes)
         for step in range(options.passes):
-            seed = options.seed * 1000 + step
-            poses = drive_poses(routes, options.views, seed, mount)
-            _refine(baked, scene, camera, poses, seed)
+            poses = drive_poses(routes, options.views, _seed(options, step), mount)
+            _refine(baked, scene, camera, poses, options, step)
             progress(step + 1, options.passes)
     return baked
 
@@ -187,6 +186,12 @@ def _ngp(scene: PosedField) -> NGPField:
             "fit writes it"
         )
     return scene.field
+
+
+def _seed(options: BakeOptions, step: int, draw: int = 0) -> int:
+    """Return the seed of a draw of a pass: 0 for its poses, 1 + k from image k on."""
+    key = np.random.SeedSequence([options.seed, step, draw])
+    return int(key.generate_state(1, np.uint64)[0])
 
 
 def _provenance(options: BakeOptions) -> dict[str, str]:
@@ -244,13 +249,19 @@ def _rays(camera: Camera, poses: np.ndarray, seed: int) -> Rays:
 
 
 def _refine(
-    baked: BrickField, posed: PosedField, camera: Camera, poses: np.ndarray, seed: int
+    baked: BrickField,
+    posed: PosedField,
+    camera: Camera,
+    poses: np.ndarray,
+    options: BakeOptions,
+    step: int,
 ) -> None:
     """Move vertices towards what the field has at the samples of views' rays."""
     sums = [dr.zeros(mi.Float, dr.width(baked.vertices)) for _ in range(5)]
     at_once = max(1, _RAYS_AT_ONCE // (camera.width * camera.height))
     for start in range(0, len(poses), at_once):
-        rays = _rays(camera, poses[start : start + at_once], seed + start)
+        seed = _seed(options, step, 1 + start)
+        rays = _rays(camera, poses[start : start + at_once], seed)
         walk, active = Walk.start(posed, rays)
         heading = dr.normalize(posed.turn(rays.direction))
         dr.eval(_add_differences(baked, posed, walk, active, heading, sums), sums)

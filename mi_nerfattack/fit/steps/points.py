@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.fields.cpu.rows import (
     SharedRows,
@@ -122,13 +123,13 @@ class PointStep:
     def _record_compare(
         self, draw: Draw, samples: Samples, raw: mi.Float
     ) -> tuple[Score, mi.Float, mi.Float]:
-        leaf = mi.Float(raw)
-        dr.enable_grad(leaf)
-        raw_density, *raw_colour = columns(leaf, 4)
-        density, colour = self.field.activate(raw_density, raw_colour)
-        depths = density * samples.width
-        values, colours = dr.detach(depths), dr.detach(colour)
-        dr.eval(depths, colour)
+        def activate(raw: mi.Float) -> tuple[mi.Float, mi.Color3f]:
+            raw_density, *raw_colour = columns(raw, 4)
+            density, colour = self.field.activate(raw_density, raw_colour)
+            return density * samples.width, colour
+
+        values, colours = dr.detach(activate(raw))
+        dr.eval(values, colours)
         with dr.suspend_grad():
             primal = composite(samples, values, colours)
             dr.eval(primal)
@@ -141,8 +142,8 @@ class PointStep:
             )
             score.loss += dr.sum(spread.penalty) * self.source.weights.spread
             dr.eval(by_depth, by_colour)
-        dr.backward(depths * by_depth + dr.dot(colour, by_colour))
-        return score, dr.grad(leaf), by_depth * values
+        slopes = vjp(activate, raw, (by_depth, by_colour))
+        return score, slopes, by_depth * values
 
     def _spread(self, samples: Samples, depths: mi.Float) -> Spread:
         """Measure spread in steps of the march, as a share of those across the box."""

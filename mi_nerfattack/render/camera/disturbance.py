@@ -10,14 +10,15 @@ policies are trained with, too.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.colour import linear_to_srgb, srgb_to_linear
+from mi_nerfattack.backend.concat import concat, split
+from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.ranges import NonNegative, Whole, checked
 
 #: Standard deviations at which the blur's kernel ends.
@@ -81,12 +82,7 @@ class Disturbance:
             step: likewise.
             d_shown: derivative of the objective by its result, of the same shape.
         """
-        with dr.resume_grad():
-            leaf = type(image)(dr.detach(image))
-            dr.enable_grad(leaf)
-            shown = self.apply(leaf, step).array
-            dr.backward_from(shown * type(shown)(d_shown.array))
-            result = dr.grad(leaf)
+        result = vjp(lambda x: self.apply(x, step), image, d_shown)
         dr.eval(result)
         return result
 
@@ -114,11 +110,11 @@ def disturbed(
     """
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():
-        value = srgb_to_linear(value)
+        value = dr.srgb_to_linear(value)
         if blurs.any():
             value = blur(value, shape, blurs)
         gain = _uploaded(kind, 2.0**exposures)
-        value = linear_to_srgb(value * dr.gather(kind, gain, _drive(value, shape)))
+        value = dr.linear_to_srgb(value * dr.gather(kind, gain, _drive(value, shape)))
     if noise_sd:
         noise = standard_normal(kind, shape, seed, step)
         value = value + dr.opaque(kind, noise_sd) * noise  # the image itself stays
@@ -137,86 +133,62 @@ def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:
         shape: (n, height, width, 3).
         blurs: (n,), standard deviations, pixels.
     """
-    reach = max(1, int(_TRUNCATE * blurs.max() + 0.5))
-    offsets = np.arange(reach + 1)
-    weights = np.exp(-0.5 * (offsets / np.maximum(blurs, 1e-3)[:, None]) ** 2)
-    weights /= 2 * weights.sum(1, keepdims=True) - weights[:, :1]
-    table = _uploaded(type(value), weights.ravel())
-    return dr.custom(_Blur, value, _Kernel(shape, table, reach))
-
-
-class _Kernel:
-    """Weights by drive and distance, which Dr.Jit does not look into for arrays."""
-
-    def __init__(self, shape: tuple[int, ...], table: Any, reach: int) -> None:
-        self.shape, self.table, self.reach = shape, table, reach
-
-    def both_ways(self, value: Any) -> Any:
-        """Convolve along rows, then along columns."""
-        _, height, width, channels = self.shape
-        dr.eval(value)  # is gathered from
-        value = self._along(value, channels, width)
-        dr.eval(value)
-        return self._along(value, channels * width, height)
-
-    @dr.syntax
-    def _along(self, value: Any, stride: int, length: int) -> Any:
-        kind = type(value)
-        integer = dr.int32_array_t(kind)
-        index = integer(dr.arange(dr.uint32_array_t(kind), dr.width(value)))
-        place = index // stride % length
-        first = index - place * stride
-        reach = dr.opaque(integer, self.reach)
-        row = _drive(value, self.shape) * (reach + 1)
-        offset = integer(-reach)
-        total = kind(0)
-        while offset <= reach:
-            source = place + offset
-            source = dr.select(source < 0, -1 - source, source) % (2 * length)
-            source = dr.select(source < length, source, 2 * length - 1 - source)
-            weight = dr.gather(kind, self.table, row + dr.abs(offset))
-            total += weight * dr.gather(kind, value, first + source * stride)
-            offset += 1
-        return total
+    return dr.custom(_Blur, value, shape[1:], [_gaussian(sd) for sd in blurs])
 
 
 class _Blur(dr.CustomOp):
-    """A linear map that is its own transpose."""
+    """A linear map that is its own transpose, which Dr.Jit would make by scattering."""
 
-    def eval(self, value: Any, kernel: _Kernel) -> Any:
-        self.kernel = kernel
-        return kernel.both_ways(value)
+    def eval(
+        self, value: Any, image: tuple[int, ...], kernels: list[list[float]]
+    ) -> Any:
+        self.image, self.kernels = image, kernels
+        return self._convolve(value)
 
     def forward(self) -> None:
-        self.set_grad_out(self.kernel.both_ways(self.grad_in("value")))
+        self.set_grad_out(self._convolve(self.grad_in("value")))
 
     def backward(self) -> None:
-        self.set_grad_in("value", self.kernel.both_ways(self.grad_out()))
+        self.set_grad_in("value", self._convolve(self.grad_out()))
+
+    def _convolve(self, value: Any) -> Any:
+        """Convolve each drive's image by a loop that any standard deviation shares."""
+        size = math.prod(self.image)
+        tensor = dr.tensor_t(type(value))
+        blurred = [
+            dr.convolve(
+                tensor(part, self.image),
+                kernel,
+                axis=(0, 1),
+                boundary="reflect",
+                mode="symbolic",
+            ).array
+            for part, kernel in zip(split(value, size), self.kernels, strict=True)
+        ]
+        return concat(blurred, [size] * len(blurred))
+
+
+def _gaussian(sd: float) -> list[float]:
+    """Sample a Gaussian of a standard deviation in pixels; the sum is 1."""
+    reach = int(_TRUNCATE * sd + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sd, 1e-3)) ** 2)
+    return (weights / weights.sum()).tolist()
 
 
 def standard_normal(kind: Any, shape: tuple[int, ...], seed: int, step: int) -> Any:
-    """Draw normal numbers by counters (TEA), a function of seed, row and step.
+    """Draw normal numbers by counters, a function of seed, row and step.
 
     Args:
         kind: type of the result.
-        shape: (n, ...), of a row a drive.
+        shape: (n, ...), of a row a drive; other n have the same rows.
         seed: of all.
         step: index of the control period.
 
     Returns:
-        flat values, mean 0 and variance 1, at most 5.9.
-
-    Source: Zafar et al. 2010; Box and Muller 1958.
+        flat values, mean 0 and variance 1.
     """
-    (key,) = np.random.SeedSequence([seed, _STREAM]).generate_state(1)
-    size = int(np.prod(shape[1:]))
-    index = dr.arange(mi.UInt32, shape[0] * size)
-    key = mi.sample_tea_32(dr.opaque(mi.UInt32, int(key)), dr.opaque(mi.UInt32, step))
-    key = mi.sample_tea_32(key[0], index // size)
-    first, second = mi.sample_tea_32(key[0], index % size)
-    scale = 2.0**-24  # 24 bits, as single precision holds them
-    radius = dr.sqrt(-2 * dr.log((kind(first >> 8) + 0.5) * scale))
-    return radius * dr.cos(2 * dr.pi * scale * kind(second >> 8))
+    (key,) = np.random.SeedSequence([seed, _STREAM, step]).generate_state(1, np.uint64)
+    return dr.rng(seed=int(key)).normal(kind, math.prod(shape))
 
 
 def _drive(value: Any, shape: tuple[int, ...]) -> Any:

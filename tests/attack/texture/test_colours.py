@@ -130,6 +130,28 @@ def test_statistics_of_a_texture_that_is_known():
     assert found.spectrum[-1] == pytest.approx(1)  # all of it is the mean
 
 
+def test_measuring_that_fails_leaves_the_texture(monkeypatch):
+    from mi_nerfattack.attack.texture import statistics
+
+    loop, grid = toy.make_loop()
+    given = toy.texture_of(grid)
+
+    def fail(*_):
+        assert not np.array_equal(toy.texture_of(grid), given)
+        raise MemoryError
+
+    monkeypatch.setattr(type(loop.sensor), "observe", fail)
+    with pytest.raises(MemoryError):
+        statistics.seen_weights(loop.sensor, [grid], [loop.initial(np.zeros((1, 3)))])
+    np.testing.assert_array_equal(toy.texture_of(grid), given)
+    colours = iter([lambda *_: 0.0, fail])
+    monkeypatch.setattr(statistics, "vertex_colours", lambda *a: next(colours)(*a))
+    edge = grid.levels()[-1].resolution
+    with pytest.raises(MemoryError):
+        statistics.texture_statistics(grid, given + 1, np.ones((edge,) * 3))
+    np.testing.assert_array_equal(toy.texture_of(grid), given)
+
+
 def test_spectrum_tells_fine_structure_from_coarse(variant):
     from mi_nerfattack.attack.texture.statistics import texture_statistics
     from mi_nerfattack.fields import GridField, GridLayout

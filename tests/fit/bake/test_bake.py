@@ -13,8 +13,10 @@ from helpers.faults import short_of_memory, signalled
 from helpers.small_fields import homogeneous, small_ngp
 
 from mi_nerfattack import cli
+from mi_nerfattack.capture.scene import drive_poses
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import NGPField, Occupancy, load_field, save_field
+from mi_nerfattack.fit.bake import bake as module
 from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
 from mi_nerfattack.fit.bake.scores import score_bake
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
@@ -84,6 +86,29 @@ def test_refinement_brings_bricks_to_the_field(field):
         least.append(seen.psnr_db)
     assert least[1] > least[0] + 1
     assert least[1] > 28
+
+
+def test_no_two_draws_share_a_seed(field, monkeypatch):
+    poses, jitter = [], []
+
+    def scatter(routes, views, seed, mount):
+        poses.append(drive_poses(routes, views, seed, mount).tobytes())
+        return drive_poses(routes, views, 0, mount)
+
+    def keep(*arguments):
+        result = rays_of(*arguments)
+        jitter.append(result.jitter.numpy().tobytes())
+        return result
+
+    rays_of = module._rays
+    monkeypatch.setattr(module, "drive_poses", scatter)
+    monkeypatch.setattr(module, "_rays", keep)
+    monkeypatch.setattr(module, "_RAYS_AT_ONCE", 1)  # an image at a time
+    for seed in (0, 1):
+        options = BakeOptions(cone=0.5, passes=3, views=3, seed=seed)
+        bake(PosedField(field), [ROUTE], CAMERA, MOUNT, options)
+    assert len(jitter) == len(set(jitter)) == 18
+    assert len(poses) == len(set(poses)) == 6
 
 
 def test_a_pose_moves_the_bricks_with_the_field(field):

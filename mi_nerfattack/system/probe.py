@@ -1,4 +1,4 @@
-"""Try every Mitsuba variant; run as ``python -m mi_nerfattack.backend.probe``.
+"""Try every Mitsuba variant; run as ``python -m mi_nerfattack.system.probe``.
 
 One JSON line for each variant. A process of its own, because an LLVM that is too
 old aborts the process at the first kernel that takes a minimum.
