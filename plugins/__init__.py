@@ -27,6 +27,7 @@ _MODULES = (
     "film",
     "limits",
     "nested",
+    "collector",
     "field_integrator",
     "opencv_camera",
 )

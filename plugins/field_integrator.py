@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
@@ -13,9 +13,10 @@ import mitsuba as mi
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import limits
 from mi_nerfattack.plugins.aovs import FieldChannels
+from mi_nerfattack.plugins.collector import FrozenComposite, RayCollector
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.film import FilmIntegrator
-from mi_nerfattack.plugins.nested import State, sample_nested
+from mi_nerfattack.plugins.nested import State, look, sample_nested
 from mi_nerfattack.plugins.properties import (
     Mask,
     background,
@@ -159,6 +160,9 @@ class FieldIntegrator(FilmIntegrator):
         self.behind = others[0] if is_first else None
         #: Whether derivatives are asked for by what the nested integrator renders.
         self.differentiates_behind = False
+        march = self.composite, self.posed, self.stop
+        self.frozen = FrozenComposite(*march)
+        self.collector = RayCollector(*march)
         samples: Any = props.get("relit_samples", LIGHT_SAMPLES)
         relit = tuple(volume.relit for volume in self.volumes)
         relighting = Relighting(relit, int(samples), self.stop)
@@ -232,12 +236,14 @@ class FieldIntegrator(FilmIntegrator):
         state_in: Any = None,
         active: Mask = True,
         δsplats: Any = None,
+        width: int = 0,
         **kwargs: Any,
     ) -> tuple[Any, mi.Bool, list[mi.Float], Any]:
         """Integrate one ray a lane; see Mitsuba's ``RBIntegrator.sample``.
 
         Where a film asks for the derivatives of :meth:`splats`, it gives their
         cotangents as ``δsplats``, and finds their tangents in the place of the state.
+        ``width`` are the rays in a row of an image, where nothing is being recorded.
         """
         del depth, δaovs, kwargs
         attached, ray = ray, mi.Ray3f(dr.detach(ray))
@@ -248,7 +254,7 @@ class FieldIntegrator(FilmIntegrator):
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
         if state_in is None:  # primal mode, or forward mode, which comes without
             inner = sampler if mode == dr.ADMode.Primal else sampler.clone()
-            state_in = self._look(scene, inner, ray, rays)
+            state_in = look(self, scene, inner, ray, rays, width)
         state: State = state_in
         rays.gains = state.gains
         valid = state.seen.total.opacity > 0
@@ -262,26 +268,7 @@ class FieldIntegrator(FilmIntegrator):
             self._backward(scene, sampler, attached, rays, state, δL, δsplats)
             return δL, valid, [], None
         tangent, t_splats = self._forward(scene, sampler, ray, rays, state)
-        # Mitsuba writes this into the tangent of alpha, which is zero.
-        return tangent, mi.Bool(False), [], t_splats
-
-    def _look(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, rays: Rays
-    ) -> State:
-        """March the fields, and see what lies behind them."""
-        light = self.relighting
-        if light is not None:
-            rays.gains = light.gains(scene, sampler, self.posed, rays)
-        seen = self.composite.render(self.posed, rays, self.stop)
-        if self.behind is None:
-            return State(seen, rays.gains)
-        behind, valid, aovs, *inner = sample_nested(
-            self.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
-        )
-        if light is not None:
-            shadow = light.behind(scene, sampler, self.posed, ray, rays.active)
-            behind *= spectrum.reflectance(shadow, ray.wavelengths)
-        return State(seen, rays.gains, behind, valid, list(aovs), *inner)
+        return tangent, valid, [], t_splats
 
     def _backward(
         self,
@@ -297,7 +284,7 @@ class FieldIntegrator(FilmIntegrator):
         with dr.resume_grad():
             by_camera = dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
         if by_camera:
-            limits.check_camera(self, scene, "sensor")
+            limits.check_camera(self, scene, "camera")
         # From the colour back to the fields, to what is behind, and to the sky
         with dr.resume_grad():
             leaf = state.copy()
@@ -327,7 +314,7 @@ class FieldIntegrator(FilmIntegrator):
                 state.inner,
             )
         if not by_camera and not any(item.has_pose_gradients for item in self.posed):
-            self.composite.backward(self.posed, rays, state.seen, cotangent, self.stop)
+            self.collector.add(rays, state.seen, cotangent)
             return
         # Fields, camera and poses in one march
         wanted = [
@@ -346,6 +333,28 @@ class FieldIntegrator(FilmIntegrator):
             with dr.resume_grad():
                 result = dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction)
                 dr.backward_from(result)
+
+    def start_gradient(self, scene: mi.Scene, keys: Collection[str]) -> None:
+        """Collect the rays of backward passes until :meth:`finish_gradient`.
+
+        Args:
+            scene: that is rendered.
+            keys: of `mi.traverse(scene)`, the parameters to differentiate by.
+
+        Raises:
+            InputError: a derivative that is not computed.
+        """
+        self.collector.clear()
+        self.differentiates_behind = limits.check(self, scene, keys)
+        self.collector.waits = True
+
+    def finish_gradient(self) -> None:
+        """Accumulate the gradients of all collected rays."""
+        self.collector.finish()
+
+    def stop_gradient(self) -> None:
+        """Collect no more."""
+        self.differentiates_behind = self.collector.waits = False
 
     def _forward(
         self,

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from mi_nerfattack.fields import GridField
+from mi_nerfattack.fields.grid_gradients import tangents
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 
@@ -104,7 +105,7 @@ class GridFieldVolume(AbstractFieldVolume):
         }
 
     def _tangents(self) -> AbstractContextManager[None]:
-        return self.field.tangents()
+        return tangents(self.field)
 
 
 mi.register_texture("grid_field", lambda props: GridFieldVolume(props))

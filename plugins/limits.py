@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import drjit as dr
@@ -11,12 +12,15 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
 
 
-def check(integrator: Any, scene: mi.Scene) -> bool:
-    """Look for parameters with gradients enabled, and refuse what is not computed.
+def check(
+    integrator: Any, scene: mi.Scene, keys: Collection[str] | None = None
+) -> bool:
+    """Look for parameters to differentiate by, and refuse what is not computed.
 
     Args:
         integrator: a `field_integrator`.
         scene: that it renders.
+        keys: of the parameters; by default those that have gradients enabled.
 
     Returns:
         whether the nested integrator has to be differentiated.
@@ -28,7 +32,7 @@ def check(integrator: Any, scene: mi.Scene) -> bool:
     attached = [
         (key, node, flags)
         for key, (value, kind, node, flags) in params.properties.items()
-        if dr.grad_enabled(mi.get_property(value, kind, node) if kind else value)
+        if (key in keys if keys is not None else _is_attached(value, kind, node))
     ]
     sensors = [(key, node) for key, node, _ in attached if isinstance(node, mi.Sensor)]
     others = [
@@ -54,6 +58,10 @@ def check_camera(integrator: Any, scene: mi.Scene, key: str) -> None:
             "camera; take them out of the scene, or differentiate by to_world of the "
             "fields"
         )
+
+
+def _is_attached(value: Any, kind: Any, node: Any) -> bool:
+    return dr.grad_enabled(mi.get_property(value, kind, node) if kind else value)
 
 
 def _is_own(integrator: Any, node: Any) -> bool:

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_nerfattack.render.composite import Seen
+from mi_nerfattack.render.lighting import spectrum
+from mi_nerfattack.render.rays import Rays
 
 
 @dataclass
@@ -62,3 +64,40 @@ def sample_nested(
         state_in=state_in,
         active=active,
     )
+
+
+def look(
+    integrator: Any,
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    rays: Rays,
+    width: int,
+) -> State:
+    """March the fields of a `field_integrator`, and see what lies behind them.
+
+    Args:
+        integrator: its fields and nested integrator.
+        scene: that is rendered.
+        sampler: of random numbers.
+        ray: n rays.
+        rays: the same, as far as fields are concerned.
+        width: rays in a row, where nothing is being recorded; 0 otherwise.
+    """
+    light = integrator.relighting
+    if light is not None:
+        rays.gains = light.gains(scene, sampler, integrator.posed, rays)
+    if width:
+        dr.make_opaque(rays)
+        seen = integrator.frozen.render(rays, width)
+    else:
+        seen = integrator.composite.render(integrator.posed, rays, integrator.stop)
+    if integrator.behind is None:
+        return State(seen, rays.gains)
+    behind, valid, aovs, *inner = sample_nested(
+        integrator.behind, dr.ADMode.Primal, scene, sampler, ray, rays.active
+    )
+    if light is not None:
+        shadow = light.behind(scene, sampler, integrator.posed, ray, rays.active)
+        behind *= spectrum.reflectance(shadow, ray.wavelengths)
+    return State(seen, rays.gains, behind, valid, list(aovs), *inner)

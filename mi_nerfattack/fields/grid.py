@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -274,22 +272,6 @@ class GridField(AbstractField):
         self._pack()
         if name == "texture" and self._colours is not None:
             self._colours.read()
-
-    @contextmanager
-    def tangents(self) -> Iterator[None]:
-        """Let :attr:`packed` have the tangents of ``colour`` and ``density``."""
-        before, zero = self.packed, dr.zeros(mi.Float, 3 * self.n_vertices)
-        colour = self.colours.value
-        if dr.grad_enabled(colour):
-            zero = self.colours.tangent(dr.grad(colour).array)
-        tangent = self.pack(zero, dr.grad(self._density))
-        self.packed = mi.Float(dr.detach(before))
-        dr.enable_grad(self.packed)
-        dr.set_grad(self.packed, tangent)
-        try:
-            yield
-        finally:
-            self.packed = before
 
     def held_vertices(self) -> np.ndarray:
         """Tell which vertices are read anywhere in an occupied cell, (n_vertices,)."""

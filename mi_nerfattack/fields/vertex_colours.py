@@ -96,6 +96,13 @@ class VertexColours:
         change = dr.gather(mi.Float, change, index - 3 * self._start, finest)
         return self._texture + dr.select(finest, change, 0)
 
+    def gradient(self, by_texture: mi.TensorXf) -> mi.TensorXf:
+        """Return the colours' gradient (n, 3) from the texture's (n_vertices, 3)."""
+        value = dr.detach(self.value.array)
+        index = 3 * self._start + dr.arange(mi.UInt32, dr.width(value))
+        slope = dr.gather(mi.Float, by_texture.array, index) / (value * (1 - value))
+        return mi.TensorXf(slope, tuple(self.value.shape))
+
     def tangent(self, tangent: mi.Float) -> mi.Float:
         """Return the texture's tangent (3 n_vertices,) from that of the colours."""
         value = dr.detach(self.value.array)

@@ -52,6 +52,7 @@ class PosedField:
         matrix[:3, :3], matrix[:3, 3] = self.pose.scale * rotation, translation
         mi.set_property(self.to_world, mi.AffineTransform4f(matrix))
         self._attached: Any = None
+        self._followed = self._matrix()
 
     def follow(self) -> None:
         """Take the pose of `to_world`, which has been changed, and its derivatives.
@@ -59,12 +60,17 @@ class PosedField:
         Raises:
             ValueError: it shears, reflects or scales unequally.
         """
-        matrix = np.array(dr.detach(self.to_world.matrix), np.float64)
-        pose = Pose.from_matrix(matrix.reshape(4, 4))
-        self._set(pose)
-        self._put(pose)
+        matrix = self._matrix()
+        if not np.array_equal(matrix, self._followed):
+            pose = Pose.from_matrix(matrix)
+            self._set(pose)
+            self._put(pose)
+            self._followed = matrix
         attached = dr.grad_enabled(self.to_world.matrix)
         self._attached = self.to_world if attached else None
+
+    def _matrix(self) -> np.ndarray:
+        return np.array(dr.detach(self.to_world.matrix), np.float64).reshape(4, 4)
 
     def _set(self, pose: Pose) -> None:
         self.pose: Pose = pose

@@ -18,6 +18,7 @@ from .reduction import AbstractReduction as AbstractReduction
 from .reduction import CVaR as CVaR
 from .reduction import Mean as Mean
 from .reduction import Worst as Worst
+from .scene_sensor import SceneSensor as SceneSensor
 from .sensor import AbstractDifferentiableSensor as AbstractDifferentiableSensor
 from .sensor import AbstractSensor as AbstractSensor
 from .sensor import Observation as Observation

@@ -12,6 +12,7 @@ import numpy as np
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.fields.grid_gradients import start_gradient
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
@@ -242,10 +243,7 @@ class FieldSensor(AbstractDifferentiableSensor):
         """Make every object's packed grid a fresh leaf with gradient zero."""
         self._tasks.clear()
         for field in self.fields:
-            leaf = mi.Float(dr.detach(field.packed))
-            dr.enable_grad(leaf)
-            field.packed = leaf
-            dr.set_grad(field.packed, dr.opaque(mi.Float, 0, dr.width(leaf)))
+            start_gradient(field)
         double = dr.float64_array_t(mi.Float)
         zeros = [[dr.opaque(double, 0) for _ in range(6)] for _ in self.objects]
         self._wrenches = zeros if poses else None

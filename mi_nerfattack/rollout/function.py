@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from mi_nerfattack.rollout.loop import (
 )
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.reduction import AbstractReduction, Mean
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sweep import (
     Gradient,
     Options,
@@ -178,12 +179,18 @@ class Rollout:
         return backward_to_images(self.loop, drive, d_states, steps, self.attached)
 
     def __call__(
-        self, textures: Sequence[Any], initial: Any, offsets: Any = None
+        self,
+        textures: Sequence[Any] | Mapping[str, Any],
+        initial: Any,
+        offsets: Any = None,
     ) -> Any:
         """Evaluate J as one differentiable operation of Dr.Jit.
 
         Args:
-            textures: one tensor (n_vertices, 3) an object, raw colours.
+            textures: of a `SceneSensor`, parameters by key, for instance the result
+                of ``mi.traverse(scene)`` or an optimiser; those that are attached
+                are differentiated. Of other sensors, one tensor (n_vertices, 3) an
+                object, raw colours.
             initial: (m, n) from :meth:`ClosedLoop.initial`.
             offsets: tensor (k, 6), shift (metres) and rotation vector (radians) of
                 each object from where it was put; left alone when left out.
@@ -191,6 +198,11 @@ class Rollout:
         Returns:
             one entry, attached to whatever of the three is. Reverse mode only.
         """
+        if not isinstance(textures, Sequence):
+            # Mitsuba's parameters and optimisers are no `Mapping` by inheritance
+            values = {key: textures[key] for key in textures.keys()}  # noqa: SIM118
+            attached = {k: v for k, v in values.items() if dr.grad_enabled(v)}
+            return dr.custom(_SceneOp, _Held(self), attached, initial)
         moved = [] if offsets is None else [offsets]
         return dr.custom(_RolloutOp, _Held(self), list(textures), initial, moved)
 
@@ -224,6 +236,33 @@ class _Held:
         self.rollout = rollout
 
 
+class _SceneOp(dr.CustomOp):
+    """As `_RolloutOp`, of a scene's parameters."""
+
+    def eval(self, held: _Held, values: dict[str, Any], initial: Any) -> Any:
+        self.rollout = held.rollout
+        self.values = {key: type(v)(dr.detach(v)) for key, v in values.items()}
+        self._install()
+        self.evaluation = self.rollout.run(dr.detach(initial))
+        return dr.value_t(type(initial))([self.evaluation.value])
+
+    def backward(self) -> None:
+        self._install()  # others may have driven
+        scale = float(dr.detach(self.grad_out())[0])
+        found = self.rollout.gradient(self.evaluation, scale=scale)
+        self.set_grad_in("values", found.parameters)
+        self.set_grad_in("initial", found.initial)
+
+    def _install(self) -> None:
+        sensor = self.rollout.loop.sensor
+        if not isinstance(sensor, SceneSensor):
+            raise TypeError(
+                f"{type(sensor).__name__}: takes textures, one tensor an object; for "
+                "parameters of a scene use a SceneSensor"
+            )
+        sensor.set_parameters(self.values)
+
+
 class _RolloutOp(dr.CustomOp):
     """Forward: a batch of drives. Backward: the rollout's adjoint."""
 
@@ -244,7 +283,8 @@ class _RolloutOp(dr.CustomOp):
         scale = float(dr.detach(self.grad_out())[0])
         moved = self.offset_type is not None
         found = self.rollout.gradient(self.evaluation, offsets=moved, scale=scale)
-        self.set_grad_in("textures", found.textures)
+        pairs = zip(self.textures, found.textures, strict=True)
+        self.set_grad_in("textures", [type(like)(value) for like, value in pairs])
         self.set_grad_in("initial", found.initial)
         if self.offset_type is not None:
             self.set_grad_in("offsets", [self.offset_type(found.offsets)])

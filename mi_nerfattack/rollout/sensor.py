@@ -25,12 +25,18 @@ class Observation:
             sensor has no fields.
         rays: n height width rays; None where the sensor traces none.
         ends: where surfaces end the rays, and what is seen there; None without any.
+        step: of a `SceneSensor`, the index of the control period.
+        linear: of a `SceneSensor`, (3, n height width), before the sRGB curve.
+        kept: of a `SceneSensor`, what its integrator hands to its derivatives.
     """
 
     image: Any
     seen: Seen | None = None
     rays: Rays | None = None
     ends: Ends | None = None
+    step: int = 0
+    linear: Any = None
+    kept: Any = None
 
 
 class AbstractSensor(ABC):
@@ -78,6 +84,14 @@ class AbstractDifferentiableSensor(AbstractSensor):
         Args:
             poses: whether to accumulate those of the objects' poses, too.
         """
+
+    def gradients(self) -> dict[str, Any]:
+        """Return what has been accumulated by key of a scene's parameters, if any."""
+        return {}
+
+    def stop_gradient(self) -> None:
+        """Leave no parameter attached, when the gradients have been read."""
+        return
 
     @property
     @abstractmethod

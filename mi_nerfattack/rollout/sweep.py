@@ -45,6 +45,7 @@ class Gradient:
         initial: (m, n) by the initial states.
         costates: (T, n, m) NumPy: ``l_t``, minus the derivative by ``x_t``.
         attribution: per control period; None where not asked for.
+        parameters: by key, of a `SceneSensor`; empty of others.
     """
 
     textures: list[Any]
@@ -52,6 +53,7 @@ class Gradient:
     initial: Any
     costates: np.ndarray
     attribution: Attribution | None
+    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 class StepRecorder:
@@ -254,26 +256,26 @@ def backward(
     sweep = Sweep(loop, drive, options.attached, together)
     sensor.start_gradient(options.offsets)
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
-    for step in visits:
-        d_after = d_before + to_state(d_states[step.index])
-        d_before = sweep.back(step, d_after)
-        costates.append(-np.array(d_after).T)
-        if options.recorder is not None:
-            sweep.finish_still()
-            options.recorder.add(step.index, sensor.texture_gradients())
-        if options.on_step is not None:
-            options.on_step(step.index)
-    sweep.finish()
-    sweep.finish_still()
-    textures = sensor.texture_gradients()
-    dr.eval(textures)
-    return Gradient(
-        textures,
-        sensor.offset_gradients() if options.offsets else None,
-        d_before,
-        np.stack(costates[::-1]),
-        options.recorder.result() if options.recorder else None,
-    )
+    try:
+        for step in visits:
+            d_after = d_before + to_state(d_states[step.index])
+            d_before = sweep.back(step, d_after)
+            costates.append(-np.array(d_after).T)
+            if options.recorder is not None:
+                sweep.finish_still()
+                options.recorder.add(step.index, sensor.texture_gradients())
+            if options.on_step is not None:
+                options.on_step(step.index)
+        sweep.finish()
+        sweep.finish_still()
+        textures, parameters = sensor.texture_gradients(), sensor.gradients()
+        offsets = sensor.offset_gradients() if options.offsets else None
+        dr.eval(textures)
+    finally:
+        sensor.stop_gradient()
+    attribution = options.recorder.result() if options.recorder else None
+    costates = np.stack(costates[::-1])
+    return Gradient(textures, offsets, d_before, costates, attribution, parameters)
 
 
 def backward_to_images(

@@ -1,0 +1,105 @@
+"""Rays of frames: marched ahead of a composite, and again for its gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+
+from mi_nerfattack.backend.freeze import freeze_method
+from mi_nerfattack.render.backdrop import Layer
+from mi_nerfattack.render.composite import AbstractComposite, Seen, Task, TaskQueue
+from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.scene_march import AbstractSceneMarch
+
+
+class RayCollector:
+    """Marches rays that meet a field which asks for gradients, and have a cotangent.
+
+    Args:
+        composite: rule by which the layers become one colour.
+        posed: the layers.
+        stop: transmittance at which rays end.
+
+    Attributes:
+        waits: whether rays of several frames are marched together, until `finish`.
+    """
+
+    def __init__(
+        self, composite: AbstractComposite, posed: Sequence[Layer], stop: float
+    ) -> None:
+        self.waits = False
+        self._parts = composite, list(posed), stop
+        self._queue = TaskQueue(freeze_method(self._accumulate, self._state))
+
+    def add(self, rays: Rays, seen: Seen, cotangent: Seen) -> None:
+        """Take rays; see :meth:`AbstractComposite.backward`."""
+        composite, posed, _ = self._parts
+        for task in composite.tasks(posed, rays, seen, cotangent):
+            self._queue.add(task)
+        if not self.waits:
+            self._queue.finish()
+
+    def clear(self) -> None:
+        """Forget the rays that wait."""
+        self._queue.clear()
+
+    def finish(self) -> None:
+        """March the rays that wait."""
+        self._queue.finish()
+
+    def _accumulate(self, task: Task) -> None:
+        composite, posed, stop = self._parts
+        composite.accumulate([posed[k] for k in task.fields], task, stop)
+
+    def _state(self, task: Task) -> list[Any]:
+        """Return what the frozen :meth:`_accumulate` reads beside its argument."""
+        composite, posed, stop = self._parts
+        return [composite, stop, task.fields, [posed[k].state() for k in task.fields]]
+
+
+class FrozenComposite:
+    """Renders a composite as a recording that is replayed, not traced again.
+
+    Args:
+        composite: rule by which the layers become one colour.
+        posed: the layers.
+        stop: transmittance at which rays end.
+    """
+
+    def __init__(
+        self, composite: AbstractComposite, posed: Sequence[Layer], stop: float
+    ) -> None:
+        self._parts = composite, list(posed), stop
+        self._first: AbstractSceneMarch | None = None
+        self._render = freeze_method(self._record, self._state)
+
+    def render(self, rays: Rays, width: int) -> Seen:
+        """See :meth:`AbstractComposite.render`; evaluates, so not while recording.
+
+        Args:
+            rays: n rays, without literals.
+            width: rays in a row.
+        """
+        composite, posed, stop = self._parts
+        if posed[0].has_gradients:
+            return self._render(rays, [])
+        # The first layer, mostly the scene, in the fastest way
+        if self._first is None:
+            self._first = composite.ahead(posed[0], stop)
+        return self._render(
+            rays, [self._first.march(rays, width)] if self._first else []
+        )
+
+    def _record(self, rays: Rays, kept: list[March]) -> Seen:
+        composite, posed, stop = self._parts
+        if not kept:
+            return composite.render(posed, rays, stop)
+        return composite.restore(posed, rays, kept, stop)
+
+    def _state(self, rays: Rays, kept: list[March]) -> list[Any]:
+        """Return what the frozen :meth:`_record` reads beside its arguments."""
+        composite, posed, stop = self._parts
+        sizes = dr.width(rays.direction), len(kept)
+        return [composite, stop, sizes, [item.state() for item in posed]]
