@@ -137,7 +137,7 @@ def blur(value: Any, shape: tuple[int, ...], blurs: np.ndarray) -> Any:
 
 
 class _Blur(dr.CustomOp):
-    """A linear map that is its own transpose, which Dr.Jit would make by scattering."""
+    """A convolution that is its own transpose; Dr.Jit's derivative would scatter."""
 
     def eval(
         self, value: Any, image: tuple[int, ...], kernels: list[list[float]]
@@ -152,7 +152,7 @@ class _Blur(dr.CustomOp):
         self.set_grad_in("value", self._convolve(self.grad_out()))
 
     def _convolve(self, value: Any) -> Any:
-        """Convolve each drive's image by a loop that any standard deviation shares."""
+        """Convolve each drive's image; equal reaches share their kernels."""
         size = math.prod(self.image)
         tensor = dr.tensor_t(type(value))
         blurred = [
