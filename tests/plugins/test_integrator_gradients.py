@@ -20,9 +20,7 @@ def T() -> Any:
     return mi.ScalarTransform4f()
 
 
-@pytest.fixture(autouse=True)
-def _rgb() -> None:
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture
