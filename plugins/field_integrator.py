@@ -78,11 +78,10 @@ class FieldIntegrator(FilmIntegrator):
          nested integrator count
 
     The integrator marches every camera ray through the nested fields up to the nearest
-    surface of the scene that light does not pass straight (as it does ``null``, a
-    ``thindielectric`` and the transparent parts of a ``mask``):
-    ``L = I + (1 - a) L_b``. Behind the fields, the ray shows what a nested integrator
-    sees, with what such surfaces reflect, or the background of the first field that
-    has one.
+    surface of the scene: ``L = I + (1 - a) L_b``. It passes surfaces that light passes
+    straight: ``null``, ``thindielectric`` and the transparent parts of a ``mask``.
+    Behind the fields, the ray shows what a nested integrator sees, with what such
+    surfaces reflect, or the background of the first field that has one.
 
     The composite is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum
     sigma_k L_k / sigma``) or ``depth`` (each field alone, folded front to back by
@@ -90,8 +89,8 @@ class FieldIntegrator(FilmIntegrator):
     not overlap. A ``splat_background`` is a layer of ``depth`` alone, and takes no
     derivatives.
 
-    With ``aovs``, the image has more channels: ``opacity``, ``depth`` (metres, of the
-    composite), and per field ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
+    With ``aovs``, the image has more channels: ``opacity`` and ``depth`` (metres) of
+    the composite. Each field adds ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
     ``<id>.A`` and ``<id>.Z``: of the field's share of the image (``interleaved``) or
     of the field alone (``depth``). The depth of a pixel is the mean of its samples
     weighted by their opacity, infinite where none is above 0. The film itself holds
@@ -125,8 +124,8 @@ class FieldIntegrator(FilmIntegrator):
     ``render.lighting.relight`` for what this leaves out. It costs several marches per
     field.
 
-    Differentiable in forward and backward mode with respect to the fields' parameters,
-    and to all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
+    Differentiable in forward and backward mode with respect to the fields' parameters.
+    So is all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
     of Mitsuba's shows: BSDFs, bitmaps and lights, and fields that an emitter shares.
     In backward mode with respect to ``to_world`` of fields, and to the sensor where
     fields are alone in the scene. AOVs are differentiated, too, but for the shares of
@@ -261,6 +260,7 @@ class FieldIntegrator(FilmIntegrator):
         if mode == dr.ADMode.Backward:
             self._backward(scene, sampler, attached, rays, state, δL, δsplats)
             return δL, valid, [], None
+        limits.check_forward(attached)
         tangent, t_splats = self._forward(scene, sampler, ray, rays, state)
         # Mitsuba writes this into the tangent of alpha, which is zero.
         return tangent, mi.Bool(False), [], t_splats
@@ -294,8 +294,7 @@ class FieldIntegrator(FilmIntegrator):
         δsplats: Any,
     ) -> None:
         """Accumulate the gradients of all that the rays show."""
-        with dr.resume_grad():
-            by_camera = dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
+        by_camera = limits.is_attached(ray)
         if by_camera:
             limits.check_camera(self, scene, "sensor")
         # From the colour back to the fields, to what is behind, and to the sky
@@ -391,8 +390,9 @@ class FieldIntegrator(FilmIntegrator):
 
     def to_string(self) -> str:
         """Describe the checked parameters."""
-        kind, names = type(self.composite).__name__, [v.id() for v in self.volumes]
-        return f"FieldIntegrator[fields={names}, {kind}, stop={self.stop}]"
+        kind = type(self.composite).__name__
+        names = ", ".join(volume.id() for volume in self.volumes)
+        return f"FieldIntegrator[fields=({names}), {kind}, stop={self.stop}]"
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))
