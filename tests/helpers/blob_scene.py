@@ -34,13 +34,15 @@ def load(
         film: properties that differ.
     """
     view = T().look_at([-3.0, 0.2, 0.6], [0, 0, 0], [0, 0, 1])
-    box = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
+    size = {"width": 12, "height": 8, "rfilter": {"type": "box"}}
+    if film.get("type") != "specfilm":
+        film = {"type": "hdrfilm", "pixel_format": "rgb", **film}
     sensor = {
         "type": "perspective",
         "id": "camera",
         "fov": 50,
         "to_world": view,
-        "film": {**box, "pixel_format": "rgb", **film},
+        "film": {**size, **film},
         "sampler": {"type": "independent", "sample_count": 4},
     }
     integrator = {"type": "field_integrator", "id": "fields", "stop": 0.0, **nested}

@@ -110,9 +110,14 @@ def problem(loaded: mi.Scene, name: str, spp: int = 2) -> Derivatives:
 
 
 def directions(rng: np.random.Generator, field: GridField, shape) -> list[np.ndarray]:
-    """Make a rough and a smooth random direction for a parameter of a grid."""
-    slope = rng.normal(0, 1, (3, int(np.prod(shape)) // field.n_vertices))
-    smooth = rng.normal(0, 1, slope.shape[1]) + small.vertices(field) @ slope
+    """Make a rough and a smooth random direction for a parameter of a grid.
+
+    Colours have the vertices of the finest level, which come last.
+    """
+    place = small.vertices(field)
+    place = place[field.levels()[-1].vertices] if len(shape) == 2 else place
+    slope = rng.normal(0, 1, (3, int(np.prod(shape)) // len(place)))
+    smooth = rng.normal(0, 1, slope.shape[1]) + place @ slope
     return [rng.normal(0, 1, shape), smooth.reshape(shape) / np.abs(smooth).max()]
 
 
