@@ -289,7 +289,8 @@ def _mean(passes: list[np.ndarray], names: list[str]) -> np.ndarray:
     stack = np.stack(passes).astype(np.float64)
     result = stack.mean(axis=0)
     for i, name in enumerate(names):
-        opacity = name[:-1] + "A"
+        of_all = name == "Z" and "opacity" in names  # where A is the film's alpha
+        opacity = "opacity" if of_all else name[:-1] + "A"
         if name.rpartition(".")[2] != "Z" or opacity not in names:
             continue
         weight = stack[..., names.index(opacity)]

@@ -34,8 +34,8 @@ def load_scene(
         size_px: width and height of all films, as if the file gave them; None keeps
             the file's.
         shapes: `mi.Shape` by name that the scene gets besides its own.
-        layers: let `field_integrator` render its AOVs where the file does not set
-            ``aovs``.
+        layers: let a `field_integrator` that is the scene's render its AOVs, unless
+            the file sets ``aovs``.
 
     Returns:
         `mi.Scene`.
@@ -135,10 +135,13 @@ def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> Non
 
 
 def _add_layers(state: Any) -> None:
-    for node in state.nodes:
-        fields = node.props.plugin_name() == "field_integrator"
-        if fields and "aovs" not in node.props:
-            node.props["aovs"] = True
+    scene = state.nodes[0].props
+    for item in (scene[key] for key in scene):
+        if not isinstance(item, mi.Properties.ResolvedReference):
+            continue
+        props = state.nodes[item.index()].props
+        if props.plugin_name() == "field_integrator" and "aovs" not in props:
+            props["aovs"] = True
 
 
 @contextmanager
