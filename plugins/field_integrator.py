@@ -16,10 +16,9 @@ from mi_nerfattack.plugins.aovs import FieldChannels
 from mi_nerfattack.plugins.collector import FrozenComposite, RayCollector
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.film import FilmIntegrator
-from mi_nerfattack.plugins.nested import State, look, sample_nested
+from mi_nerfattack.plugins.nested import State, lay_over, look, sample_nested
 from mi_nerfattack.plugins.properties import (
     Mask,
-    background,
     read_composite,
     read_nested,
     read_stop,
@@ -29,7 +28,7 @@ from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render.backdrop import only_fields
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
-from mi_nerfattack.render.rays import March, Rays
+from mi_nerfattack.render.rays import Rays
 from mi_nerfattack.render.surroundings import nearest_surface
 
 
@@ -79,11 +78,10 @@ class FieldIntegrator(FilmIntegrator):
          nested integrator count
 
     The integrator marches every camera ray through the nested fields up to the nearest
-    surface of the scene that light does not pass straight (as it does ``null``, a
-    ``thindielectric`` and the transparent parts of a ``mask``):
-    ``L = I + (1 - a) L_b``. Behind the fields, the ray shows what a nested integrator
-    sees, with what such surfaces reflect, or the background of the first field that
-    has one.
+    surface of the scene: ``L = I + (1 - a) L_b``. It passes surfaces that light passes
+    straight: ``null``, ``thindielectric`` and the transparent parts of a ``mask``.
+    Behind the fields, the ray shows what a nested integrator sees, with what such
+    surfaces reflect, or the background of the first field that has one.
 
     The composite is ``interleaved`` (one march, ``sigma = sum sigma_k``, ``L = sum
     sigma_k L_k / sigma``) or ``depth`` (each field alone, folded front to back by
@@ -91,8 +89,8 @@ class FieldIntegrator(FilmIntegrator):
     not overlap. A ``splat_background`` is a layer of ``depth`` alone, and takes no
     derivatives.
 
-    With ``aovs``, the image has more channels: ``opacity``, ``depth`` (metres, of the
-    composite), and per field ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
+    With ``aovs``, the image has more channels: ``opacity`` and ``depth`` (metres) of
+    the composite. Each field adds ``<id>.R``, ``<id>.G``, ``<id>.B`` (premultiplied),
     ``<id>.A`` and ``<id>.Z``: of the field's share of the image (``interleaved``) or
     of the field alone (``depth``). The depth of a pixel is the mean of its samples
     weighted by their opacity, infinite where none is above 0. The film itself holds
@@ -126,8 +124,8 @@ class FieldIntegrator(FilmIntegrator):
     ``render.lighting.relight`` for what this leaves out. It costs several marches per
     field.
 
-    Differentiable in forward and backward mode with respect to the fields' parameters,
-    and to all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
+    Differentiable in forward and backward mode with respect to the fields' parameters.
+    So is all that a nested ``prb``, ``prbvolpath`` or other differentiable integrator
     of Mitsuba's shows: BSDFs, bitmaps and lights, and fields that an emitter shares.
     In backward mode with respect to ``to_world`` of fields, and to the sensor where
     fields are alone in the scene. AOVs are differentiated, too, but for the shares of
@@ -261,12 +259,13 @@ class FieldIntegrator(FilmIntegrator):
         if state.valid is not None:
             valid |= state.valid
         if mode == dr.ADMode.Primal:
-            radiance = self._over(state.seen.total, rays, state.behind, ray.wavelengths)
+            radiance = lay_over(self, state.seen.total, rays, state.behind, ray)
             aovs = [*self.channels.of_sample(state.seen), *state.aovs]
             return radiance, valid, aovs, state
         if mode == dr.ADMode.Backward:
             self._backward(scene, sampler, attached, rays, state, δL, δsplats)
             return δL, valid, [], None
+        limits.check_forward(attached)
         tangent, t_splats = self._forward(scene, sampler, ray, rays, state)
         return tangent, valid, [], t_splats
 
@@ -281,8 +280,7 @@ class FieldIntegrator(FilmIntegrator):
         δsplats: Any,
     ) -> None:
         """Accumulate the gradients of all that the rays show."""
-        with dr.resume_grad():
-            by_camera = dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
+        by_camera = limits.is_attached(ray)
         if by_camera:
             limits.check_camera(self, scene, "camera")
         # From the colour back to the fields, to what is behind, and to the sky
@@ -291,7 +289,7 @@ class FieldIntegrator(FilmIntegrator):
             direction = mi.Vector3f(rays.direction)
             dr.enable_grad(leaf.seen, leaf.behind, direction)
             lit = replace(rays, direction=direction)
-            radiance = self._over(leaf.seen.total, lit, leaf.behind, ray.wavelengths)
+            radiance = lay_over(self, leaf.seen.total, lit, leaf.behind, ray)
             result = dr.sum(radiance * δL)
             if δsplats is not None:
                 δalpha, δothers = δsplats
@@ -383,25 +381,17 @@ class FieldIntegrator(FilmIntegrator):
                     leaf.behind,
                     sample_nested(self.behind, dr.ADMode.Forward, *parts)[0],
                 )
-            colour = self._over(leaf.seen.total, rays, leaf.behind, ray.wavelengths)
+            colour = lay_over(self, leaf.seen.total, rays, leaf.behind, ray)
             found = colour, *self.splats(leaf)
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
             colour, alpha, aovs = dr.forward_to(found, flags=flags)
         return colour, (alpha, aovs)
 
-    def _over(self, total: March, rays: Rays, behind: Any, wavelengths: Any) -> Any:
-        """Lay the fields over what is behind, as a spectrum."""
-        passed = 1 - total.opacity
-        if behind is not None:
-            return spectrum.emission(total.radiance, wavelengths) + passed * behind
-        fields = [v for v in self.volumes if isinstance(v, AbstractFieldVolume)]
-        sky = background(fields, rays.direction) & (rays.t_max == dr.inf)
-        return spectrum.emission(total.radiance + passed * sky, wavelengths)
-
     def to_string(self) -> str:
         """Describe the checked parameters."""
-        kind, names = type(self.composite).__name__, [v.id() for v in self.volumes]
-        return f"FieldIntegrator[fields={names}, {kind}, stop={self.stop}]"
+        kind = type(self.composite).__name__
+        names = ", ".join(volume.id() for volume in self.volumes)
+        return f"FieldIntegrator[fields=({names}), {kind}, stop={self.stop}]"
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

@@ -133,7 +133,7 @@ class _View:
         names = integrator.film_channels()
         if names and mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
             raise InputError(
-                f"film {type(self.film).__name__}: has channels of its own, and none "
+                f"film {self.film.class_name()}: has channels of its own, and none "
                 "for AOVs; set aovs to false, or use hdrfilm"
             )
         self.sampler, self.spp = integrator.prepare(sensor, seed, spp, names)

@@ -87,11 +87,12 @@ class GridFieldVolume(AbstractFieldVolume):
     (7,700/metre), a path takes thousands of steps. ``density_limit`` 500 still lets no
     light pass more than a centimetre (0.7 %).
 
-    ``colour`` stands for the texture of all levels: a step of an optimiser is a change
+    ``colour`` represents the texture of all levels: a step of an optimiser is a change
     of colour by that step. Keep it within 0 and 1, for instance by ``dr.clip``. Where
     the file calls space empty, the density is 0 whatever ``density`` says: see
     ``fields.window``. A new ``to_world`` moves the field, except in media. Derivatives
-    by it are in backward mode alone.
+    by it are in backward mode alone, and leave out the faces of the field's box, where
+    its density should be 0.
     """
 
     kind = "grid_field"

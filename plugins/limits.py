@@ -64,6 +64,18 @@ def _is_attached(value: Any, kind: Any, node: Any) -> bool:
     return dr.grad_enabled(mi.get_property(value, kind, node) if kind else value)
 
 
+def is_attached(ray: mi.Ray3f) -> bool:
+    """Tell whether derivatives by the camera are asked for."""
+    with dr.resume_grad():
+        return dr.grad_enabled(ray.o) or dr.grad_enabled(ray.d)
+
+
+def check_forward(ray: mi.Ray3f) -> None:
+    """Raise InputError if a ray has tangents."""
+    if is_attached(ray):
+        raise InputError("sensor: has no derivative in forward mode; use dr.backward")
+
+
 def _is_own(integrator: Any, node: Any) -> bool:
     return any(node is volume for volume in integrator.volumes)
 

@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.plugins.properties import background
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
-from mi_nerfattack.render.rays import Rays
+from mi_nerfattack.render.rays import March, Rays
 
 
 @dataclass
@@ -101,3 +102,14 @@ def look(
         shadow = light.behind(scene, sampler, integrator.posed, ray, rays.active)
         behind *= spectrum.reflectance(shadow, ray.wavelengths)
     return State(seen, rays.gains, behind, valid, list(aovs), *inner)
+
+
+def lay_over(
+    integrator: Any, total: March, rays: Rays, behind: Any, ray: mi.Ray3f
+) -> Any:
+    """Lay fields over what is behind them, as a spectrum; differentiable."""
+    passed = 1 - total.opacity
+    if behind is not None:
+        return spectrum.emission(total.radiance, ray.wavelengths) + passed * behind
+    sky = background(integrator.volumes, rays.direction) & (rays.t_max == dr.inf)
+    return spectrum.emission(total.radiance + passed * sky, ray.wavelengths)

@@ -26,6 +26,7 @@ class NGPFieldVolume(AbstractFieldVolume):
        - |transform|
        - Rotation, translation and uniform scale, field to world, metres.
          (Default: identity)
+       - |exposed|, |differentiable|
 
      * - quantity
        - |string|
@@ -77,8 +78,10 @@ class NGPFieldVolume(AbstractFieldVolume):
 
             {"type": "ngp_field", "filename": "field.safetensors"}
 
-    Not differentiable: the pose. Media step by the largest density, an estimate (see
-    ``NGPField.density_bound``): ``density_limit`` makes it sharp and small.
+    A new ``to_world`` moves the field, except in media. Derivatives by it are in
+    backward mode alone, and leave out the faces of the field's box. Media step by the
+    largest density, an estimate (see ``NGPField.density_bound``): ``density_limit``
+    makes it sharp and small.
     """
 
     kind = "ngp_field"

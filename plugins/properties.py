@@ -82,6 +82,7 @@ def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
     The sky turns with the field.
     """
     for volume in volumes:
-        if volume.field.kind == "ngp_field":
+        field = getattr(volume, "field", None)  # splats have none
+        if field is not None and field.kind == "ngp_field":
             return volume.posed.background(direction)
     return mi.Color3f(0)

@@ -49,14 +49,18 @@ class AbstractLoop(ABC):
         torch.set_num_threads(1)  # as the commands do: more would wait spinning
         self.policy, self.width, self.height = policy, width, height
         self.scene = load_scene(width, height)
-        self.texture: Any = None
+        self.leaf: Any = None
 
     @abstractmethod
     def value(self, frames: int) -> Any:
-        """Drive and return the cost, attached to `self.texture`, a fresh leaf."""
+        """Drive and return the cost, attached to `self.leaf`, which is fresh."""
+
+    @abstractmethod
+    def by_colour(self) -> np.ndarray:
+        """Return the last gradient by the colours of the hydrant, (n, 3)."""
 
     def gradient(self, frames: int) -> dict[str, float]:
-        """Drive and differentiate the cost by the hydrant's texture.
+        """Drive and differentiate the cost by the leaf.
 
         Returns:
             ``seconds`` and ``cpu_seconds``, and the cost as ``loss``.
@@ -64,13 +68,13 @@ class AbstractLoop(ABC):
         clock = Clock()
         value = self.value(frames)
         dr.backward(value)
-        dr.eval(dr.grad(self.texture))
+        dr.eval(dr.grad(self.leaf))
         dr.sync_thread()
         return clock.per_step(1) | {"loss": float(dr.detach(value)[0])}
 
     def write(self, path: str) -> None:
-        """Write the last gradient, (n_vertices, 3), as a file of NumPy's."""
-        np.save(Path(path), dr.grad(self.texture).numpy())
+        """Write :meth:`by_colour` as a file of NumPy's."""
+        np.save(Path(path), self.by_colour())
 
     def memory(self) -> dict[str, float]:
         """Return the largest resident size of the process so far, in MB."""
@@ -103,8 +107,15 @@ class RolloutLoop(AbstractLoop):
     def value(self, frames: int) -> Any:
         """See :meth:`AbstractLoop.value`."""
         rollout = Rollout(self.loop, StageSum(cost), frames, adjoint=self.adjoint)
-        self.texture = _leaf(self.sensor.textures()[0])
-        return rollout([self.texture], self.loop.initial(np.array([START])))
+        self.leaf = _leaf(self.sensor.textures()[0])
+        return rollout([self.leaf], self.loop.initial(np.array([START])))
+
+    def by_colour(self) -> np.ndarray:
+        """See :meth:`AbstractLoop.by_colour`."""
+        field: Any = self.sensor.objects[0].field
+        finest = dr.grad(self.leaf).numpy()[field.levels()[-1].vertices]
+        colour = field.colours.value.numpy()
+        return finest / (colour * (1 - colour))  # texture = logit(colour)
 
     def _network(self, features: Any) -> Any:
         """Return controls (1, n) of features (3 height width, n), colour by colour."""
@@ -134,7 +145,7 @@ class PlainLoop(AbstractLoop):
     def __init__(self, policy: str, width: int, height: int) -> None:
         super().__init__(policy, width, height)
         self.parameters = mi.traverse(self.scene)
-        self.key = f"fields.{HYDRANT}.texture"
+        self.key = f"fields.{HYDRANT}.colour"
         self.rule = TorchRule()
         to_torch = dr.wrap(source="drjit", target="torch")
         in_torch = policy == "torch"
@@ -142,8 +153,8 @@ class PlainLoop(AbstractLoop):
 
     def value(self, frames: int) -> Any:
         """See :meth:`AbstractLoop.value`."""
-        self.texture = _leaf(self.parameters[self.key])
-        self.parameters[self.key] = self.texture
+        self.leaf = _leaf(self.parameters[self.key])
+        self.parameters[self.key] = self.leaf
         self.parameters.update()
         state: Any = mi.Vector3d(*START)
         dr.make_opaque(state)
@@ -172,9 +183,13 @@ class PlainLoop(AbstractLoop):
         pixels = dr.reshape(type(image), image, (-1, 3))
         return drjit_rule(dr.mean(pixels, axis=1)[:, None], self.width)
 
+    def by_colour(self) -> np.ndarray:
+        """See :meth:`AbstractLoop.by_colour`."""
+        return dr.grad(self.leaf).numpy()
 
-def _leaf(texture: Any) -> Any:
-    """Return a copy of a texture that collects a gradient."""
-    leaf = type(texture)(dr.detach(texture))
+
+def _leaf(parameter: Any) -> Any:
+    """Return a copy of a parameter that collects a gradient."""
+    leaf = type(parameter)(dr.detach(parameter))
     dr.enable_grad(leaf)
     return leaf

@@ -18,7 +18,6 @@ network = policy.PilotNet.load(scenes.bundled("policy/pilotnet.safetensors"))
 driver, start = policy.TorchPolicy(network), route.pose_at(6.0)
 
 scene = mi.load_file(str(here / "surrogate.xml"), parallel=False)
-params = mi.traverse(scene)
 sensor = attack.surrogate_sensor(scene, place.mount, names)
 car = vehicle.Dubins(route.speed_ms, place.car.max_control)
 parts = sensor, driver, route.goal, car, vehicle.RK4(), place.period
@@ -35,11 +34,11 @@ def error_path_traced():
     return deploy.drive(world, driver, route, start, 0, horizon).distance_m.mean()
 
 
-keys = [f"fields.{name}.texture" for name in names]
-textures = mi.ad.Adam(lr=0.05, params={key: params[key] for key in keys})
+given = dict(zip(names, sensor.textures(), strict=True))
+textures = mi.ad.Adam(lr=0.05, params=given)
 before, costs = error_path_traced(), []
 for _ in range(iterations + 1):
-    value = drive([textures[key] for key in keys], loop.initial(start))
+    value = drive([textures[name] for name in names], loop.initial(start))
     costs.append(-value[0] / horizon)
     print(f"surrogate, step {len(costs) - 1}: mean error {costs[-1]:.3f} m")
     dr.backward(value)

@@ -38,6 +38,6 @@ scene = mi.load_dict(
     },
     parallel=False,
 )
-image = mi.render(scene, spp=8)[..., :3]
+image = mi.render(scene, spp=8)
 mi.util.write_bitmap("hydrant.png", image, write_async=False)
 print("hydrant.safetensors, hydrant.png")

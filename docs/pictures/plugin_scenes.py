@@ -43,7 +43,12 @@ def field(kind: str, name: str, **properties: object) -> Description:
 
 def camera(eye: list[float], target: list[float], **lens: object) -> Description:
     """Describe a camera that looks from one point at another."""
-    film = {"type": "hdrfilm", "width": WIDTH_PX, "height": HEIGHT_PX}
+    film = {
+        "type": "hdrfilm",
+        "width": WIDTH_PX,
+        "height": HEIGHT_PX,
+        "pixel_format": "rgba",
+    }
     return {
         "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 0, 1]),
         "film": film | {"rfilter": {"type": "box"}},

@@ -38,8 +38,7 @@ def surrogate_sensor(
         scene: metric, z up; one `perspective` or `opencv_camera`.
         mount: pose of the camera on the vehicle.
         attacked: ids of the `grid_field`s with textures to change, in the order of the
-            sensor's textures, which `mi.traverse` calls ``<id>.texture``; None for all
-            but one called ``scene``.
+            sensor's textures; None for all but one called ``scene``.
         seed: of jitter and of the nested integrator's samples, renewed each step and
             replayed by derivatives.
 

@@ -90,11 +90,13 @@ class VertexColours:
             )
         if value is not self.value:
             mi.set_property(self.value, value)
-        change = _logit(flat) - self._raw
         index = dr.arange(mi.UInt32, dr.width(self._texture))
         finest = index >= 3 * self._start
-        change = dr.gather(mi.Float, change, index - 3 * self._start, finest)
-        return self._texture + dr.select(finest, change, 0)
+        place = index - 3 * self._start
+        # Gathered first, so that the derivatives of many images add up in place.
+        colour = dr.select(finest, dr.gather(mi.Float, flat, place, finest), 0.5)
+        start = dr.gather(mi.Float, self._raw, place, finest)
+        return self._texture + (_logit(colour) - start)
 
     def gradient(self, by_texture: mi.TensorXf) -> mi.TensorXf:
         """Return the colours' gradient (n, 3) from the texture's (n_vertices, 3)."""

@@ -86,7 +86,13 @@ class PosedField:
         self._columns = [mi.Vector3f(*map(float, rotation[:, i])) for i in range(3)]
         self._origin = mi.Point3f(*map(float, placed.translation))
         dr.make_opaque(self._columns, self._origin)
-        self.live[:] = [*self._columns, self._origin, self._inverse_scale, self._step]
+        self.live[:] = [
+            *self._columns,
+            self._origin,
+            self._inverse_scale,
+            self._step,
+            self._cone,
+        ]
 
     def with_gain(self, gain: mi.Color3f) -> PosedField:
         """Return this field with its radiance multiplied, ray by ray.

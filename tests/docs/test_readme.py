@@ -67,6 +67,8 @@ def test_the_xml_shows_both_fields(monkeypatch):
     xml = block("xml")
     assert len(xml.splitlines()) == 8
     text = f'<scene version="3.0.0">{xml}{SENSOR}</scene>'
+    aovs = '<boolean name="aovs" value="true"/>'
+    text = text.replace("</integrator>", f"{aovs}</integrator>")
     scene = mi.load_string(text, parallel=False)
     image = np.array(mi.render(scene, spp=4))
     names = ["R", "G", "B", *scene.integrator().aov_names()]

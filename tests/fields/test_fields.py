@@ -152,8 +152,10 @@ def test_grid_refuses_wrong_parameters() -> None:
     field = GridField(GridLayout(1, 3, 3), -small.ONES, small.ONES)
     with pytest.raises(ValueError, match=r"texture: shape \(5, 3\); expected"):
         field.set_parameter("texture", np.zeros((5, 3), np.float32))
-    with pytest.raises(KeyError, match="colour: a grid field has"):
-        field.set_parameter("colour", np.zeros(1, np.float32))
+    with pytest.raises(ValueError, match=r"colour: shape \(26, 3\); expected"):
+        field.set_parameter("colour", mi.TensorXf(0.5, (26, 3)))
+    with pytest.raises(KeyError, match="hue: a grid field has"):
+        field.set_parameter("hue", np.zeros(1, np.float32))
 
 
 # NGP

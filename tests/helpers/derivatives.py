@@ -27,6 +27,8 @@ def central_difference(f: Callable[[float], float], step: float) -> float:
 class Derivatives:
     """Three ways to differentiate a random projection of an output.
 
+    Steps of colours are in units of c (1 - c), which keep them between 0 and 1.
+
     Args:
         params: of the object, from `mi.traverse`.
         key: the parameter.
@@ -38,6 +40,7 @@ class Derivatives:
     def __init__(self, params: Any, key: str, output: Output, seed: int = 0) -> None:
         self.params, self.key, self.output = params, key, output
         self.base = params[key].numpy().copy()
+        self.unit = self.base * (1 - self.base) if key.endswith("colour") else 1
         size = output().numpy().size
         rng = np.random.default_rng(seed)
         self.weight = rng.uniform(0.1, 1, size).astype(np.float32)
@@ -53,7 +56,7 @@ class Derivatives:
 
     def value(self, direction: np.ndarray, s: float) -> float:
         """Return the projection after a step along a direction."""
-        self._set(self.base + s * direction.reshape(self.base.shape))
+        self._set(self.base + s * self.unit * direction.reshape(self.base.shape))
         self.params.update()
         return total(self.output(), self.weight)
 
@@ -70,16 +73,17 @@ class Derivatives:
         found = self.output()
         weight = type(found)(self.weight.reshape(found.numpy().shape))
         dr.backward(dr.sum(found * weight, axis=None))
-        result = dr.grad(self.params[self.key]).numpy().astype(float).ravel()
+        result = dr.grad(self.params[self.key]).numpy().astype(float) * self.unit
         self._reset()
-        return result
+        return result.ravel()
 
     def tangent(self, direction: np.ndarray) -> float:
         """Return the directional derivative in forward mode."""
         attached = self._set(self.base)
         dr.enable_grad(attached)
         self.params.update()
-        shaped = direction.reshape(self.base.shape).astype(self.base.dtype)
+        shaped = self.unit * direction.reshape(self.base.shape)
+        shaped = shaped.astype(self.base.dtype)
         dr.set_grad(self.params[self.key], type(attached)(shaped))
         dr.forward_from(self.params[self.key], dr.ADFlag.ClearEdges)
         found = self.output()

@@ -65,15 +65,25 @@ def write_lens(folder: Path) -> Path:
     return write_scene(folder, PATH + camera + BALLS)
 
 
-def write_slab(folder: Path, film: str = BOX, fov: float = 5) -> Path:
-    """Write a homogeneous box [-1, 1]^3 in front of the camera."""
+def write_slab(
+    folder: Path, film: str = BOX, fov: float = 5, inside: str = "", more: str = ""
+) -> Path:
+    """Write a homogeneous box [-1, 1]^3 in front of the camera.
+
+    Args:
+        folder: where.
+        film: what the film nests.
+        fov: of the camera, degrees.
+        inside: what the integrator nests, too.
+        more: what the scene has, too.
+    """
     save_field(folder / "box.safetensors", small.homogeneous(DENSITY, RAW_COLOUR))
     integrator = (
         '<integrator type="field_integrator"><float name="stop" value="0"/>'
         '<volume type="grid_field" id="box"><string name="filename" '
-        'value="box.safetensors"/></volume></integrator>'
+        f'value="box.safetensors"/></volume>{inside}</integrator>'
     )
-    return write_scene(folder, integrator + sensor(film, fov=fov))
+    return write_scene(folder, integrator + sensor(film, fov=fov) + more)
 
 
 def opengl_pose(eye: np.ndarray) -> np.ndarray:

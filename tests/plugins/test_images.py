@@ -44,9 +44,9 @@ def scene(integrator: str, world: str = "", eye: str = OUTSIDE) -> mi.Scene:
 
 
 def fields(inside: str) -> str:
-    """Write a field_integrator as XML; stop 0 makes it exact."""
-    stop = '<float name="stop" value="0"/>'
-    return f'<integrator type="field_integrator">{stop}{inside}</integrator>'
+    """Write a field_integrator with AOVs as XML; stop 0 makes it exact."""
+    more = '<float name="stop" value="0"/><boolean name="aovs" value="true"/>'
+    return f'<integrator type="field_integrator">{more}{inside}</integrator>'
 
 
 def emitter(inside: str) -> str:

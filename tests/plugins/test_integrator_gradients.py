@@ -10,45 +10,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import small_fields as small
+from helpers.blob_scene import T, load, write_blob
 from helpers.derivatives import central_difference
-
-from mi_nerfattack.fields import save_field
-
-
-def T() -> Any:
-    return mi.ScalarTransform4f()
-
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture
 def blob(tmp_path: Path, rng: np.random.Generator) -> dict[str, Any]:
-    """A soft blob in [-1, 1]^3 as a volume."""
-    save_field(tmp_path / "blob.safetensors", small.blob(rng, step_m=0.05))
-    return {
-        "type": "grid_field",
-        "id": "blob",
-        "filename": str(tmp_path / "blob.safetensors"),
-    }
-
-
-def load(nested: dict[str, Any], more: dict[str, Any] | None = None) -> mi.Scene:
-    """Load a scene with fields before a camera of 12 x 8 pixels."""
-    view = T().look_at([-3.0, 0.2, 0.6], [0, 0, 0], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
-    sensor = {
-        "type": "perspective",
-        "id": "camera",
-        "fov": 50,
-        "to_world": view,
-        "film": {**film, "pixel_format": "rgb"},
-        "sampler": {"type": "independent", "sample_count": 4},
-    }
-    integrator = {"type": "field_integrator", "id": "fields", "stop": 0.0, **nested}
-    scene = {"type": "scene", "i": integrator, "camera": sensor, **(more or {})}
-    return mi.load_dict(scene, parallel=False)
+    return write_blob(tmp_path, rng)
 
 
 class Case:
@@ -315,8 +285,9 @@ def test_forward_mode_in_every_habit(blob, habit, name) -> None:
     assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_forward_mode_by_the_pose_is_refused(blob) -> None:
-    scene, key = load({"a": blob}), "fields.blob.to_world"
+@pytest.mark.parametrize("key", ["fields.blob.to_world", "camera.to_world"])
+def test_forward_mode_by_the_pose_is_refused(blob, key) -> None:
+    scene = load({"a": blob})
     params = mi.traverse(scene)
     number = mi.Float(0)
     dr.enable_grad(number)

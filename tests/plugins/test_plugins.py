@@ -104,8 +104,11 @@ def test_integrator_loads_from_xml_and_dict(paths) -> None:
         assert str(loaded) == (
             "FieldIntegrator[fields=(scene, object), InterleavedComposite, stop=1e-06]"
         )
-        layers = [f"{name}.{c}" for name in ("scene", "object") for c in "RGBAZ"]
-        assert loaded.aov_names() == ["opacity", "depth", *layers]
+        assert loaded.aov_names() == []
+    aovs = '<boolean name="aovs" value="true"/>'
+    layers = [f"{name}.{c}" for name in ("scene", "object") for c in "RGBAZ"]
+    loaded = load(nesting("field_integrator", aovs + both))
+    assert loaded.aov_names() == ["opacity", "depth", *layers]
 
 
 def test_relative_names_follow_mitsubas_file_resolver(grid: Path) -> None:
@@ -120,7 +123,8 @@ def test_parameters_show_under_the_id_and_are_differentiable(paths) -> None:
     loaded = load(nesting("field_integrator", both))
     params = mi.traverse(loaded)
     names = ("table", "density_weights", "colour_weights", "sky")
-    expected = {"object.texture", "object.density", *[f"scene.{n}" for n in names]}
+    expected = {"object.colour", "object.density", *[f"scene.{n}" for n in names]}
+    expected |= {"object.to_world", "scene.to_world"}
     assert set(params.keys()) == expected
     for name in params.keys():  # noqa: SIM118  not a dict
         assert not params.flags(name) & mi.ParamFlags.NonDifferentiable.value
@@ -255,7 +259,8 @@ def test_a_density_given_back_changes_nothing() -> None:
     name = bundled("hydrant/field.safetensors")
     camera = '<lookat origin="-2, 0.3, 0.6" target="0, 0, 0.375" up="0, 0, 1"/>'
     scene = load(
-        f"""<scene ><integrator type="field_integrator">{volume(name)}</integrator>
+        f"""<scene ><integrator type="field_integrator">
+        <boolean name="aovs" value="true"/>{volume(name)}</integrator>
         <sensor type="perspective"><float name="fov" value="35"/>
         <transform name="to_world">{camera}</transform>
         <film type="hdrfilm"><integer name="width" value="32"/>

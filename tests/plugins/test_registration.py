@@ -69,8 +69,8 @@ importlib.reload(mi_nerfattack.plugins)
 use()
 """,
 }
-RGB, MONO = "llvm_ad_rgb 10", "llvm_ad_mono 8"
-SPECTRAL = "llvm_ad_spectral 10"
+RGB, MONO = "llvm_ad_rgb 3", "llvm_ad_mono 1"
+SPECTRAL = "llvm_ad_spectral 3"
 PRINTED = {"through every variant": [RGB, MONO, SPECTRAL, RGB, RGB]}
 REFUSED = [
     name

@@ -91,7 +91,7 @@ def test_gradients_of_the_stock_sensor(variant: str, tmp_path: Path) -> None:
     volume = {"type": "grid_field", "filename": str(path)}
     integrators = {
         "ball.bsdf.reflectance.color0.value": INTEGRATORS["prb"],
-        "integrator.box.texture": {"type": "field_integrator", "box": volume},
+        "integrator.box.colour": {"type": "field_integrator", "box": volume},
     }
     for key, integrator in integrators.items():
         gradients = []

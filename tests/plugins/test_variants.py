@@ -110,9 +110,14 @@ def problem(loaded: mi.Scene, name: str, spp: int = 2) -> Derivatives:
 
 
 def directions(rng: np.random.Generator, field: GridField, shape) -> list[np.ndarray]:
-    """Make a rough and a smooth random direction for a parameter of a grid."""
-    slope = rng.normal(0, 1, (3, int(np.prod(shape)) // field.n_vertices))
-    smooth = rng.normal(0, 1, slope.shape[1]) + small.vertices(field) @ slope
+    """Make a rough and a smooth random direction for a parameter of a grid.
+
+    Colours have the vertices of the finest level, which come last.
+    """
+    place = small.vertices(field)
+    place = place[field.levels()[-1].vertices] if len(shape) == 2 else place
+    slope = rng.normal(0, 1, (3, int(np.prod(shape)) // len(place)))
+    smooth = rng.normal(0, 1, slope.shape[1]) + place @ slope
     return [rng.normal(0, 1, shape), smooth.reshape(shape) / np.abs(smooth).max()]
 
 
@@ -157,11 +162,11 @@ def evaluated(loaded: mi.Volume, method: str, it: mi.Interaction3f) -> Any:
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [(name, method) for name in ("texture", "density") for method in ("eval", "eval_1")]
-    + [("texture", "eval_3")],  # radiance does not depend on density
+    [(name, method) for name in ("colour", "density") for method in ("eval", "eval_1")]
+    + [("colour", "eval_3")],  # radiance does not depend on density
 )
 def test_grid_field(grid: str, rng, method: str, name: str) -> None:
-    quantity = "radiance" if name == "texture" else "density"
+    quantity = "radiance" if name == "colour" else "density"
     loaded = mi.load_dict(volume(grid, quantity=quantity))
     params, it = mi.traverse(loaded), interactions(rng)
     found = Derivatives(params, name, evaluated(loaded, method, it))
@@ -198,7 +203,7 @@ def test_spectra_of_volumes_are_those_of_their_colours(grid: str, rng) -> None:
 
 
 @pytest.mark.parametrize("composite", ["interleaved", "depth"])
-@pytest.mark.parametrize("name", ["texture", "density"])
+@pytest.mark.parametrize("name", ["colour", "density"])
 def test_field_integrator(grid: str, rng, name: str, composite: str) -> None:
     loaded = scene(integrator(object=volume(grid), composite=composite))
     found = problem(loaded, name)
@@ -213,7 +218,7 @@ def test_field_integrator_with_an_ngp(ngp: str, rng, name: str) -> None:
 
 def test_field_integrator_over_a_nested_integrator(grid: str, rng) -> None:
     light = {"type": "constant"}
-    nested = integrator(object=volume(grid), behind={"type": "path"})
+    nested = integrator(object=volume(grid), behind={"type": "prb"})
     loaded = scene(nested, light=light)
     found = problem(loaded, "density", 16)
     found.check(directions(rng, field_of(loaded), found.base.shape))
@@ -243,7 +248,7 @@ def test_path_shows_what_the_integrator_shows(tmp_path, rng, eye) -> None:
 )
 def test_field_emitter(grid: str, rng, seeing: str, eye) -> None:
     fields = emitter(object=volume(grid))
-    found = problem(scene({"type": seeing}, eye, (0, 0, -0.4), **fields), "texture", 4)
+    found = problem(scene({"type": seeing}, eye, (0, 0, -0.4), **fields), "colour", 4)
     rough = rng.normal(0, 1, found.base.shape)
     gradient = found.gradient() @ rough.ravel()
     assert gradient == pytest.approx(found.difference(rough, 0.05), rel=1e-3)
@@ -277,9 +282,9 @@ def test_field_emitter_of_an_ngp(ngp: str, rng, name: str) -> None:
 @IN_RGB
 def test_opacity_one(tmp_path: Path, rng) -> None:
     name = write(tmp_path / "box.safetensors", small.homogeneous(1e4))
-    loaded = scene(integrator(object=volume(name)))
+    loaded = scene(integrator(object=volume(name), aovs=True))
     assert np.array(mi.render(loaded, spp=1))[..., -2].max() > 1 - 1e-6
-    found = problem(loaded, "texture")
+    found = problem(loaded, "colour")
     found.check(directions(rng, field_of(loaded), found.base.shape))
     opaque = problem(loaded, "density")
     # Nothing passes: more density changes no colour, as all have the same.
@@ -291,9 +296,9 @@ def test_opacity_zero(tmp_path: Path, rng) -> None:
     field = small.blob(rng, step_m=0.1)
     field.set_parameter("density", np.full(field.n_vertices, -60, np.float32))
     name = write(tmp_path / "clear.safetensors", field)
-    loaded = scene(integrator(object=volume(name)))
+    loaded = scene(integrator(object=volume(name), aovs=True))
     assert not np.array(mi.render(loaded, spp=1))[..., [0, -2]].any()
-    for parameter in ("texture", "density"):
+    for parameter in ("colour", "density"):
         found = problem(loaded, parameter)
         found.check_zero(rng.normal(0, 1, found.base.shape))
 
@@ -306,7 +311,7 @@ def test_opacity_zero(tmp_path: Path, rng) -> None:
 )
 def test_objects_out_of_view(grid: str, rng, eye, target) -> None:
     loaded = scene(integrator(object=volume(grid)), eye, target)
-    for parameter in ("texture", "density"):
+    for parameter in ("colour", "density"):
         found = problem(loaded, parameter)
         found.check_zero(rng.normal(0, 1, found.base.shape))
 
@@ -318,7 +323,7 @@ def test_emitter_at_the_ends_of_opacity(tmp_path: Path, rng, density: float) -> 
     raw = np.full(field.n_vertices, density / field.layout.levels)
     field.set_parameter("density", raw.astype(np.float32))
     name = write(tmp_path / "box.safetensors", field)
-    found = problem(scene(DIRECT, (3, 2, 1), **emitter(object=volume(name))), "texture")
+    found = problem(scene(DIRECT, (3, 2, 1), **emitter(object=volume(name))), "colour")
     direction = rng.normal(0, 1, found.base.shape)
     if density > 0:
         found.check([direction])
@@ -333,7 +338,7 @@ def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
     it = interactions(rng)
     it.p += mi.Vector3f(2, 0, 0)
     output = evaluated(loaded, method, it)
-    found = Derivatives(mi.traverse(loaded), "texture", output)
+    found = Derivatives(mi.traverse(loaded), "colour", output)
     found.check_zero(rng.normal(0, 1, found.base.shape))
 
 
@@ -344,11 +349,11 @@ def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
 def test_touching_objects(grid: str, rng, composite: str) -> None:
     beside = mi.ScalarTransform4f().translate([0, 2, 0])
     one, two = volume(grid), volume(grid, to_world=beside)
-    seeing = integrator(one=one, two=two, composite=composite)
+    seeing = integrator(one=one, two=two, composite=composite, aovs=True)
     loaded = scene(seeing, (2.5, 3.5, 0.6), (0, 0.9, 0))
     image = np.array(mi.render(loaded, spp=4))
     assert ((image[..., -1] < np.inf) & (image[..., -6] < np.inf)).any()
-    for name in ("one.texture", "two.density"):
+    for name in ("one.colour", "two.density"):
         found = problem(loaded, name)
         found.check(directions(rng, field_of(loaded), found.base.shape))
 

@@ -184,6 +184,7 @@ def test_field_and_window_of_mesh(tmp_path: Path, x: float) -> None:
             "integrator": {
                 "type": "field_integrator",
                 "stop": 0.0,
+                "aovs": True,
                 "box": volume,
                 "behind": {"type": "path", "max_depth": 2},
             },
@@ -250,7 +251,12 @@ def test_rays_that_leave_the_box_see_the_sky(tmp_path: Path, angle: float) -> No
     scene = mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "field_integrator", "stop": 0.0, "ngp": volume},
+            "integrator": {
+                "type": "field_integrator",
+                "stop": 0.0,
+                "aovs": True,
+                "ngp": volume,
+            },
             "sensor": sensor(100.0),
         },
         parallel=False,

@@ -42,6 +42,7 @@ def scene(paths: dict[str, str], shift: float, **more: Any) -> Any:
     integrator = {
         "type": "field_integrator",
         "composite": "depth",
+        "aovs": True,
         "street": {
             "type": "splat_background",
             "filename": paths["wall.ply"],
@@ -96,7 +97,7 @@ def test_surfaces_end_the_march(paths) -> None:
 def test_a_texture_in_front_of_splats_has_a_gradient(paths) -> None:
     world = scene(paths, 0.0)
     params = mi.traverse(world)
-    (key,) = [key for key in params.keys() if key.endswith("texture")]
+    (key,) = [key for key in params.keys() if key.endswith("colour")]
     dr.enable_grad(params[key])
     params.update()
     image = mi.render(world, params, spp=1)

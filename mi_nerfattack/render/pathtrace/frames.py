@@ -63,6 +63,7 @@ class Frame:
 class FrameRenderer:
     """Renders one sensor of a scene, from its own pose or from others.
 
+    A `field_integrator` renders its AOVs, too, unless the file sets ``aovs`` to false.
     After the first frame no kernel is compiled, whatever the poses and seeds. Not
     differentiable.
 
@@ -91,7 +92,7 @@ class FrameRenderer:
         if spp is not None and spp < 1:
             raise InputError(f"spp: {spp}; at least 1")
         self.path: Path = Path(path)
-        self.scene = load_scene(path, parameters, size_px)
+        self.scene = load_scene(path, parameters, size_px, layers=True)
         self.sensor = _pick_sensor(path, self.scene, sensor)
         if self.scene.integrator() is None:
             raise InputError(f"{path}: has no integrator; add one, for instance path")
@@ -288,7 +289,8 @@ def _mean(passes: list[np.ndarray], names: list[str]) -> np.ndarray:
     stack = np.stack(passes).astype(np.float64)
     result = stack.mean(axis=0)
     for i, name in enumerate(names):
-        opacity = name[:-1] + "A"
+        of_all = name == "Z" and "opacity" in names  # where A is the film's alpha
+        opacity = "opacity" if of_all else name[:-1] + "A"
         if name.rpartition(".")[2] != "Z" or opacity not in names:
             continue
         weight = stack[..., names.index(opacity)]

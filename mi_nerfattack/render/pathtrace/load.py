@@ -24,6 +24,7 @@ def load_scene(
     parameters: Mapping[str, str] | None = None,
     size_px: tuple[int, int] | None = None,
     shapes: Mapping[str, Any] | None = None,
+    layers: bool = False,
 ) -> Any:
     """Load a Mitsuba scene in the active variant.
 
@@ -33,6 +34,8 @@ def load_scene(
         size_px: width and height of all films, as if the file gave them; None keeps
             the file's.
         shapes: `mi.Shape` by name that the scene gets besides its own.
+        layers: let a `field_integrator` that is the scene's render its AOVs, unless
+            the file sets ``aovs``.
 
     Returns:
         `mi.Scene`.
@@ -48,6 +51,8 @@ def load_scene(
             _refuse_empty_bitmaps(path, state)
             if size_px is not None:
                 _resize_films(path, state, size_px)
+            if layers:
+                _add_layers(state)
             config.merge_meshes = not _has_rectangles(state)
             for name, shape in (shapes or {}).items():
                 state.nodes[0].props[name] = shape
@@ -127,6 +132,16 @@ def _resize_films(path: str | Path, state: Any, size_px: tuple[int, int]) -> Non
                 "remove crop_* from it, or give no size"
             )
         node.props["width"], node.props["height"] = size_px
+
+
+def _add_layers(state: Any) -> None:
+    scene = state.nodes[0].props
+    for item in (scene[key] for key in scene):
+        if not isinstance(item, mi.Properties.ResolvedReference):
+            continue
+        props = state.nodes[item.index()].props
+        if props.plugin_name() == "field_integrator" and "aovs" not in props:
+            props["aovs"] = True
 
 
 @contextmanager

@@ -349,12 +349,12 @@ def problem(folder: Path, rng, name: str, composite: str) -> Derivatives:
 @pytest.mark.slow
 @pytest.mark.parametrize("each_variant", [*RGB, *SPECTRAL, *MONO], indirect=True)
 def test_gradients_in_every_variant(each_variant, tmp_path: Path, rng) -> None:
-    found = problem(tmp_path, rng, "object.texture", "interleaved")
+    found = problem(tmp_path, rng, "object.colour", "interleaved")
     found.check([rng.normal(0, 1, found.base.shape)])
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("name", ["other.texture", *later("object.texture")])
+@pytest.mark.parametrize("name", ["other.colour", *later("object.colour")])
 def test_gradients_of_the_depth_composite(tmp_path: Path, rng, name: str) -> None:
     found = problem(tmp_path, rng, name, "depth")
     found.check([rng.normal(0, 1, found.base.shape)])
@@ -375,7 +375,7 @@ def test_gradients_include_the_light(box: str) -> None:
     for radiance in (1.0, 2.0):
         loaded = scene({"object": volume(box)}, light=sky(radiance))
         params = mi.traverse(loaded)
-        key = "i.object.texture"
+        key = "i.object.colour"
         found = Derivatives(params, key, images(loaded, params))
         gradients.append(found.gradient())
     assert np.abs(gradients[0]).max() > 0

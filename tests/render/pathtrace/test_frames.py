@@ -19,6 +19,7 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount
 from mi_nerfattack.render.pathtrace import frames as film
 from mi_nerfattack.render.pathtrace.frames import FrameRenderer, write_frame
+from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.vehicle.route.route import Route
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -247,7 +248,7 @@ def test_many_samples_are_the_mean_of_passes(tmp_path, monkeypatch):
     frame = renderer.render(seed=2)
     assert frame.metadata["spp"] == "12"  # three passes of four
     seeds = [int(s) for s in np.random.SeedSequence(2).generate_state(3)]
-    scene = mi.load_file(str(path), parallel=False)
+    scene = load_scene(path, layers=True)
     images = [np.array(mi.render(scene, spp=4, seed=s)) for s in seeds]
     for i, name in enumerate("RGBA"):
         expected = np.mean([image[..., i] for image in images], axis=0)
@@ -259,6 +260,33 @@ def test_many_samples_are_the_mean_of_passes(tmp_path, monkeypatch):
     depth = np.mean(moments, axis=0)[seen] / opacity[seen]
     np.testing.assert_allclose(frame.channels["Z"][seen], depth, rtol=1e-5)
     assert np.isinf(frame.channels["Z"][~seen]).all()
+
+
+def test_depths_of_passes_count_by_the_opacity_of_fields(tmp_path, monkeypatch):
+    """Where the film's alpha is 1, since there is a sky behind."""
+    rgba = f'<string name="pixel_format" value="rgba"/>{scenes.BOX}'
+    behind = '<integrator type="path"/>', '<emitter type="constant"/>'
+    path = scenes.write_slab(tmp_path, rgba, 60, *behind)
+    monkeypatch.setattr(film, "_MAX_RAYS", 4 * scenes.WIDTH * scenes.HEIGHT)
+    channels = FrameRenderer(path, spp=10).render().channels
+    assert (channels["A"] == 1).all() and channels["opacity"].max() < 1
+    np.testing.assert_allclose(channels["Z"], channels["box.Z"], rtol=1e-5)
+
+
+def test_layers_are_left_out_where_the_scene_says_so(tmp_path):
+    off = '<boolean name="aovs" value="false"/>'
+    path = scenes.write_slab(tmp_path, inside=off)
+    assert "".join(FrameRenderer(path).render().channels) == "RGB"
+
+
+def test_fields_in_a_stock_integrator_have_no_layers(tmp_path):
+    inside = '<integrator type="aov"><string name="aovs" value="dd:depth"/>'
+    path = scenes.write_slab(tmp_path)
+    text = path.read_text().replace("<integrator", f"{inside}<integrator", 1)
+    path.write_text(text.replace("</integrator>", "</integrator></integrator>", 1))
+    frame = FrameRenderer(path, spp=4).render()
+    assert list(frame.channels) == [*"RGB", "dd.T"]
+    write_frame(tmp_path / "a.exr", frame, "half")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
