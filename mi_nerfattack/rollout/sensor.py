@@ -32,6 +32,10 @@ class Observation:
     rays: Rays | None = None
     ends: Ends | None = None
 
+    def __repr__(self) -> str:
+        count, height, width, _ = self.image.shape
+        return f"Observation({count} images {width}x{height})"
+
 
 class AbstractSensor(ABC):
     """Camera on a vehicle in some world."""
