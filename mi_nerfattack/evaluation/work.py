@@ -279,7 +279,7 @@ class Evaluation:
     def __repr__(self) -> str:
         environments, routes, _ = map(dict.fromkeys, zip(*self.drives, strict=True))
         count = sum(len(drives) for drives in self.drives.values())
-        where = f"{', '.join(environments)}; {len(routes)} routes"
+        where = f"{', '.join(environments)}; routes: {', '.join(routes)}"
         return f"Evaluation({count} drives: {where})"
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fields.window import Window
-from mi_nerfattack.notebook import picture
 
 
 class AbstractField(ABC):
@@ -48,9 +47,6 @@ class AbstractField(ABC):
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:.3g}" for side in self.upper - self.lower)
         return f"{type(self).__name__}({sides} m, step {self.step_m:.3g} m)"
-
-    def _repr_png_(self) -> bytes:
-        return picture(self)
 
     def occupy(self, occupancy: Occupancy) -> None:
         """Make the field empty outside the occupied cells of a grid over its box."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mi_nerfattack.fields.base import AbstractField
+from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.pathtrace.frames import Frame, to_srgb
 from mi_nerfattack.report.plots.around import Around, over_paper
 from mi_nerfattack.report.plots.charts import BLUE, GREEN, ORANGE, blank, png
@@ -28,7 +28,7 @@ def draw(thing: Any) -> bytes:
     """Draw an object as a PNG file.
 
     Args:
-        thing: a `Route`, a `Drive`, a `Trajectory`, a field or a `Frame`.
+        thing: a `Route`, a `Drive`, a `Trajectory`, a `GridField` or a `Frame`.
 
     Raises:
         TypeError: there is no picture of such an object.
@@ -79,8 +79,8 @@ def _trajectory(trajectory: Trajectory) -> bytes:
 
 
 @draw.register
-def _field(field: AbstractField) -> bytes:
-    """Render the field from four sides, over white."""
+def _field(field: GridField) -> bytes:
+    """Render the object from four sides, over white."""
     around = Around(field.lower, field.upper, _AZIMUTHS_DEG, _EDGE_PX)
     views = [over_paper(*view) for view in around.views(field)]
     return _encoded((255 * np.concatenate(views, axis=1)).round().astype(np.uint8))

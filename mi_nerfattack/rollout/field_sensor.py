@@ -106,7 +106,7 @@ class FieldSensor(AbstractDifferentiableSensor):
     def __repr__(self) -> str:
         camera, objects = self.camera, len(self.objects)
         size, name = f"{camera.width}x{camera.height}", type(self.composite).__name__
-        return f"FieldSensor({size}, {objects} objects, {name})"
+        return f"FieldSensor({size}, objects: {objects}, {name})"
 
     def showing(
         self, objects: list[PosedField], scene: Layer | None = None

@@ -126,7 +126,7 @@ class PreprocessSection(Section):
 class PlainGoal(Section):
     """No goal, or the one that the network declares."""
 
-    goal: Literal["none"] | None = None
+    goal: Literal["none", None] = None  # None: as declared_goal finds
 
     def build(self, module: torch.nn.Module) -> AbstractGoal:
         """Make what passes the goal to a network."""

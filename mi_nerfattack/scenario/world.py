@@ -84,7 +84,7 @@ class World:
 
     def __repr__(self) -> str:
         return (
-            f"World({self.route.name!r}, {len(self.fields)} objects, "
+            f"World({self.route.name!r}, objects: {len(self.fields)}, "
             f"{self.horizon} periods, {len(self.initial)} initial states, "
             f"{', '.join(self.labels)})"
         )

@@ -170,11 +170,14 @@ class _Log(_Display):
     """A line now and then, where standard error is a file."""
 
     def __init__(self) -> None:
-        self._lines = StageBars()
+        self._started = time.perf_counter()
+        self._lines = StageBars(self._started)
 
     def show(self, state: _State, over: bool) -> None:
         total = state.total or float("inf")
         self._lines.show(state.stage, state.done, total, state.text())
+        if over:
+            self._lines = StageBars(self._started)
 
 
 class ProgressBar:
