@@ -9,6 +9,10 @@ from .backend import variant as variant
 from .commands.evaluate import evaluate_policy as evaluate_policy
 from .commands.shared.progress import ProgressBar as ProgressBar
 from .commands.shared.progress import progress as progress
+from .deploy import Conditions as Conditions
+from .deploy import bundled_place as bundled_place
+from .deploy import drive as drive
+from .deploy import make_environment as make_environment
 from .errors import InputError as InputError
 from .errors import NerfAttackError as NerfAttackError
 from .errors import SetupError as SetupError
