@@ -70,7 +70,7 @@ class TestReadyBar:
         last = lines[0].split("\r")[-1]
         assert last.startswith(f"drive [{'#' * 24}] 3/3")
         assert "1/3" in lines[0] and " left" in lines[0]
-        assert f"[{'#' * 12}{'.' * 12}] 1/2  best 0.3 m" in lines[2]
+        assert f"[{'#' * 12}{'.' * 12}] 1/2  0:00  best 0.3 m" in lines[2]
         assert "PSNR 30.25 dB" in lines[-1]
 
     def test_it_updates_an_element_of_a_notebook(self, capsys, monkeypatch):
@@ -96,6 +96,19 @@ class TestReadyBar:
         assert 'value="1.0000"' in shown[0][-1]
         assert "&lt;attack&gt;" in shown[3][0]
         assert capsys.readouterr() == ("", "")
+
+    def test_it_tells_the_time_left_by_what_was_done_here(self, capsys, monkeypatch):
+        monkeypatch.setenv("TTY_COMPATIBLE", "1")
+        monkeypatch.setenv("COLUMNS", "60")
+        now = iter(np.arange(0, 1e3, 10.0))
+        monkeypatch.setattr(progress.time, "perf_counter", lambda: next(now))
+        bar = nf.progress()
+        for done in (100, 101, 102, 103):  # the first hundred were kept
+            bar("drives", done, 104, "kept " * 20)
+        _, *lines = capsys.readouterr().err.split("\r")
+        clocks = [line.split("  ")[1] for line in lines]
+        assert clocks == ["0:00", "0:30 left", "0:20 left", "0:10 left"]
+        assert all(len(line) == 59 for line in lines)
 
     def test_it_draws_at_most_five_times_a_second(self, capsys, monkeypatch):
         monkeypatch.setenv("TTY_COMPATIBLE", "1")

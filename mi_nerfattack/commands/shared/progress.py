@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import shutil
 import sys
 import time
 from abc import ABC, abstractmethod
@@ -98,12 +99,22 @@ class StageBars:
 
 @dataclass(frozen=True)
 class _State:
-    """How far a stage is: units done and of all, where that is known."""
+    """How far a stage is.
+
+    Attributes:
+        stage: its name.
+        done: units of work.
+        total: units of the whole stage, where that is known.
+        remark: what else was reported.
+        first: units that were done when the stage was first reported.
+        elapsed_s: since then.
+    """
 
     stage: str
     done: float
     total: float | None
     remark: str
+    first: float
     elapsed_s: float
 
     @property
@@ -111,17 +122,15 @@ class _State:
         return min(1.0, self.done / self.total) if self.total else 0.0
 
     def text(self) -> str:
-        """Return count, remark and time, without the stage."""
-        words = [self.remark]
+        """Return count, time and remark, without the stage."""
+        count = ""
         if not isinstance(self.done, float):
-            all_units = "" if self.total is None else f"/{self.total}"
-            words.insert(0, f"{self.done}{all_units}")
-        if 0 < self.share < 1:
-            left_s = self.elapsed_s * (1 / self.share - 1)
-            words.append(f"{_clock(left_s)} left")
-        else:
-            words.append(_clock(self.elapsed_s))
-        return "  ".join(filter(None, words))
+            count = str(self.done) + ("" if self.total is None else f"/{self.total}")
+        clock = _clock(self.elapsed_s)
+        if self.total is not None and self.first < self.done < self.total:
+            period_s = self.elapsed_s / (self.done - self.first)
+            clock = f"{_clock(period_s * (self.total - self.done))} left"
+        return "  ".join(filter(None, (count, clock, self.remark)))
 
 
 class _Display(ABC):
@@ -142,6 +151,7 @@ class _Terminal(_Display):
         full = round(_CELLS * state.share)
         bar = "#" * full + "." * (_CELLS - full)
         line = f"{state.stage} [{bar}] {state.text()}"
+        line = line[: shutil.get_terminal_size().columns - 1]  # or it would wrap
         end = "\n" if over else ""
         print(f"\r{line:{self._width}}", end=end, file=sys.stderr, flush=True)
         self._width = 0 if over else len(line)
@@ -206,7 +216,7 @@ class ProgressBar:
         self._display: _Display = kinds.get(True, _Log)()
         self._current: str | None = None
         self._steps = 0
-        self._start = self._shown = 0.0
+        self._first = self._start = self._shown = 0.0
 
     @overload
     def __call__(self, step: int, /) -> None: ...
@@ -234,12 +244,13 @@ class ProgressBar:
     def _show(self, stage: str, done: float, total: float | None, remark: str) -> None:
         now = time.perf_counter()
         if stage != self._current:
-            self._current, self._start, self._shown = stage, now, float("-inf")
+            self._current, self._first = stage, done
+            self._start, self._shown = now, float("-inf")
         self._steps = int(done)
         over = total is not None and done >= total
         if over or now - self._shown >= _EVERY_S:
             self._shown = now
-            state = _State(stage, done, total, remark, now - self._start)
+            state = _State(stage, done, total, remark, self._first, now - self._start)
             self._display.show(state, over)
         if over:
             self._current, self._steps = None, 0
