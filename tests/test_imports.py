@@ -15,9 +15,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "mi_nerfattack"
 # Each part imports only what stands to its left.
 ORDER = (
-    "errors ranges backend io system vehicle policy scenes fields render rollout "
-    "capture plugins attack deploy fit scenario evaluation training report experiment "
-    "robot commands cli bench"
+    "errors ranges notebook backend io system vehicle policy scenes fields render "
+    "rollout capture plugins attack deploy fit scenario evaluation training report "
+    "experiment robot commands cli bench"
 ).split()
 # Parts that can be used without torch; `vehicle` wraps it for its users.
 WITHOUT_TORCH = "errors io scenes fields render rollout capture plugins deploy".split()

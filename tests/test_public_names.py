@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import mi_nerfattack as nf
+
 ROOT = Path(__file__).parents[1]
 PARTS = sorted(
     path.parent.name
@@ -70,6 +72,18 @@ def test_all_public_names_resolve(part):
         assert not (folder / f"{name}.py").exists() and not (folder / name).exists()
     with pytest.raises(AttributeError, match="nothing"):
         _ = package.nothing
+
+
+def test_names_of_the_whole_package_resolve():
+    for name in nf.__all__:
+        assert getattr(nf, name) is not None
+        # a part of that name would hide it as soon as it is loaded
+        assert name not in (*PARTS, "cli", "errors", "notebook", "ranges")
+    script = {"ClosedLoop", "Rollout", "NoGoal", "bundled", "progress", "Run"}
+    assert script | {"attack_policy", "evaluate_policy"} <= set(nf.__all__)
+    assert import_module("mi_nerfattack.attack") is nf.attack  # a package
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = nf.nothing
 
 
 def test_rendering_loads_neither_policies_nor_other_worlds(tmp_path):

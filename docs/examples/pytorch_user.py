@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from mi_nerfattack import attack, policy, rollout, scenario, scenes
-from mi_nerfattack.policy.goals import IntegerGoal
 from mi_nerfattack.vehicle.state import state_type
 
 mi.set_variant("llvm_ad_rgb")
@@ -27,7 +26,7 @@ class Damped(nn.Module):
 
 
 described, _ = scenario.load_scenario(scenes.bundled("base.toml"))
-mine = policy.TorchPolicy(Damped(), IntegerGoal(3), recurrent=[(-1, 1)])
+mine = policy.TorchPolicy(Damped(), policy.IntegerGoal(3), recurrent=[(-1, 1)])
 world = scenario.build_world(described, mine)
 drives = rollout.Rollout(
     world.loop(world.surrogate),

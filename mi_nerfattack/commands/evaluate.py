@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -225,6 +226,61 @@ class Evaluate:
         # a server that keeps a state would mix the drives of several processes
         alone = "carla" in self.environments or isinstance(policy, HttpSection)
         return chosen_workers(self.workers, alone)
+
+
+def evaluate_policy(
+    policy: str | Path,
+    folder: str | Path,
+    *,
+    environments: tuple[str, ...] = Evaluate.environments,
+    routes: tuple[str, ...] = (),
+    runs: int = Evaluate.runs,
+    objects: tuple[int, ...] = Evaluate.objects,
+    seed: int = Evaluate.seed,
+    horizon: int = Evaluate.horizon,
+    spp: int = Evaluate.spp,
+    workers: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Evaluation:
+    """Drive a policy in the closed loop: ``mi-nerfattack evaluate``.
+
+    Args:
+        policy: a scenario (TOML), which is driven in its own scene, or what else the
+            command takes as a policy.
+        folder: of the drives; those that are finished are not repeated.
+        environments: names of environments.
+        routes: by name; all by default, of a scenario its own.
+        runs: drives of each environment, route and case.
+        objects: numbers of objects with random textures beside the road, a case each.
+        seed: of starts, places, textures and images.
+        horizon: most control periods of a drive.
+        spp: samples per pixel of path-traced images.
+        workers: processes that drive. A script that takes more than 1 needs
+            ``if __name__ == "__main__":``, as with `multiprocessing`.
+        progress: called with control periods done and in all, for example
+            `mi_nerfattack.progress(stage="driving")`.
+
+    Raises:
+        InputError: an argument or a file does not fit.
+    """
+    from mi_nerfattack import variant
+    from mi_nerfattack.evaluation.work import run_evaluation
+
+    variant.ensure()
+    command = Evaluate(
+        policy=str(policy),
+        environments=environments,
+        routes=routes,
+        runs=runs,
+        objects=objects,
+        seed=seed,
+        horizon=horizon,
+        spp=spp,
+        workers=workers,
+        drives=Path(folder),
+    )
+    work = command._work()
+    return run_evaluation(work, command._workers(work.policy), progress)
 
 
 def _check_different(option: str, names: tuple[str, ...]) -> None:

@@ -276,6 +276,12 @@ class Evaluation:
     drives: Mapping[tuple[str, str, str], Sequence[Drive]]
     seconds: Mapping[tuple[str, str], float]
 
+    def __repr__(self) -> str:
+        environments, routes, _ = map(dict.fromkeys, zip(*self.drives, strict=True))
+        count = sum(len(drives) for drives in self.drives.values())
+        where = f"{', '.join(environments)}; routes: {', '.join(routes)}"
+        return f"Evaluation({count} drives: {where})"
+
 
 def run_evaluation(
     work: EvaluateWork,

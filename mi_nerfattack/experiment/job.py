@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
+from mi_nerfattack.backend import variant
 from mi_nerfattack.backend.determinism import deterministic
 from mi_nerfattack.backend.interrupts import held_interrupts
+from mi_nerfattack.backend.torch_arrays import one_thread
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import Baseline
@@ -25,7 +27,7 @@ from mi_nerfattack.experiment.claim import claimed
 from mi_nerfattack.experiment.effort import Account, Effort
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.kept_drives import SharedDrives
-from mi_nerfattack.experiment.run_folder import RunFolder
+from mi_nerfattack.experiment.run_folder import Run, RunFolder
 from mi_nerfattack.experiment.stages import OnProgress, Stages, step_counter
 from mi_nerfattack.rollout.drive import (
     ATTACK,
@@ -35,14 +37,16 @@ from mi_nerfattack.rollout.drive import (
     departure_limit,
 )
 from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.scenario import Scenario, portable_text
+from mi_nerfattack.scenario.scenario import Scenario, load_scenario, portable_text
 from mi_nerfattack.scenario.world import World, build_attack, build_world
+from mi_nerfattack.scenes import resolve
 
 #: Called with a sentence.
 OnNotice = Callable[[str], None]
 
 
-def _quiet(*arguments: Any) -> None:
+def quiet(*arguments: Any) -> None:
+    """Show nothing of what is reported."""
     del arguments
 
 
@@ -74,8 +78,8 @@ class Job:
     text: str
     policy: Any
     output: Path
-    on_progress: OnProgress = _quiet
-    on_notice: OnNotice = _quiet
+    on_progress: OnProgress = quiet
+    on_notice: OnNotice = quiet
     started: float = field(default_factory=time.perf_counter)
     frames: Frames | None = 3
     shared: SharedDrives | None = None
@@ -248,3 +252,87 @@ class Job:
         attack.step(on_step)
         sweeps = np.diff(times)
         account.add_iteration(float(sweeps[::2].sum()), float(sweeps[1::2].sum()))
+
+
+def attack_policy(
+    scenario: str | Path,
+    folder: str | Path,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    anyway: bool = False,
+    frames: Frames | None = 3,
+    progress: OnProgress = quiet,
+    on_notice: OnNotice = quiet,
+) -> Run:
+    """Attack a policy as a scenario file describes it: ``mi-nerfattack attack``.
+
+    Args:
+        scenario: TOML file, or ``bundled:FILE``.
+        folder: the run folder, new or empty.
+        resume: go on from what an interrupted run left in the folder.
+        force: resume although scenario, files or versions have changed.
+        anyway: attack although the checks find that it would prove nothing.
+        frames: of each case: ``"all"``, ``"worst"``, or so many, equally spaced; None
+            writes no frames, plots, attribution and page.
+        progress: called with stage, steps done, steps in all and a remark, for example
+            `mi_nerfattack.progress()`.
+        on_notice: called with a sentence, for example `print`.
+
+    Raises:
+        InputError: a file is missing or wrong, or the attack would prove nothing.
+        SetupError: the scenario is deterministic and the variant cannot be.
+    """
+    started, output = time.perf_counter(), Path(folder)
+    with claimed(output, resume):
+        metrics = attack_claimed(
+            resolve(str(scenario)),
+            output,
+            started=started,
+            frames=frames,
+            on_progress=progress,
+            on_notice=on_notice,
+            resume=resume,
+            force=force,
+            anyway=anyway,
+        )
+    return Run(output, metrics)
+
+
+def attack_claimed(
+    scenario: Path,
+    folder: Path,
+    *,
+    object_field: Path | None = None,
+    started: float,
+    frames: Frames | None,
+    on_progress: OnProgress,
+    on_notice: OnNotice,
+    resume: bool,
+    force: bool,
+    anyway: bool,
+) -> dict[str, Any]:
+    """Do what :func:`attack_policy` does in a folder that is claimed.
+
+    Args:
+        scenario: the scenario file.
+        folder: the run folder.
+        object_field: grid field that replaces the one of every object.
+        started: `time.perf_counter()` from which the wall time counts.
+        frames: as of :func:`attack_policy`.
+        on_progress: called with stage, steps done, steps in all and a remark.
+        on_notice: called with a sentence.
+        resume: as of :func:`attack_policy`.
+        force: as of :func:`attack_policy`.
+        anyway: as of :func:`attack_policy`.
+
+    Returns:
+        the document that ``metrics.json`` holds.
+    """
+    described, text = load_scenario(scenario, object_field)
+    variant.ensure()
+    policy = described.build_policy()
+    with one_thread():
+        reports = on_progress, on_notice
+        job = Job(described, text, policy, folder, *reports, started, frames)
+        return job.run_claimed(resume=resume, force=force, anyway=anyway)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,7 @@ CHECKPOINT = "checkpoint.safetensors"
 DRIVES = "drives"
 METRICS = "metrics.json"
 SCENARIO = "scenario.toml"
+_WIDTH = 100  # characters of the table in a notebook
 
 
 def object_path(folder: Path, name: str) -> Path:
@@ -41,6 +46,46 @@ def read_finished(folder: Path) -> dict[str, Any]:
     document = files.read_json(path)
     validate(document)
     return document
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished attack.
+
+    Attributes:
+        folder: the run folder, with pictures, drives and the attacked fields.
+        metrics: the content of its ``metrics.json``.
+    """
+
+    folder: Path
+    metrics: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Run:
+        """Read a run folder.
+
+        Raises:
+            InputError: the folder holds no finished run, or the file is damaged.
+        """
+        return cls(Path(folder), read_finished(Path(folder)))
+
+    def _repr_html_(self) -> str:
+        """Show the verdict, the table and the drives from above, in a notebook."""
+        from rich.console import Console
+
+        from mi_nerfattack.report.table import metrics_table
+
+        console = Console(record=True, file=io.StringIO(), width=_WIDTH)
+        console.print(metrics_table(self.metrics))
+        layout = '<pre style="line-height: 1.2">{code}</pre>'
+        table = console.export_html(inline_styles=True, code_format=layout)
+        sentences = "".join(f"<p>{html.escape(s)}</p>" for s in self.metrics["verdict"])
+        overhead = self.folder / "overhead.png"  # missing where frames is None
+        image = ""
+        if overhead.is_file():
+            data = base64.b64encode(overhead.read_bytes()).decode()
+            image = f'<img width="600" src="data:image/png;base64,{data}">'
+        return f"<div>{sentences}{table}{image}</div>"
 
 
 def folder_labels(folders: Sequence[Path]) -> list[str]:

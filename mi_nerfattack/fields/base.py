@@ -44,6 +44,10 @@ class AbstractField(ABC):
     window: Window
     _live: list[Any]
 
+    def __repr__(self) -> str:
+        sides = " x ".join(f"{side:.3g}" for side in self.upper - self.lower)
+        return f"{type(self).__name__}({sides} m, step {self.step_m:.3g} m)"
+
     def occupy(self, occupancy: Occupancy) -> None:
         """Make the field empty outside the occupied cells of a grid over its box."""
         self.occupancy, self.window = occupancy, Window(occupancy.cells)

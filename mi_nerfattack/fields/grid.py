@@ -22,6 +22,7 @@ from mi_nerfattack.fields.levels import (
 )
 from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.fields.vertex_colours import VertexColours
+from mi_nerfattack.notebook import picture
 
 _MOST_VERTICES = (1 << 30) - 1  # four numbers each, which kernels index by 32 bits
 
@@ -149,6 +150,9 @@ class GridField(AbstractField):
         self._texture = flat_parameter(texture, (self.n_vertices, 3), "texture")
         self._colours: VertexColours | None = None
         self._pack()
+
+    def _repr_png_(self) -> bytes:
+        return picture(self)
 
     def occupy(self, occupancy: Occupancy) -> None:
         """See :meth:`AbstractField.occupy`."""

@@ -67,6 +67,7 @@ class OneHotGoal(AbstractGoal):
         return (torch.nn.functional.one_hot(goals, self.count).to(like),)
 
 
+@dataclass(frozen=True)
 class NoGoal(AbstractGoal):
     """Pass nothing: every route is driven by the image alone."""
 
@@ -76,6 +77,27 @@ class NoGoal(AbstractGoal):
         """Drop the goals."""
         del goals, like
         return ()
+
+
+def declared_goal(module: torch.nn.Module) -> AbstractGoal:
+    """Return how a module takes the goal that nobody describes: the one default.
+
+    A module whose attribute `goals` is an integer takes one of that many goals as an
+    integer, as `PilotNet` does. A module without this attribute takes the image alone.
+
+    Raises:
+        InputError: `goals` is no integer of at least 1.
+    """
+    count = getattr(module, "goals", None)
+    if count is None:
+        return NoGoal()
+    if not isinstance(count, int):
+        raise InputError(
+            f"{type(module).__name__}.goals: a {type(count).__name__}; an integer of "
+            "at least 1, or say how the goal is passed: goal=NoGoal(), in a scenario "
+            'policy.goal = "none"'
+        )
+    return IntegerGoal(count)
 
 
 def _in_range(goals: torch.Tensor, count: int) -> torch.Tensor:

@@ -18,7 +18,7 @@ from mi_nerfattack.policy.checks import (
     expand_goals,
     steering,
 )
-from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal
+from mi_nerfattack.policy.goals import AbstractGoal, declared_goal
 from mi_nerfattack.policy.module_call import call_module, check_repeatable
 from mi_nerfattack.policy.preprocess import Preprocess
 
@@ -37,7 +37,8 @@ class TorchPolicy(AbstractPolicy):
             (n,), (n, 1), or (n, k) where `output` tells the column. It is switched to
             evaluation mode, its parameters are frozen, and it is moved to the device
             of the images.
-        goal: how the goal is passed; ``IntegerGoal(module.goals)`` unless given.
+        goal: how the goal is passed; by default ``IntegerGoal(module.goals)`` if the
+            module has this attribute, otherwise `NoGoal()`.
         preprocess: from the camera's image to the network's.
         recurrent: shapes of the hidden states, zero at first, with -1 for the number
             of vehicles: ``[(-1, 64)]``, ``[(1, -1, 32)]``.
@@ -60,12 +61,15 @@ class TorchPolicy(AbstractPolicy):
         self.module = module.eval()
         for parameter in module.parameters():  # a ScriptModule has no requires_grad_
             parameter.requires_grad_(False)
-        self.goal: AbstractGoal = _own_goal(module) if goal is None else goal
+        self.goal: AbstractGoal = goal or declared_goal(module)
         self.preprocess: Preprocess = preprocess or Preprocess()
         self.recurrent: tuple[tuple[int, ...], ...] = check_hidden(recurrent)
         self.control_scale, self.output = float(control_scale), output
         self.name: str = name or type(module).__name__
         self._checked = False
+
+    def __repr__(self) -> str:
+        return f"TorchPolicy({self.name}, {self.goal!r})"
 
     def control(self, image: Any, goal: Any) -> Any:
         """Evaluate the module on first images, without recording a graph."""
@@ -194,13 +198,3 @@ class TorchPolicy(AbstractPolicy):
         """Return the type of the module's parameters and buffers, if it has any."""
         tensors = (*self.module.parameters(), *self.module.buffers())
         return next((t.dtype for t in tensors if t.is_floating_point()), None)
-
-
-def _own_goal(module: torch.nn.Module) -> AbstractGoal:
-    count = getattr(module, "goals", None)
-    if not isinstance(count, int):
-        raise InputError(
-            f"{type(module).__name__}.goals: {count!r}; an integer of at least 1, or "
-            "pass goal=NoGoal()"
-        )
-    return IntegerGoal(count)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.notebook import picture
 from mi_nerfattack.ranges import Name, Positive, Whole, checked
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -81,6 +82,17 @@ class Drive:
             self._freeze(name, (steps,))
         if np.any(np.diff(self.time_s) <= 0):
             raise InputError("Drive.time_s: not increasing; give seconds step by step")
+
+    def __repr__(self) -> str:
+        distance = self.distance_m
+        return (
+            f"Drive({self.environment}, {self.route}, {self.case}, run {self.run}: "
+            f"{len(distance)} steps, distance from the lane centre "
+            f"{distance.mean():.3f} m in the mean, {distance.max():.3f} m at most)"
+        )
+
+    def _repr_png_(self) -> bytes:
+        return picture(self)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays by name."""

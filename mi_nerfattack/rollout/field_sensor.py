@@ -104,6 +104,11 @@ class FieldSensor(AbstractDifferentiableSensor):
         self._tasks = TaskQueue(freeze_method(self._accumulate, self._state))
         self._frozen_by_rays = freeze_method(self._by_rays, self._state)
 
+    def __repr__(self) -> str:
+        camera, objects = self.camera, len(self.objects)
+        size, name = f"{camera.width}x{camera.height}", type(self.composite).__name__
+        return f"FieldSensor({size}, objects: {objects}, {name})"
+
     def showing(
         self, objects: list[PosedField], scene: Layer | None = None
     ) -> FieldSensor:

@@ -46,6 +46,12 @@ class Evaluation:
     costs: np.ndarray
     trajectory: Trajectory
 
+    def __repr__(self) -> str:
+        return f"Evaluation({self.value:.6g}, {self.trajectory!r})"
+
+    def _repr_png_(self) -> bytes:
+        return self.trajectory._repr_png_()
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -74,6 +80,12 @@ class Rollout:
     adjoint: AbstractAdjoint = field(default_factory=Replay)
     attached: bool = False
     camera_path: CameraPath | None = None
+
+    def __repr__(self) -> str:
+        parts = self.objective, self.reduction, self.adjoint
+        names = ", ".join(type(part).__name__ for part in parts)
+        images = "attached" if self.attached else "detached"
+        return f"Rollout({self.horizon} periods, {names}, {images}, {self.loop!r})"
 
     @property
     def frames(self) -> int:

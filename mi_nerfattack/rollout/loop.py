@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerfattack.notebook import picture
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.rollout.objective import StateHistory
 from mi_nerfattack.rollout.sensor import (
@@ -69,6 +70,11 @@ class ClosedLoop:
         )
         object.__setattr__(self, "transition", transition)
 
+    def __repr__(self) -> str:
+        parts = self.sensor, self.policy, self.dynamics, self.integrator
+        names = ", ".join(type(part).__name__ for part in parts)
+        return f"ClosedLoop({names}, goal {self.goal}, periods of {self.dt:g} s)"
+
     def initial(self, poses: np.ndarray) -> Any:
         """Upload initial poses (n, 3), metres and radians, as full states (m, n)."""
         return to_state(self.dynamics.extend(np.atleast_2d(poses)))
@@ -101,7 +107,7 @@ class CameraPath:
         frame: control period whose frame all periods show; None for each its own.
     """
 
-    states: Sequence[Any]
+    states: Sequence[Any] = field(repr=False)
     frame: int | None = None
 
     def at(self, period: int) -> tuple[Any, int]:
@@ -122,9 +128,9 @@ class Step:
     """
 
     index: int
-    state: Any
+    state: Any = field(repr=False)
     observation: Observation
-    memory: tuple[Any, ...]
+    memory: tuple[Any, ...] = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -146,6 +152,14 @@ class Trajectory:
     kept: tuple[Any, ...] = ()
     camera_path: CameraPath | None = None
     still: Observation | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"Trajectory({self.count} drives, {self.horizon} periods of {self.dt:g} s)"
+        )
+
+    def _repr_png_(self) -> bytes:
+        return picture(self)
 
     @property
     def horizon(self) -> int:

@@ -38,6 +38,10 @@ class Observation:
     linear: Any = None
     kept: Any = None
 
+    def __repr__(self) -> str:
+        count, height, width, _ = self.image.shape
+        return f"Observation({count} images {width}x{height})"
+
 
 class AbstractSensor(ABC):
     """Camera on a vehicle in some world."""

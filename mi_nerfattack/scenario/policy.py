@@ -15,7 +15,13 @@ from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.policy.black_box import DIFFERENTIABLE_KINDS, CallablePolicy
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.exported.load import load_exported, load_torchscript
-from mi_nerfattack.policy.goals import AbstractGoal, IntegerGoal, NoGoal, OneHotGoal
+from mi_nerfattack.policy.goals import (
+    AbstractGoal,
+    IntegerGoal,
+    NoGoal,
+    OneHotGoal,
+    declared_goal,
+)
 from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
@@ -118,13 +124,13 @@ class PreprocessSection(Section):
 
 
 class PlainGoal(Section):
-    """The goal as the kind takes it, or none."""
+    """No goal, or the one that the network declares."""
 
-    goal: Literal["none"] | None = None
+    goal: Literal["none", None] = None  # None: as declared_goal finds
 
-    def build(self, default: AbstractGoal) -> AbstractGoal:
+    def build(self, module: torch.nn.Module) -> AbstractGoal:
         """Make what passes the goal to a network."""
-        return default if self.goal is None else NoGoal()
+        return declared_goal(module) if self.goal is None else NoGoal()
 
 
 class NumberedGoal(Section):
@@ -133,8 +139,9 @@ class NumberedGoal(Section):
     goal: Literal["integer", "one_hot"]
     goals: Count
 
-    def build(self, default: AbstractGoal) -> AbstractGoal:
+    def build(self, module: torch.nn.Module) -> AbstractGoal:
         """Make what passes the goal to a network."""
+        del module
         return (IntegerGoal if self.goal == "integer" else OneHotGoal)(self.goals)
 
 
@@ -175,7 +182,6 @@ class AbstractNetworkSection(AbstractPolicySection):
         module: torch.nn.Module,
         batch: int | None = None,
         recurrent: Shapes = (),
-        goal: AbstractGoal | None = None,
     ) -> TorchPolicy:
         """Join network, goal and preprocessing."""
         if (batch := self.batch or batch) not in (None, 1):
@@ -185,7 +191,7 @@ class AbstractNetworkSection(AbstractPolicySection):
             )
         return TorchPolicy(
             module if batch is None else OneImage(module, recurrent),
-            self.goal.build(goal or NoGoal()),
+            self.goal.build(module),
             self.preprocess.build(),
             recurrent,
             self.control_scale,
@@ -226,8 +232,7 @@ class PilotNetSection(AbstractNetworkSection):
 
     def build(self) -> AbstractPolicy:
         """Load the network."""
-        net = PilotNet.load(self.file.file)
-        return self._policy(net, goal=IntegerGoal(net.goals))
+        return self._policy(PilotNet.load(self.file.file))
 
 
 class ModuleSection(AbstractNetworkSection):

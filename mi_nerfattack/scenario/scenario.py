@@ -199,6 +199,13 @@ class Scenario(Section):
     baseline: BaselineSection = BaselineSection()
     deployment: DeploymentSections = RenderedDeployment()
 
+    def __repr__(self) -> str:
+        return (
+            f"Scenario({self.name!r}, route {self.scene.route!r}, "
+            f"objects: {len(self.objects)}, policy {self.policy.source}, "
+            f"{self.attack.method.method} attack)"
+        )
+
     def build_policy(self) -> AbstractPolicy:
         """Make the policy under test.
 

@@ -82,6 +82,13 @@ class World:
     objective: AbstractObjective
     initial: np.ndarray
 
+    def __repr__(self) -> str:
+        return (
+            f"World({self.route.name!r}, objects: {len(self.fields)}, "
+            f"{self.horizon} periods, {len(self.initial)} initial states, "
+            f"{', '.join(self.labels)})"
+        )
+
     def loop(self, sensor: AbstractSensor) -> ClosedLoop:
         """Close the loop through a sensor."""
         motion = self.motion

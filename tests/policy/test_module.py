@@ -9,9 +9,10 @@ import torch
 from torch import nn
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.policy.goals import NoGoal
+from mi_nerfattack.policy.goals import IntegerGoal, NoGoal
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.scenario.policy import load_policy
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -214,3 +215,27 @@ def test_a_module_that_detaches_the_image_is_refused(rng):
     made = policy(lambda x: x.detach().mean((1, 2, 3)))
     with pytest.raises(InputError, match="mine.py: its control has no derivative"):
         made.step_vjp(images(rng, 1), 0, (), mi.Float(1), ())
+
+
+@pytest.mark.parametrize(
+    ("line", "goal"),
+    [("pass", NoGoal()), ("goals = 3", IntegerGoal(3)), ("goals = None", NoGoal())],
+)
+def test_a_module_says_how_it_takes_the_goal(line, goal, tmp_path):
+    """One default, in Python and in scenarios; `batch` wraps the module."""
+    code = f"import torch\n\n\nclass Net(torch.nn.Module):\n    {line}\n"
+    (tmp_path / "net.py").write_text(code)
+    file = {"file": "net.py:Net", "trust_code": True}
+    made = [load_policy({**file, **more}, tmp_path) for more in ({}, {"batch": 1})]
+    for policy in (*made, TorchPolicy(made[0].module)):
+        assert policy.goal == goal
+    chosen = load_policy({**file, "goal": "none"}, tmp_path)
+    assert chosen.goal == TorchPolicy(made[0].module, NoGoal()).goal == NoGoal()
+
+
+def test_goals_that_are_no_number_are_refused():
+    module = nn.Module()
+    module.goals = nn.Linear(3, 4)
+    with pytest.raises(InputError, match=r"Module\.goals: a Linear; .*goal=NoGoal"):
+        TorchPolicy(module)
+    assert TorchPolicy(module, NoGoal()).goal == NoGoal()

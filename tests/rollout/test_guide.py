@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 def test_examples_run(tmp_path):
     text = GUIDE.read_text("utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     script = tmp_path / "guide.py"
     script.write_text("\n".join(blocks), "utf-8")
     result = subprocess.run(

@@ -35,11 +35,29 @@ def run_scenario(
         frames: of each case; None writes no plots, attribution and page, either.
     """
     started = time.perf_counter()
+    from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.claim import claimed
+    from mi_nerfattack.experiment.job import attack_claimed
 
     with claimed(output, resume):
-        how = {"resume": resume, "force": force, "anyway": anyway}
-        document = _run(path, output, object_field(), started, frames, **how)
+        field = object_field()  # it shows bars of its own
+        with StageBars(started) as bars:
+
+            def show(stage: str, done: int, total: int, remark: str) -> None:
+                bars.show(stage, done, total, f"{done}/{total} {remark}")
+
+            document = attack_claimed(
+                path,
+                output,
+                object_field=field,
+                started=started,
+                frames=frames,
+                on_progress=show,
+                on_notice=bars.say,
+                resume=resume,
+                force=force,
+                anyway=anyway,
+            )
     return Result(document, lambda: _show(document, output, frames))
 
 
@@ -55,33 +73,6 @@ def _show(document: dict[str, Any], output: Path, frames: Frames | None) -> None
         console.print(sentence, highlight=False)
     console.print(metrics_table(document))
     _print_files(console, output, document, frames)
-
-
-def _run(
-    path: Path,
-    output: Path,
-    object_field: Path | None,
-    started: float,
-    frames: Frames | None,
-    **how: bool,
-) -> dict[str, Any]:
-    """Run a scenario in a folder that is claimed, as `Job.run_claimed` is told."""
-    from mi_nerfattack import variant
-    from mi_nerfattack.backend.torch_arrays import one_thread
-    from mi_nerfattack.commands.shared.progress import StageBars
-    from mi_nerfattack.experiment.job import Job
-    from mi_nerfattack.scenario.scenario import load_scenario
-
-    scenario, text = load_scenario(path, object_field)
-    variant.ensure()
-    policy = scenario.build_policy()
-    with StageBars(started) as bars, one_thread():
-
-        def show(stage: str, done: int, total: int, remark: str) -> None:
-            bars.show(stage, done, total, f"{done}/{total} {remark}")
-
-        job = Job(scenario, text, policy, output, show, bars.say, started, frames)
-        return job.run_claimed(**how)
 
 
 def _print_files(

@@ -15,6 +15,7 @@ import numpy as np
 from mi_nerfattack.backend.colour import linear_to_uint8
 from mi_nerfattack.errors import InputError, NerfAttackError
 from mi_nerfattack.io import exr, files
+from mi_nerfattack.notebook import picture
 from mi_nerfattack.render.camera.conventions import (
     from_mitsuba,
     mitsuba_to_opencv,
@@ -44,6 +45,15 @@ class Frame:
 
     channels: Mapping[str, np.ndarray]
     metadata: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        height, width = next(iter(self.channels.values())).shape
+        names = [*self.channels]
+        listed = " ".join(names[:5]) + f" and {len(names) - 5} more" * (len(names) > 5)
+        return f"Frame({width}x{height}, {listed})"
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self) if {"R", "Y"} & self.channels.keys() else None
 
     def colour_only(self) -> Frame:
         """Return the frame without AOVs, opacity and depth.

@@ -38,14 +38,25 @@ def chart(path: str | Path, height_in: float) -> Iterator[Figure]:
         path: PNG file.
         height_in: height, inches of 150 pixels.
     """
-    with matplotlib.rc_context(RC):
-        figure = Figure((WIDTH_PX / DPI, height_in), DPI, layout="constrained")
+    with blank((WIDTH_PX / DPI, height_in), DPI) as figure:
         yield figure
         save(path, figure)
 
 
+@contextmanager
+def blank(size_in: tuple[float, float], dpi: float) -> Iterator[Figure]:
+    """Give a figure to draw in; it is not written."""
+    with matplotlib.rc_context(RC):
+        yield Figure(size_in, dpi, layout="constrained")
+
+
 def save(path: str | Path, figure: Figure) -> None:
-    """Write a figure as PNG, atomically; equal figures give equal bytes."""
+    """Write a figure as PNG, atomically."""
+    files.write_bytes(path, png(figure))
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file; equal figures give equal bytes."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-    files.write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()

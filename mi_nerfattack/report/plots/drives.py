@@ -94,7 +94,7 @@ def overhead(
     with matplotlib.rc_context(RC):
         figure, axes = _map_panels(len(panels), low, high)
         for axis, (environment, group) in zip(axes, panels.items(), strict=True):
-            _draw_lane(axis, route_points, lane_width_m)
+            draw_lane(axis, route_points, lane_width_m)
             for footprint in object_footprints:
                 axis.fill(*footprint.T, facecolor=_OBJECT, edgecolor="black", zorder=6)
             for drive in sorted(group, key=_drawing_order):
@@ -309,7 +309,8 @@ def _map_panels(count: int, low: np.ndarray, high: np.ndarray) -> tuple[Figure, 
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
-def _draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
+def draw_lane(axis: Axes, route: np.ndarray, lane_width_m: float) -> None:
+    """Draw a lane from above, its borders and its centre (n, 2), metres."""
     left, right = _borders(route, lane_width_m)
     axis.fill(*np.concatenate([left, right[::-1]]).T, facecolor=_LANE, zorder=0)
     for edge in (left, right):

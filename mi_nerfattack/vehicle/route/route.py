@@ -13,6 +13,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.notebook import picture
 from mi_nerfattack.ranges import Positive, Whole, checked
 from mi_nerfattack.vehicle.route.polyline import (
     Measures,
@@ -65,6 +66,16 @@ class Route:
         points = checked_points(f"route {self.name!r}", self.points, self.closed)
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
+
+    def __repr__(self) -> str:
+        points = f"{len(self.points)} points" + ", closed" * self.closed
+        return (
+            f"Route({self.name!r}, goal {self.goal}, {points}, "
+            f"{self.length:.1f} m, lane {self.lane_width_m:g} m, {self.speed_ms:g} m/s)"
+        )
+
+    def _repr_png_(self) -> bytes:
+        return picture(self)
 
     @classmethod
     def from_file(cls, path: str | Path, name: str) -> Route:
