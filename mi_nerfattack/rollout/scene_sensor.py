@@ -13,7 +13,9 @@ from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.grid_gradients import gradient, start_gradient
-from mi_nerfattack.render.camera.intrinsics import CameraMount
+from mi_nerfattack.render.camera.conventions import from_mitsuba
+from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
+from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.offset import offset_gradient, offset_pose
 from mi_nerfattack.rollout.scene_camera import SceneCamera
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
@@ -279,6 +281,16 @@ class SceneSensor(AbstractDifferentiableSensor):
     def fields(self) -> list[GridField]:
         """See :meth:`AbstractDifferentiableSensor.fields`."""
         return [volume.field for volume in self._objects().values()]
+
+    @property
+    def objects(self) -> list[PosedField]:
+        """The objects where they are, as environments show them."""
+        return [volume.posed for volume in self._objects().values()]
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The lens of the scene's sensor, for other environments."""
+        return from_mitsuba(self.camera.sensor)[0]
 
     def textures(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.textures`."""
