@@ -153,7 +153,7 @@ def test_grid_refuses_wrong_parameters() -> None:
     with pytest.raises(ValueError, match=r"texture: shape \(5, 3\); expected"):
         field.set_parameter("texture", np.zeros((5, 3), np.float32))
     with pytest.raises(ValueError, match=r"colour: shape \(26, 3\); expected"):
-        field.set_parameter("colour", mi.TensorXf(0.5, (26, 3)))
+        field.set_parameter("colour", dr.full(mi.TensorXf, 0.5, (26, 3)))
     with pytest.raises(KeyError, match="hue: a grid field has"):
         field.set_parameter("hue", np.zeros(1, np.float32))
 
