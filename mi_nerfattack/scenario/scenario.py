@@ -202,7 +202,7 @@ class Scenario(Section):
     def __repr__(self) -> str:
         return (
             f"Scenario({self.name!r}, route {self.scene.route!r}, "
-            f"objects: {len(self.objects)}, policy {self.policy.source}, "
+            f"objects: {len(self.objects)}, policy {Path(self.policy.source).name}, "
             f"{self.attack.method.method} attack)"
         )
 
