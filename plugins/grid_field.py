@@ -91,8 +91,8 @@ class GridFieldVolume(AbstractFieldVolume):
     of colour by that step. Keep it within 0 and 1, for instance by ``dr.clip``. Where
     the file calls space empty, the density is 0 whatever ``density`` says: see
     ``fields.window``. A new ``to_world`` moves the field, except in media. Derivatives
-    by it are in backward mode alone, and leave out the faces of the field's box, where
-    its density should be 0.
+    by it are in backward mode alone, and need an empty cell: else the density ends at
+    the faces of the field's box at once.
     """
 
     kind = "grid_field"

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
+from mi_nerfattack.render.posed import PosedField
 
 
 def check(
@@ -58,6 +59,9 @@ def check_camera(integrator: Any, scene: mi.Scene, key: str) -> None:
             "camera; take them out of the scene, or differentiate by to_world of the "
             "fields"
         )
+    for item in integrator.posed:
+        if isinstance(item, PosedField):
+            item.check_continuous(key)
 
 
 def _is_attached(value: Any, kind: Any, node: Any) -> bool:

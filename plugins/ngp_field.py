@@ -79,9 +79,9 @@ class NGPFieldVolume(AbstractFieldVolume):
             {"type": "ngp_field", "filename": "field.safetensors"}
 
     A new ``to_world`` moves the field, except in media. Derivatives by it are in
-    backward mode alone, and leave out the faces of the field's box. Media step by the
-    largest density, an estimate (see ``NGPField.density_bound``): ``density_limit``
-    makes it sharp and small.
+    backward mode alone, and need an empty cell, as those of ``grid_field``. Media step
+    by the largest density, an estimate (see ``NGPField.density_bound``):
+    ``density_limit`` makes it sharp and small.
     """
 
     kind = "ngp_field"

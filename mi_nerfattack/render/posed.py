@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.rays import meet_box
@@ -59,6 +60,7 @@ class PosedField:
 
         Raises:
             ValueError: it shears, reflects or scales unequally.
+            InputError: a derivative is asked for, and there is none.
         """
         matrix = self._matrix()
         if not np.array_equal(matrix, self._followed):
@@ -67,7 +69,22 @@ class PosedField:
             self._put(pose)
             self._followed = matrix
         attached = dr.grad_enabled(self.to_world.matrix)
+        if attached:
+            self.check_continuous("to_world")
         self._attached = self.to_world if attached else None
+
+    def check_continuous(self, parameter: str) -> None:
+        """Raise InputError if the density jumps at the faces of the field's box.
+
+        Args:
+            parameter: that moves rays or box, for the message.
+        """
+        if self.field.window.is_open:
+            raise InputError(
+                f"{parameter}: the {self.field.kind} has no empty cell, so its density "
+                "ends at the faces of its box at once, which has no derivative; leave "
+                "cells at its border empty"
+            )
 
     def _matrix(self) -> np.ndarray:
         return np.array(dr.detach(self.to_world.matrix), np.float64).reshape(4, 4)

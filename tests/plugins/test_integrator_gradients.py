@@ -10,8 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from helpers import small_fields as small
 from helpers.blob_scene import T, load, write_blob
 from helpers.derivatives import central_difference
+
+from mi_nerfattack.fields import save_field
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -241,6 +244,19 @@ def test_the_pose_of_a_field_behind_glass(blob) -> None:
     scene = behind_glass("prb", blob)
     key = next(k for k in mi.traverse(scene).keys() if k.endswith("blob.to_world"))  # noqa: SIM118
     Case(scene, key, change, pattern).check(0.01)
+
+
+@pytest.mark.parametrize("key", ["camera.to_world", "fields.open.to_world"])
+def test_a_field_that_ends_at_its_box_at_once_is_refused(tmp_path, key) -> None:
+    save_field(tmp_path / "open.safetensors", small.homogeneous(0.7))
+    name = str(tmp_path / "open.safetensors")
+    scene = load({"a": {"type": "grid_field", "id": "open", "filename": name}})
+
+    def shift(s, base):
+        return mi.AffineTransform4f().translate([0, s, 0]) @ base
+
+    with pytest.raises(Exception, match="leave cells at its border empty"):
+        Case(scene, key, shift, pattern).gradient()
 
 
 def test_camera_among_surfaces_is_refused(blob) -> None:

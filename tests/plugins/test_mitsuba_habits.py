@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -221,7 +222,7 @@ def test_stock_integrators_around(blob, kind: str, aovs: bool) -> None:
     scene = load({"a": blob}, {"i": around, "floor": floor()})
     alone = load({"a": blob}, {"floor": floor()})
     found, expected = shown(scene), shown(alone)
-    assert np.isfinite(found).all() and expected.max() > 0.1
+    assert np.isfinite(found[..., :3]).all() and expected.max() > 0.1
     np.testing.assert_allclose(found[..., :3], expected, atol=1e-5)
 
 
@@ -243,6 +244,7 @@ def test_channels_of_a_nested_aov_come_last(blob, aovs: bool) -> None:
 
 @pytest.mark.parametrize("nested", [{}, {"behind": {"type": "path"}}])
 def test_a_recorded_function_renders_what_changed(blob, nested) -> None:
+    gc.collect()  # Dr.Jit also looks into emitters of scenes that have been dropped
     scene = load(
         {"a": blob, **nested}, {"light": {"type": "constant"}} if nested else {}
     )

@@ -15,6 +15,8 @@ from helpers.derivatives import central_difference
 
 from mi_nerfattack.attack import surrogate_sensor
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.fields import load_field, save_field
+from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout import (
     ClosedLoop,
@@ -34,7 +36,15 @@ KEY = "fields.near.colour"
 
 @pytest.fixture
 def folder(tmp_path: Path, variant: str) -> Path:
+    """Fields whose border is empty, as that of fitted ones."""
     walled.write_fields(tmp_path)
+    cells = np.zeros((16, 16, 16), bool)
+    cells[1:-1, 1:-1, 1:-1] = True
+    for name in ("near", "far", "fog"):
+        path = tmp_path / f"{name}.safetensors"
+        field = load_field(path)
+        field.occupy(Occupancy(cells))
+        save_field(path, field)
     return tmp_path
 
 
