@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from mi_nerfattack.fields import GridField
-from mi_nerfattack.fields.grid_gradients import tangents
+from mi_nerfattack.fields.vertex_colours import tangents
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 
 

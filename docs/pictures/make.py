@@ -24,6 +24,7 @@ PICTURES: dict[str, Callable[[Path, bool], None]] = {
     "loop": diagrams.draw_loop,
     "chart": diagrams.draw_chart,
     "gallery": gallery_blocks.gallery,
+    "glass": plugin_scenes.glass,
     "plugins": plugin_scenes.plugins,
 }
 # Each of these shows a finished run, too.

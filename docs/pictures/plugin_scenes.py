@@ -35,6 +35,20 @@ def plugins(folder: Path, small: bool) -> None:
         write_jpeg(folder / f"plugin_{name}.jpg", Image.fromarray(pixels))
 
 
+def glass(folder: Path, small: bool) -> None:
+    """Render `glass.jpg` of docs/examples/glass.xml.
+
+    Args:
+        folder: where the picture goes.
+        small: render few samples of a small image.
+    """
+    size = {"width": 160, "height": 80} if small else {"width": 640, "height": 320}
+    scene = mi.load_file(str(ROOT / "docs/examples/glass.xml"), parallel=False, **size)
+    image = mi.render(scene, spp=4 if small else 32)
+    pixels = np.array(mi.util.convert_to_bitmap(image))
+    write_jpeg(folder / "glass.jpg", Image.fromarray(pixels))
+
+
 def field(kind: str, name: str, **properties: object) -> Description:
     """Describe a bundled field."""
     filename = str(ROOT / f"scenes/{name}/field.safetensors")

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from mi_nerfattack.ranges import Count, checked
-from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.loop import ClosedLoop, Step, Trajectory
+from mi_nerfattack.rollout.reduction import Cost
 from mi_nerfattack.rollout.sweep import Gradient, Options, backward, differentiable
 
 

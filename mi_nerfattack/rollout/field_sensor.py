@@ -12,7 +12,7 @@ import numpy as np
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.fields.grid_gradients import start_gradient
+from mi_nerfattack.fields.vertex_colours import start_gradient
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,

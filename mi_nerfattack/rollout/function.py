@@ -11,7 +11,6 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.adjoint import AbstractAdjoint, Replay
-from mi_nerfattack.rollout.cost import Cost
 from mi_nerfattack.rollout.loop import (
     CameraPath,
     ClosedLoop,
@@ -21,7 +20,7 @@ from mi_nerfattack.rollout.loop import (
     simulate,
 )
 from mi_nerfattack.rollout.objective import AbstractObjective
-from mi_nerfattack.rollout.reduction import AbstractReduction, Mean
+from mi_nerfattack.rollout.reduction import AbstractReduction, Cost, Mean
 from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sweep import (
     Gradient,

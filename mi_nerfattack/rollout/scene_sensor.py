@@ -12,7 +12,7 @@ import numpy as np
 from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.fields.grid_gradients import gradient, start_gradient
+from mi_nerfattack.fields.vertex_colours import gradient, start_gradient
 from mi_nerfattack.render.camera.conventions import from_mitsuba
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.posed import PosedField

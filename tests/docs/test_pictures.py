@@ -111,6 +111,13 @@ def test_pictures_of_plugins_are_made(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_picture_with_glass_is_made(tmp_path):
+    make("glass", tmp_path)
+    assert_made({"glass.jpg"}, tmp_path)
+    assert red(read(tmp_path / "glass.jpg"))[:, 80:].mean() > 0.01, "the hydrant"
+
+
+@pytest.mark.slow
 def test_pictures_of_the_gallery_are_made(tmp_path):
     make("gallery", tmp_path)
     assert_made(GALLERY, tmp_path)

@@ -30,29 +30,26 @@ SENSOR = """
 """
 
 
-def block(language: str) -> str:
-    """The README's block of a language."""
+def blocks(language: str) -> list[str]:
+    """The README's blocks of a language."""
     text = (ROOT / "README.md").read_text("utf-8")
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", text, re.M | re.S)
-    return found
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.M | re.S)
+
+
+def run(script: str, folder: Path) -> list[str]:
+    """Run a script beside the scenes, and return the lines that it prints."""
+    (folder / "scenes").symlink_to(ROOT / "scenes")
+    words = [sys.executable, "-c", script]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
 
 
 def test_the_script_writes_an_image_and_prints_the_gradients_shape(tmp_path):
-    script = block("python")
+    script, _ = blocks("python")
     assert len([line for line in script.splitlines() if line]) <= 15
-    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            script + "print(dr.sum(dr.abs(dr.grad(params[key]).array))[0])",
-        ],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    shape, total = done.stdout.splitlines()
+    total = "print(dr.sum(dr.abs(dr.grad(params[key]).array))[0])"
+    shape, total = run(script + total, tmp_path)
     assert re.fullmatch(r"\(\d{6,}, 3\)", shape)
     assert float(total) > 0
     image = np.array(mi.Bitmap(str(tmp_path / "frame.exr")))
@@ -61,10 +58,22 @@ def test_the_script_writes_an_image_and_prints_the_gradients_shape(tmp_path):
     assert (middle[..., 0] > 2 * middle[..., 2]).mean() > 0.5
 
 
+def test_the_script_of_a_drive_changes_the_colours(tmp_path):
+    _, script = blocks("python")
+    assert len([line for line in script.splitlines() if line]) <= 25
+    short = script.replace("horizon=20", "horizon=4").replace("range(5)", "range(2)")
+    assert short.count("horizon=4") == short.count("range(2)") == 1
+    before = "before = params[key].numpy().copy()\nadam ="
+    after = "print(abs(adam[key].numpy() - before).max())\nprint(-value[0])"
+    change, error = run(short.replace("adam =", before, 1) + after, tmp_path)
+    assert 0.05 <= float(change) <= 0.15  # two steps
+    assert float(error) >= 0
+
+
 @pytest.mark.usefixtures("variant")
 def test_the_xml_shows_both_fields(monkeypatch):
     monkeypatch.chdir(ROOT)
-    xml = block("xml")
+    (xml,) = blocks("xml")
     assert len(xml.splitlines()) == 8
     text = f'<scene version="3.0.0">{xml}{SENSOR}</scene>'
     aovs = '<boolean name="aovs" value="true"/>'
