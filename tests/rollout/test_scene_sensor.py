@@ -65,6 +65,7 @@ def board() -> mi.Scene:
         "bitmap": mi.Bitmap(colours),
         "raw": True,
         "filter_type": "bilinear",
+        "accel": False,  # a GPU's texture unit is less precise
     }
     place = t.translate([6, 0.2, 1.0]).rotate([0, 1, 0], -90).scale([1, 1, 1])
     described = walled.scene_dict(Path(), walled.PERSPECTIVE, walls=False)
