@@ -280,8 +280,9 @@ class DepthComposite(AbstractComposite):
         self, posed: Sequence[Layer], rays: Rays, seen: Seen, cotangent: Seen
     ) -> list[Task]:
         """See :meth:`AbstractComposite.tasks`; one for each field."""
+        # From the total to each layer, through the folds
         parts = self._cotangents(seen, cotangent)
-        dr.eval(parts)
+        dr.eval(parts)  # so that it is known how many rays have to be marched again
         return [
             task
             for k, item in enumerate(posed)
@@ -323,7 +324,7 @@ class DepthComposite(AbstractComposite):
             dr.enable_grad(leaves)
             result = depth_composite(leaves).pair(cotangent.total)
             for leaf, part in zip(leaves, cotangent.layers, strict=False):
-                result += leaf.pair(part)
+                result += leaf.pair(part)  # of losses on a layer by itself
             dr.backward_from(result)
             return [dr.grad(leaf) for leaf in leaves]
 
@@ -372,6 +373,7 @@ def depth_composite(layers: list[March]) -> March:
     Source: appendix A.4 to A.6.
     """
     ordered = sort_by_depth(layers)
+    # Back to front: I = I_f + (1 - a_f) I_b
     result = ordered[-1]
     for front in reversed(ordered[:-1]):
         result = front.over(result)

@@ -150,10 +150,13 @@ def integrate(
     """
     sums = Sums.zeros(len(posed))
     while active:
+        # The next lattice interval in an occupied cell, and one sample in it
         walk, here = walk.next(posed, active)
         points = [path.at(here.t) for path in walk.paths]
         densities, colours = _evaluate(evaluate, points, towards, here)
+        # A.1 to A.3 as sums: T phi(x) x L, and the same of 1 and of t
         sums = sums.plus(here.depths(densities), colours, here.t)
+        # Behind transmittance `stop`, nothing is seen
         active = here.active & (dr.exp(-sums.tau) > stop)
     return sums
 
@@ -222,22 +225,27 @@ def replay(  # noqa: D417  one entry describes four
         as :func:`march_derivative`, the derivatives by rays for each field.
     """
     count = range(len(posed))
+    # Replay: `rest` starts as all that the rays gathered, and loses each sample's part
     rest, tangent = Rest.of(primal), March()
     by_rays = [RayGradient() for _ in posed]
     while active:
         walk, here = walk.next(posed, active)
         with dr.resume_grad():
+            # The fields again at the sample, attached to their parameters
             points, headings = _attach(walk.paths, here.t, with_rays)
             densities, colours = _evaluate(
                 [item.eval for item in posed], points, headings, here
             )
+            # dI/dL = w, dI/dsigma = width (T L - what is behind): see `sums.Rest.minus`
             depths = here.depths(densities)
             rest, slope = rest.minus(dr.detach(depths), dr.detach(colours), here.t)
             change = slope.change(depths, colours)
+            # From the sample to the parameters, or from the parameters to the sample
             if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                 dr.backward_from(cotangent.pair(change))
             else:
                 tangent = tangent.plus(dr.forward_to(change), here.active)
+            # From the sample to the rays
             if dr.hint(with_rays, mode="scalar"):
                 growth = slope.growth(cotangent, dr.detach(depths), dr.detach(colours))
                 by_rays = [

@@ -157,13 +157,16 @@ class Sweep:
             d_after: (m, n), by the state after it.
         """
         loop, index = self.loop, step.index
+        # Vehicle: l_t^T dPhi/dx and, for each period whose control acts, l_t^T dPhi/du
         d_state = self.back_blindly(index, step.state, d_after)
+        # All that depends on this period's control has been visited: its cotangent
         image = loop.shown(step.observation, index)
         none = dr.opaque(type(d_state[0]), 0, dr.width(d_state))
         cotangent = dr.array_t(image)(self.pending.pop(index, none))
         dr.eval(cotangent)
         self._waiting.append((step, image, cotangent))
         alone = bool(step.memory or self.d_memory)
+        # Policy and sensor: several periods at a time
         full = alone or len(self._waiting) == self.together
         by_pose = self.finish() if full else None
         if by_pose is not None:
@@ -199,6 +202,7 @@ class Sweep:
         steps, images, cotangents = zip(*self._waiting, strict=True)
         self._waiting.clear()
         loop, by_pose = self.loop, None
+        # Policy: from controls to images
         d_images, self.d_memory = loop.policy.step_vjp(
             _batch(images),
             loop.goal,
@@ -208,9 +212,11 @@ class Sweep:
         )
         release_heap()
         for step, d_image in zip(steps, _unbatch(d_images, len(steps)), strict=True):
+            # Camera: through disturbance and eight bits (straight through)
             d_seen = loop.shown_vjp(step.observation, step.index, d_image)
             if self.on_image is not None:
                 self.on_image(step.index, d_seen)
+            # Sensor: from images to parameters and, attached (A.12), to the state
             if self.drive.still is None:
                 state, _ = self.drive.camera(step.index)
                 by_pose = differentiable(loop).vjp(
@@ -258,6 +264,7 @@ def backward(
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
     try:
         for step in visits:
+            # A.9, resolved: minus l_t is dJ/dx_t and the derivative through x_{t+1}
             d_after = d_before + to_state(d_states[step.index])
             d_before = sweep.back(step, d_after)
             costates.append(-np.array(d_after).T)
