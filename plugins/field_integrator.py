@@ -131,7 +131,7 @@ class FieldIntegrator(FilmIntegrator):
     fields are alone in the scene. AOVs are differentiated, too, but for the shares of
     single fields in ``interleaved``. What has no derivative raises an error: a nested
     integrator without that interface (``path``), moving surfaces, which occlude
-    fields, and the light on relit objects.
+    fields, and all but ``colour`` where a field is relit, whose light is constant.
     Monochromatic variants show luminance; spectral ones the linear spectrum of
     ``render.lighting.spectrum``; AOVs are RGB everywhere.
     """
@@ -158,9 +158,8 @@ class FieldIntegrator(FilmIntegrator):
         self.behind = others[0] if is_first else None
         #: Whether derivatives are asked for by what the nested integrator renders.
         self.differentiates_behind = False
-        march = self.composite, self.posed, self.stop
-        self.frozen = FrozenComposite(*march)
-        self.collector = RayCollector(*march)
+        self.frozen = FrozenComposite(self.composite, self.posed, self.stop)
+        self.collector = RayCollector(self.composite, self.posed, self.stop)
         samples: Any = props.get("relit_samples", LIGHT_SAMPLES)
         relit = tuple(volume.relit for volume in self.volumes)
         relighting = Relighting(relit, int(samples), self.stop)
@@ -351,7 +350,8 @@ class FieldIntegrator(FilmIntegrator):
         self.collector.finish()
 
     def stop_gradient(self) -> None:
-        """Collect no more."""
+        """Collect no more, and forget the rays that wait."""
+        self.collector.clear()
         self.differentiates_behind = self.collector.waits = False
 
     def _forward(
@@ -376,11 +376,11 @@ class FieldIntegrator(FilmIntegrator):
             for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
                 dr.set_grad(layer, part)
             if self.differentiates_behind:
-                parts = scene, sampler, ray, rays.active, None, state.inner
-                dr.set_grad(
-                    leaf.behind,
-                    sample_nested(self.behind, dr.ADMode.Forward, *parts)[0],
+                mode, inner = dr.ADMode.Forward, state.inner
+                t_behind, *_ = sample_nested(
+                    self.behind, mode, scene, sampler, ray, rays.active, state_in=inner
                 )
+                dr.set_grad(leaf.behind, t_behind)
             colour = lay_over(self, leaf.seen.total, rays, leaf.behind, ray)
             found = colour, *self.splats(leaf)
             flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad

@@ -105,7 +105,7 @@ class AbstractFieldVolume(mi.Volume):
         self.field = field
         self.relit = bool(props.get("relit", False))
         self.posed = PosedField(field, pose)
-        self._loaded, self._moved = pose, False
+        self._loaded = pose
         # Mitsuba finds them here where `drjit.freeze` records a rendering
         self.live = [field.live, self.posed.live]
 
@@ -130,13 +130,14 @@ class AbstractFieldVolume(mi.Volume):
                 self.field.set_parameter(name, value)
         if not keys or "to_world" in keys:
             try:
-                self.posed.follow()
+                self.posed.follow(f"{self.id()}.to_world")
+            except InputError:
+                raise
             except ValueError as err:
                 raise InputError(
                     f"{self.id()}.to_world: {err}; fields take rotation, translation "
                     "and uniform scale"
                 ) from err
-            self._moved = not self.posed.pose.is_near(self._loaded)
 
     @contextmanager
     def tangents(self) -> Iterator[None]:
@@ -178,7 +179,7 @@ class AbstractFieldVolume(mi.Volume):
         return mi.Vector3f(self._evaluate(it, active)[1])
 
     def _evaluate(self, it: mi.Interaction3f, active: Mask) -> Any:
-        if self._moved:
+        if not self.posed.placed.is_near(self._loaded):
             raise InputError(
                 f"{self.id()}: a medium cannot follow to_world, since Mitsuba keeps "
                 "the box in which the volume was loaded; load the scene again, or use "

@@ -12,6 +12,11 @@ from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
 from mi_nerfattack.render.posed import PosedField
 
+_RELIT = (
+    "{}: has no derivative where fields are relit, since their light is a constant; "
+    "set relit to false"
+)
+
 
 def check(
     integrator: Any, scene: mi.Scene, keys: Collection[str] | None = None
@@ -43,6 +48,9 @@ def check(
         and not _is_own(integrator, node)
         and _has_effect(integrator, key, flags)
     ]
+    if integrator.relighting is not None:
+        for key, node, _ in attached:
+            _check_relit(integrator, key, node)
     if sensors:
         check_camera(integrator, scene, sensors[0][0])
     shared = _shared(integrator, scene, [node for _, node, _ in attached])
@@ -59,9 +67,17 @@ def check_camera(integrator: Any, scene: mi.Scene, key: str) -> None:
             "camera; take them out of the scene, or differentiate by to_world of the "
             "fields"
         )
+    if integrator.relighting is not None:
+        raise InputError(_RELIT.format(key))
     for item in integrator.posed:
         if isinstance(item, PosedField):
             item.check_continuous(key)
+
+
+def _check_relit(integrator: Any, key: str, node: Any) -> None:
+    """Refuse what shadows and normals depend on, which are constants."""
+    if _is_own(integrator, node) and not key.endswith(".colour"):
+        raise InputError(_RELIT.format(key))
 
 
 def _is_attached(value: Any, kind: Any, node: Any) -> bool:
@@ -115,6 +131,4 @@ def _check_behind(integrator: Any, key: str) -> None:
             'has no derivative; nest <integrator type="prb"/> in its place'
         )
     if integrator.relighting is not None:
-        raise InputError(
-            f"{key}: has no derivative where fields are relit; set relit to false"
-        )
+        raise InputError(_RELIT.format(key))

@@ -55,8 +55,11 @@ class PosedField:
         self._attached: Any = None
         self._followed = self._matrix()
 
-    def follow(self) -> None:
+    def follow(self, name: str) -> None:
         """Take the pose of `to_world`, which has been changed, and its derivatives.
+
+        Args:
+            name: of the parameter, for messages.
 
         Raises:
             ValueError: it shears, reflects or scales unequally.
@@ -70,7 +73,7 @@ class PosedField:
             self._followed = matrix
         attached = dr.grad_enabled(self.to_world.matrix)
         if attached:
-            self.check_continuous("to_world")
+            self.check_continuous(name)
         self._attached = self.to_world if attached else None
 
     def check_continuous(self, parameter: str) -> None:

@@ -48,8 +48,9 @@ class Clip:
 def nearest_surface(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
     """Return the distance of the first surface that stops rays (n,), or infinity.
 
-    What light passes straight, rays pass: `null`, the transparent parts of a `mask`,
-    and `thindielectric`.
+    What light passes straight, rays pass: `null`, what is not opaque of a `mask`, and
+    `thindielectric`. They pass it whole: it does not dim the fields behind it, and what
+    it reflects counts as behind all fields.
 
     Raises:
         InputError: a shape of the scene is `ellipsoids`.

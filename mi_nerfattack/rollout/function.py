@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -199,9 +200,9 @@ class Rollout:
 
         Args:
             textures: of a `SceneSensor`, parameters by key, for instance the result
-                of ``mi.traverse(scene)`` or an optimiser; those that are attached
-                are differentiated. Of other sensors, one tensor (n_vertices, 3) an
-                object, raw colours.
+                of ``mi.traverse(scene)`` or an optimiser; all are set, and those that
+                are attached are differentiated. Of other sensors, one tensor
+                (n_vertices, 3) an object, raw colours.
             initial: (m, n) from :meth:`ClosedLoop.initial`.
             offsets: tensor (k, 6), shift (metres) and rotation vector (radians) of
                 each object from where it was put; left alone when left out.
@@ -213,7 +214,8 @@ class Rollout:
             # Mitsuba's parameters and optimisers are no `Mapping` by inheritance
             values = {key: textures[key] for key in textures.keys()}  # noqa: SIM118
             attached = {k: v for k, v in values.items() if dr.grad_enabled(v)}
-            return dr.custom(_SceneOp, _Held(self), attached, initial)
+            others = {k: v for k, v in values.items() if k not in attached}
+            return dr.custom(_SceneOp, _Held(self, others), attached, initial)
         moved = [] if offsets is None else [offsets]
         return dr.custom(_RolloutOp, _Held(self), list(textures), initial, moved)
 
@@ -243,8 +245,11 @@ class Rollout:
 class _Held:
     """A rollout that Dr.Jit does not look into for arrays."""
 
-    def __init__(self, rollout: Rollout) -> None:
+    def __init__(
+        self, rollout: Rollout, constants: Mapping[str, Any] | None = None
+    ) -> None:
         self.rollout = rollout
+        self.constants: Mapping[str, Any] = constants or {}
 
 
 class _SceneOp(dr.CustomOp):
@@ -252,26 +257,36 @@ class _SceneOp(dr.CustomOp):
 
     def eval(self, held: _Held, values: dict[str, Any], initial: Any) -> Any:
         self.rollout = held.rollout
-        self.values = {key: type(v)(dr.detach(v)) for key, v in values.items()}
-        self._install()
-        self.evaluation = self.rollout.run(dr.detach(initial))
+        self.keys = list(values)
+        self.values = dict(held.constants)
+        self.values |= {key: type(v)(dr.detach(v)) for key, v in values.items()}
+        with self._installed():
+            self.evaluation = self.rollout.run(dr.detach(initial))
         return dr.value_t(type(initial))([self.evaluation.value])
 
     def backward(self) -> None:
-        self._install()  # others may have driven
         scale = float(dr.detach(self.grad_out())[0])
-        found = self.rollout.gradient(self.evaluation, scale=scale)
+        with self._installed():  # others may have driven
+            found = self.rollout.gradient(self.evaluation, scale=scale)
         self.set_grad_in("values", found.parameters)
         self.set_grad_in("initial", found.initial)
 
-    def _install(self) -> None:
+    @contextmanager
+    def _installed(self) -> Iterator[None]:
+        """Set the parameters, and differentiate by those that were attached."""
         sensor = self.rollout.loop.sensor
         if not isinstance(sensor, SceneSensor):
             raise TypeError(
                 f"{type(sensor).__name__}: takes textures, one tensor an object; for "
                 "parameters of a scene use a SceneSensor"
             )
+        before = sensor.keys
         sensor.set_parameters(self.values)
+        sensor.select(self.keys)
+        try:
+            yield
+        finally:
+            sensor.select(before)
 
 
 class _RolloutOp(dr.CustomOp):

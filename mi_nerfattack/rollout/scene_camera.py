@@ -36,7 +36,7 @@ class SceneCamera:
 
     def rays(
         self, pose: Any, count: int, step: int
-    ) -> tuple[mi.Sampler, mi.RayDifferential3f, Any]:
+    ) -> tuple[mi.Sampler, mi.Ray3f, Any]:
         """Make rays, vehicle by vehicle, row by row, sample by sample.
 
         Args:
@@ -83,11 +83,12 @@ class SceneCamera:
         )
         dr.eval(origin, columns)
         right, down, forward = (dr.gather(mi.Vector3f, c, vehicle) for c in columns)
-        ray.o = dr.gather(mi.Point3f, origin, vehicle) + (
+        moved = mi.Ray3f(ray)  # without differentials, which are the scene sensor's
+        moved.o = dr.gather(mi.Point3f, origin, vehicle) + (
             o.z * forward - o.x * right - o.y * down
         )
-        ray.d = d.z * forward - d.x * right - d.y * down
-        return sampler, ray, weight
+        moved.d = d.z * forward - d.x * right - d.y * down
+        return sampler, moved, weight
 
     def pixels(self, colour: Any) -> mi.Color3f:
         """Average the samples of each pixel, as linear RGB."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -21,24 +21,37 @@ from mi_nerfattack.rollout.scene_camera import SceneCamera
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
 
+@runtime_checkable
+class CollectsRays(Protocol):
+    """An integrator that marches the rays of several frames together."""
+
+    def start_gradient(self, scene: mi.Scene, keys: list[str]) -> None:
+        """Collect rays from now on; InputError where a key has no derivative."""
+
+    def finish_gradient(self) -> None:
+        """Accumulate the gradients of all collected rays."""
+
+    def stop_gradient(self) -> None:
+        """Collect no more, and forget the rays that wait."""
+
+
 class SceneSensor(AbstractDifferentiableSensor):
     """Camera on a vehicle that sees a Mitsuba scene as its integrator renders it.
 
     An image is that of `mi.render` with the scene's sensor on the vehicle, developed
     by a box filter: lens, clip distances, film size and samples per pixel are the
-    sensor's; its pose counts for nothing. The derivative is the integrator's own
-    ``sample`` in backward mode, with the random numbers of the forward pass, so that
-    every integrator with the protocol of Mitsuba's `RBIntegrator` will do, for instance
-    `field_integrator`, `prb`, `prbvolpath` and `volprim_rf_basic`, and every parameter
-    of `mi.traverse` that it differentiates.
-
-    Cost of an observation: one frame; of a product: one derivative of a frame.
+    sensor's, its pose is not. The derivative is the integrator's own ``sample`` in
+    backward mode, with the random numbers of the forward pass. So the integrator needs
+    the protocol of Mitsuba's `RBIntegrator`, as `field_integrator`, `prb`, `prbvolpath`
+    and `volprim_rf_basic` have it. Lens and film are constants of the derivative, and
+    so is the shape of surfaces, since visibility has no derivative here.
 
     Args:
         scene: metric, z up.
         mount: pose of the camera on the vehicle.
         params: keys of `mi.traverse(scene)` to differentiate by, for instance
-            ``hydrant.colour``; a rollout that is called with parameters sets them.
+            ``hydrant.colour``; a rollout that is called with parameters chooses them
+            by itself.
         sensor: index of the scene's sensor.
         seed: of all random numbers, renewed each control period.
 
@@ -60,22 +73,20 @@ class SceneSensor(AbstractDifferentiableSensor):
                 f"variant {mi.variant()!r}: a policy's camera has three colours; call "
                 "mitsuba.set_variant('llvm_ad_rgb')"
             )
-        if not 0 <= sensor < len(scene.sensors()):
-            raise InputError(
-                f"sensor: {sensor}; the scene has {len(scene.sensors())}, from 0 on"
-            )
+        count = len(scene.sensors())
+        if not 0 <= sensor < count:
+            raise InputError(f"sensor: {sensor}; the scene has {count}, from 0 on")
         self.scene = scene
         self.integrator: Any = scene.integrator()
-        protocol = mi.ad.integrators.common.RBIntegrator
-        if not isinstance(self.integrator, protocol):
+        if not isinstance(self.integrator, mi.ad.integrators.common.RBIntegrator):
             raise InputError(
                 f"scene: its integrator {self.integrator.class_name()} cannot be "
                 "differentiated ray by ray; use field_integrator or prb"
             )
         self.camera = SceneCamera(scene.sensors()[sensor], mount or CameraMount(), seed)
         #: A `field_integrator`, which marches rays of several frames together.
-        self._collector: Any = None
-        if hasattr(self.integrator, "finish_gradient"):
+        self._collector: CollectsRays | None = None
+        if isinstance(self.integrator, CollectsRays):
             self._collector = self.integrator
         # While a gradient is collected: what it replaces, and what collects it
         self._before: dict[str, Any] = {}
@@ -92,12 +103,20 @@ class SceneSensor(AbstractDifferentiableSensor):
             keys: of `mi.traverse(scene)`.
 
         Raises:
-            InputError: there is no such parameter.
+            InputError: there is no such parameter, or it has no derivative here.
         """
         for key in keys:
             if key not in self.params:
                 near = ", ".join(name for name in self.params.keys() if "." in name)
                 raise InputError(f"{key}: no parameter of the scene; there are: {near}")
+            _, _, node, flags = self.params.properties[key]
+            constant = mi.ParamFlags.NonDifferentiable | mi.ParamFlags.Discontinuous
+            if isinstance(node, mi.Sensor | mi.Film | mi.Sampler) or flags & constant:
+                raise InputError(
+                    f"{key}: a constant of the derivative, as lens, film and the shape "
+                    "of surfaces are; leave it out of params (mi.render differentiates "
+                    "by the lens, prb_projective by shapes)"
+                )
         self.keys: tuple[str, ...] = tuple(keys)
 
     def __repr__(self) -> str:
@@ -193,19 +212,20 @@ class SceneSensor(AbstractDifferentiableSensor):
         return {key: self.params[key] for key in self.keys}
 
     def set_parameters(self, values: Mapping[str, Any]) -> None:
-        """Replace parameters, and differentiate by them.
+        """Replace parameters by detached values.
 
         Args:
-            values: by key of `mi.traverse(scene)`; what the scene has already stays
-                attached to what it is attached to.
+            values: by key of `mi.traverse(scene)`. A value that the scene has already
+                is left as it is, with its derivatives.
 
         Raises:
             InputError: there is no such parameter, or its value is not allowed.
         """
-        self.select(list(values))
         for key, value in values.items():
+            if key not in self.params:
+                raise InputError(f"{key}: no parameter of the scene")
             if not _is_same(self.params[key], value):
-                self.params[key] = dr.detach(value)
+                self.params[key] = dr.detach(value) if _is_array(value) else value
         self.params.update()
 
     def start_gradient(self, poses: bool = False) -> None:
@@ -219,7 +239,13 @@ class SceneSensor(AbstractDifferentiableSensor):
         """
         self.stop_gradient()
         moved = [f"{name}.to_world" for name in self._objects()] if poses else []
-        keys = [*self.keys, *moved]
+        try:
+            self._start(list(dict.fromkeys([*self.keys, *moved])))
+        except BaseException:
+            self.stop_gradient()
+            raise
+
+    def _start(self, keys: list[str]) -> None:
         if self._collector is not None:
             self._collector.start_gradient(self.scene, keys)
         for key in keys:
@@ -346,11 +372,16 @@ class SceneSensor(AbstractDifferentiableSensor):
             )
 
 
+def _is_array(value: Any) -> bool:
+    return bool(dr.detail.collect_indices(value))
+
+
 def _is_same(a: Any, b: Any) -> bool:
-    """Tell whether two values are one and the same in memory."""
-    return dr.detail.collect_indices(dr.detach(a)) == dr.detail.collect_indices(
-        dr.detach(b)
-    )
+    """Tell whether two values are one and the same in memory, or equal numbers."""
+    if not _is_array(a) or not _is_array(b):
+        return bool(np.all(np.equal(a, b)))
+    one, other = (dr.detail.collect_indices(dr.detach(value)) for value in (a, b))
+    return one == other
 
 
 def _develop(linear: mi.Color3f) -> mi.Color3f:

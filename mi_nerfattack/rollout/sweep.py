@@ -259,10 +259,15 @@ def backward(
     sensor = differentiable(loop)
     alone = options.attached or options.recorder is not None
     together = 1 if alone else max(1, IMAGES // drive.count)
+    if options.recorder is not None and not sensor.fields:
+        raise InputError(
+            "recorder: takes apart the gradient of objects' colours; the sensor's "
+            "parameters have none"
+        )
     sweep = Sweep(loop, drive, options.attached, together)
-    sensor.start_gradient(options.offsets)
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
     try:
+        sensor.start_gradient(options.offsets)
         for step in visits:
             # A.9, resolved: minus l_t is dJ/dx_t and the derivative through x_{t+1}
             d_after = d_before + to_state(d_states[step.index])
@@ -319,18 +324,22 @@ def backward_to_images(
             found[index] = d_image.numpy().copy()
 
     sweep = Sweep(loop, drive, attached, on_image=keep)
-    sensor.start_gradient()
     linked = attached or bool(loop.policy.initial_memory(drive.count))
     d_before, start = to_state(np.zeros_like(d_states[0])), min(steps, default=0)
-    for index in reversed(range(start, drive.horizon if steps else 0)):
-        state = drive.states[index]
-        d_after = d_before + to_state(d_states[index])
-        if linked or index in steps:
-            seen = drive.observe(sensor, index)
-            d_before = sweep.back(Step(index, state, seen, drive.kept[index]), d_after)
-        else:
-            d_before = sweep.back_blindly(index, state, d_after)
-            dr.eval(d_before, sweep.pending)
+    try:
+        sensor.start_gradient()
+        for index in reversed(range(start, drive.horizon if steps else 0)):
+            state = drive.states[index]
+            d_after = d_before + to_state(d_states[index])
+            if linked or index in steps:
+                seen = drive.observe(sensor, index)
+                step = Step(index, state, seen, drive.kept[index])
+                d_before = sweep.back(step, d_after)
+            else:
+                d_before = sweep.back_blindly(index, state, d_after)
+                dr.eval(d_before, sweep.pending)
+    finally:
+        sensor.stop_gradient()
     return found
 
 

@@ -49,7 +49,8 @@ def test_the_script_writes_an_image_and_prints_the_gradients_shape(tmp_path):
     script, _ = blocks("python")
     assert len([line for line in script.splitlines() if line]) <= 15
     total = "print(dr.sum(dr.abs(dr.grad(params[key]).array))[0])"
-    shape, total = run(script + total, tmp_path)
+    fewer = script.replace("spp=8", "spp=1")
+    shape, total = run(fewer + total, tmp_path)
     assert re.fullmatch(r"\(\d{6,}, 3\)", shape)
     assert float(total) > 0
     image = np.array(mi.Bitmap(str(tmp_path / "frame.exr")))

@@ -285,3 +285,54 @@ def test_what_has_no_derivative_is_refused(folder) -> None:
         InputError, match="PRBIntegrator has no derivative by the camera"
     ):
         drive.gradient(drive.run(drive.loop.initial(STATE)))
+
+
+def test_constants_of_the_derivative_are_refused(folder) -> None:
+    for key in ("sensor.x_fov", "sensor.film.size"):
+        with pytest.raises(InputError, match="a constant of the derivative"):
+            SceneSensor(scene(folder), toy.MOUNT, [key])
+    with pytest.raises(InputError, match="prb_projective by shapes"):
+        SceneSensor(board(), toy.MOUNT, ["board.to_world"])
+
+
+def test_detached_values_are_set_too(folder) -> None:
+    sensor = SceneSensor(scene(folder), toy.MOUNT, [KEY])
+    loop = close(sensor)
+    drive = Rollout(loop, StageSum(toy.square_error), 3)
+    bright = {KEY: mi.TensorXf(np.full(sensor.params[KEY].shape, 0.9, np.float32))}
+    initial = loop.initial(STATE)
+    value = drive(bright, initial)
+    assert value[0] == pytest.approx(drive.measure(initial).value, rel=1e-6)
+    np.testing.assert_allclose(sensor.params[KEY].numpy(), 0.9, rtol=1e-5)
+    assert sensor.keys == (KEY,)
+
+
+def test_nothing_is_left_of_a_gradient_that_failed_or_of_images(folder) -> None:
+    loaded = scene(folder)
+    sensor = SceneSensor(loaded, toy.MOUNT, [KEY, "fields.near.to_world"])
+    params, loop = mi.traverse(loaded), close(sensor)
+    drive = Rollout(loop, StageSum(toy.square_error), 3)
+    evaluation = drive.run(loop.initial(STATE))
+
+    def gradient() -> np.ndarray:
+        dr.enable_grad(params[KEY])
+        params.update()
+        dr.backward(dr.sum(mi.render(loaded, params), axis=None))
+        found = dr.grad(params[KEY]).numpy().copy()
+        params[KEY] = dr.detach(params[KEY])
+        params.update()
+        return found
+
+    rendered(loaded, STATE)  # puts the scene's sensor there
+    expected = gradient()
+    assert np.abs(expected).max() > 0
+    drive.by_images(evaluation.trajectory, [1])
+
+    def interrupt(step: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        drive.gradient(evaluation, offsets=True, on_step=interrupt)
+    assert not dr.grad_enabled(params["fields.near.to_world"].matrix)
+    found = gradient()
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
