@@ -168,15 +168,20 @@ class _View:
         """Splat rays and divide by their weights; differentiable."""
         block = self.film.create_block()
         block.set_coalesce(block.coalesce() and self.spp >= 4)
-        mi.ad.integrators.common.ADIntegrator._splat_to_block(
-            block,
-            self.film,
-            self.position,
-            value=colour * self.weight,
-            weight=mi.Float(1),
-            alpha=alpha,
-            aovs=list(aovs),
-            wavelengths=self.ray.wavelengths,
-        )
+        block.put(self.position, self._channels(block, colour, alpha, aovs))
         self.film.put_block(block)
         return self.integrator.developed(self.film.develop())
+
+    def _channels(
+        self, block: mi.ImageBlock, colour: Any, alpha: mi.Float, aovs: list
+    ) -> list[mi.Float]:
+        """Return what a film wants of rays: colours, weights and AOVs."""
+        value, wavelengths = colour * self.weight, self.ray.wavelengths
+        if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
+            count = block.channel_count()
+            return self.film.prepare_sample(value, wavelengths, count, 1.0, alpha)
+        if mi.is_spectral:
+            value = mi.spectrum_to_srgb(value, wavelengths)
+        rgb = [value.x] * 3 if mi.is_monochromatic else [*value]
+        has_alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
+        return [*rgb, *([alpha] if has_alpha else []), mi.Float(1), *aovs]

@@ -16,7 +16,7 @@ from mi_nerfattack.io import files
 variant.ensure()
 
 import mi_nerfattack.experiment.results  # noqa: E402, F401  slow, so before the fork
-from mi_nerfattack.backend.torch_arrays import one_thread  # noqa: E402  see above
+from mi_nerfattack.backend.determinism import one_thread  # noqa: E402  see above
 from mi_nerfattack.experiment.job import Job  # noqa: E402  see above
 from mi_nerfattack.fields import GridField, GridLayout, save_field  # noqa: E402  see above
 from mi_nerfattack.policy.pilotnet import PilotNet  # noqa: E402  see above

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.study.rows import Row
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.experiment.job import Job
 from mi_nerfattack.scenario.scenario import load_scenario
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.checks.before_attack import changeable_share

@@ -1,3 +1,3 @@
 from .determinism import deterministic as deterministic
-from .torch_arrays import one_thread as one_thread
+from .determinism import one_thread as one_thread
 from .variant import ensure as ensure

@@ -1,7 +1,7 @@
 """Equal input, equal bits; and the random generators that all code shares.
 
-Torch is never imported here: it is taken into account where something else has
-loaded it.
+Only `one_thread` imports torch: elsewhere it is taken into account where something
+else has loaded it.
 """
 
 from __future__ import annotations
@@ -102,3 +102,16 @@ def _deterministic_torch() -> Iterator[None]:
 
 def _torch() -> Any:
     return sys.modules.get("torch")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: several wait spinning while the renderer works."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,12 +1,7 @@
-"""Arrays of Dr.Jit as torch's and back, and the number of threads that torch uses.
-
-Memory is shared where it can be.
-"""
+"""Arrays of Dr.Jit as torch's and back; memory is shared where it can be."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -32,17 +27,6 @@ def to_tensor(value: torch.Tensor, like: Any) -> Any:
 def to_row(value: torch.Tensor, like: Any) -> Any:
     """Make a Dr.Jit row (n,) of the scalar type and backend of the tensor `like`."""
     return dr.array_t(like)(_settled(value, like))
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread: several wait spinning while the renderer works."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _settled(value: torch.Tensor, like: Any) -> Any:

@@ -35,7 +35,7 @@ class Check:
         import shlex
 
         from mi_nerfattack import variant
-        from mi_nerfattack.backend.torch_arrays import one_thread
+        from mi_nerfattack.backend.determinism import one_thread
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.checks import check as checks

@@ -103,7 +103,7 @@ class Sweep:
         return SlurmJobs(*jobs, self._count())
 
     def _check(self, cells: list[Cell]) -> Result:
-        from mi_nerfattack.backend.torch_arrays import one_thread
+        from mi_nerfattack.backend.determinism import one_thread
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.sweep.forecast import Forecast, sentences
 

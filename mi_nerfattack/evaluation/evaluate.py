@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.roadside.rule import Roadside

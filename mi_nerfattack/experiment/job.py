@@ -13,9 +13,8 @@ import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
 from mi_nerfattack.backend import variant
-from mi_nerfattack.backend.determinism import deterministic
+from mi_nerfattack.backend.determinism import deterministic, one_thread
 from mi_nerfattack.backend.interrupts import held_interrupts
-from mi_nerfattack.backend.torch_arrays import one_thread
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.baseline import Baseline

@@ -28,6 +28,7 @@ PRIVATE = {
 # Of PyTrees, and left out of Dr.Jit's own stubs.
 FIELDS = {"data": HashGridEncoding, "layers": nn.Sequential, "weights": nn.Linear}
 DETAIL = {
+    "drjit.detail.collect_indices",
     "drjit.detail.llvm_version",
     "drjit.detail.malloc_clear_statistics",
     "drjit.detail.malloc_watermark",

@@ -37,9 +37,11 @@ def run_scenario(
     started = time.perf_counter()
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.claim import claimed
-    from mi_nerfattack.experiment.job import attack_claimed
 
     with claimed(output, resume):
+        # seconds, with torch: not before the folder is found to be free
+        from mi_nerfattack.experiment.job import attack_claimed
+
         field = object_field()  # it shows bars of its own
         with StageBars(started) as bars:
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mi_nerfattack.attack.black_box.search import Judged, Proposal, Textures
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.experiment.transfer.columns import Column

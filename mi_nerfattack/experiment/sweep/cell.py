@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.claim import claimed

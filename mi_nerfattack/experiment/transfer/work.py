@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.deploy.environment import AbstractEnvironment

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mi_nerfattack import cli
-from mi_nerfattack.backend.torch_arrays import one_thread
+from mi_nerfattack.backend.determinism import one_thread
 from mi_nerfattack.deploy.driving import drive
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.transfer import run as transfer_run
