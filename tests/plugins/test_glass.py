@@ -13,6 +13,7 @@ from helpers import toy_loop as toy
 from helpers.derivatives import central_difference
 
 from mi_nerfattack.fields import GridLayout, save_field
+from mi_nerfattack.fields.occupancy import Occupancy
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "glass.xml"
 SPP = 128
@@ -25,6 +26,9 @@ def scene(variant: str, tmp_path: Path) -> mi.Scene:
     """The example with a soft object: differences need edges wider than a step."""
     field = toy.blob(GridLayout(3, 6, 12), 0.4, 3.5, 0.02, 2)
     field.lower, field.upper = (x + [0, 0, 0.4] for x in (field.lower, field.upper))
+    cells = np.zeros((16, 16, 16), bool)
+    cells[1:-1, 1:-1, 1:-1] = True  # the pose has derivatives if the border is empty
+    field.occupy(Occupancy(cells))
     red = np.tile(np.float32([0.8, -0.8, -0.8]), (field.n_vertices, 1))
     field.set_parameter("texture", red)
     save_field(tmp_path / "soft.safetensors", field)

@@ -349,10 +349,11 @@ def test_volume_outside_of_its_box(grid: str, rng, method: str) -> None:
 def test_touching_objects(grid: str, rng, composite: str) -> None:
     beside = mi.ScalarTransform4f().translate([0, 2, 0])
     one, two = volume(grid), volume(grid, to_world=beside)
-    seeing = integrator(one=one, two=two, composite=composite, aovs=True)
-    loaded = scene(seeing, (2.5, 3.5, 0.6), (0, 0.9, 0))
-    image = np.array(mi.render(loaded, spp=4))
+    view = (2.5, 3.5, 0.6), (0, 0.9, 0)
+    seeing = integrator(one=one, two=two, composite=composite)
+    image = np.array(mi.render(scene({**seeing, "aovs": True}, *view), spp=4))
     assert ((image[..., -1] < np.inf) & (image[..., -6] < np.inf)).any()
+    loaded = scene(seeing, *view)
     for name in ("one.colour", "two.density"):
         found = problem(loaded, name)
         found.check(directions(rng, field_of(loaded), found.base.shape))
