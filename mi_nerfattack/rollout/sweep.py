@@ -259,7 +259,7 @@ def backward(
     sensor = differentiable(loop)
     alone = options.attached or options.recorder is not None
     together = 1 if alone else max(1, IMAGES // drive.count)
-    if options.recorder is not None and not sensor.fields:
+    if options.recorder is not None and not sensor.textures():
         raise InputError(
             "recorder: takes apart the gradient of objects' colours; the sensor's "
             "parameters have none"
