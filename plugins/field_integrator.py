@@ -26,6 +26,7 @@ from mi_nerfattack.plugins.properties import (
 )
 from mi_nerfattack.plugins.splat_background import SplatBackgroundVolume
 from mi_nerfattack.render.backdrop import only_fields
+from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
 from mi_nerfattack.render.lighting.relight import LIGHT_SAMPLES, Relighting
 from mi_nerfattack.render.rays import Rays
@@ -212,8 +213,7 @@ class FieldIntegrator(FilmIntegrator):
         before = self.differentiates_behind
         self.differentiates_behind = limits.check(self, scene)
         with ExitStack() as stack:
-            # Inside an operation, Dr.Jit cannot pass tangents from a parameter on to
-            # what was derived from it before.
+            # Dr.Jit passes no tangents on inside an operation: see `tangents`
             for volume in self.volumes if mode == dr.ADMode.Forward else []:
                 stack.enter_context(volume.tangents())
             try:
@@ -298,7 +298,7 @@ class FieldIntegrator(FilmIntegrator):
             dr.backward_from(result)
             cotangent = dr.grad(leaf.seen)
             δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
-            by_sky = dr.grad(direction)
+            by_sky = dr.grad(direction) if by_camera else None
         if self.differentiates_behind:
             sample_nested(
                 self.behind,
@@ -313,23 +313,27 @@ class FieldIntegrator(FilmIntegrator):
         if not by_camera and not any(item.has_pose_gradients for item in self.posed):
             self.collector.add(rays, state.seen, cotangent)
             return
-        # Fields, camera and poses in one march
+        self._backward_rays(ray, rays, state, cotangent, by_sky)
+
+    def _backward_rays(
+        self, ray: mi.Ray3f, rays: Rays, state: State, cotangent: Seen, by_sky: Any
+    ) -> None:
+        """March fields, poses and, with `by_sky`, the camera back at once."""
         wanted = [
             k
             for k, item in enumerate(self.posed)
-            if by_camera or item.has_gradients or item.has_pose_gradients
+            if by_sky is not None or item.has_gradients or item.has_pose_gradients
         ]
         found = self.composite.backward_rays(
             self.posed, rays, state.seen, cotangent, self.stop, wanted
         )
         for k, by_rays in zip(wanted, found, strict=True):
             self.posed[k].backward_pose(rays, by_rays)
-        if by_camera:
+        if by_sky is not None:
             by_origin = sum((part.origin for part in found), mi.Vector3f(0))
             by_direction = sum((part.direction for part in found), by_sky)
             with dr.resume_grad():
-                result = dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction)
-                dr.backward_from(result)
+                dr.backward_from(dr.dot(ray.o, by_origin) + dr.dot(ray.d, by_direction))
 
     def start_gradient(self, scene: mi.Scene, keys: Collection[str]) -> None:
         """Collect the rays of backward passes until :meth:`finish_gradient`.
@@ -389,9 +393,8 @@ class FieldIntegrator(FilmIntegrator):
 
     def to_string(self) -> str:
         """Describe the checked parameters."""
-        kind = type(self.composite).__name__
-        names = ", ".join(volume.id() for volume in self.volumes)
-        return f"FieldIntegrator[fields=({names}), {kind}, stop={self.stop}]"
+        kind, ids = type(self.composite).__name__, [v.id() for v in self.volumes]
+        return f"FieldIntegrator[fields=({', '.join(ids)}), {kind}, stop={self.stop}]"
 
 
 mi.register_integrator("field_integrator", lambda props: FieldIntegrator(props))

@@ -88,7 +88,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         self._collector: CollectsRays | None = None
         if isinstance(self.integrator, CollectsRays):
             self._collector = self.integrator
-        # While a gradient is collected: what it replaces, and what collects it
         self._before: dict[str, Any] = {}
         self._leaves: dict[str, Any] = {}
         self._arrays: list[tuple[GridField, mi.Float]] = []
@@ -123,8 +122,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         """Name integrator, size and parameters."""
         kind, (width, height) = type(self.integrator).__name__, self.camera.size
         return f"SceneSensor({kind}, {width}x{height}, params={list(self.keys)})"
-
-    # Frames
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render a frame; see :meth:`AbstractSensor.observe`."""
@@ -255,7 +252,8 @@ class SceneSensor(AbstractDifferentiableSensor):
                 leaf = type(value)(dr.detach(value))
                 dr.enable_grad(leaf)
                 self.params[key] = self._leaves[key] = leaf
-        self.params.update()
+        if self._leaves:  # an update evaluates the values of all parameters
+            self.params.update()
         self._arrays = [(field, start_gradient(field)) for field in self._fields()]
 
     def gradients(self) -> dict[str, Any]:
@@ -277,7 +275,8 @@ class SceneSensor(AbstractDifferentiableSensor):
             self._collector.stop_gradient()
         for key, value in self._before.items():
             self.params[key] = value
-        self.params.update()
+        if self._before:
+            self.params.update()
         for field, packed in self._arrays:
             field.packed = packed
         self._before, self._leaves, self._arrays = {}, {}, []
