@@ -100,10 +100,8 @@ def _row(
     posed, stop = PosedField(field), case[2]
     forward, seen = _time(lambda: march(posed, rays, stop), repeats)
     ones = March(mi.Color3f(1), mi.Float(1), mi.Float(0))
-    mode = dr.ADMode.Backward
-    derivative, _ = _time(
-        lambda: march_derivative(mode, posed, rays, seen, ones, stop), repeats
-    )
+    fixed = dr.ADMode.Backward, posed, rays, seen, ones, stop
+    derivative, _ = _time(lambda: march_derivative(*fixed, with_rays=True), repeats)
     image, depth = _image(field, seen, rays)
     error = np.abs(image - expected[0])
     both = np.isfinite(depth) & np.isfinite(expected[1])
