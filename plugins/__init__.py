@@ -21,6 +21,7 @@ _MODULES = (
     "field_volume",
     "grid_field",
     "ngp_field",
+    "brick_field",
     "splat_background",
     "field_emitter",
     "aovs",
@@ -29,10 +30,11 @@ _MODULES = (
     "nested",
     "collector",
     "field_integrator",
+    "loaded",
     "opencv_camera",
 )
 _REGISTERED = {
-    "register_texture": ("grid_field", "ngp_field", "splat_background"),
+    "register_texture": ("grid_field", "ngp_field", "brick_field", "splat_background"),
     "register_emitter": ("field_emitter",),
     "register_integrator": ("field_integrator",),
     "register_sensor": ("opencv_camera",),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -83,14 +84,15 @@ class FrozenComposite:
             width: rays in a row.
         """
         composite, posed, stop = self._parts
-        if posed[0].has_gradients:
+        if not posed or posed[0].has_gradients:
             return self._render(rays, [])
         # The first layer, mostly the scene, in the fastest way
         if self._first is None:
             self._first = composite.ahead(posed[0], stop)
-        return self._render(
-            rays, [self._first.march(rays, width)] if self._first else []
-        )
+        if self._first is None:
+            return self._render(rays, [])
+        alone = replace(rays, gains=rays.gains[:1])
+        return self._render(rays, [self._first.march(alone, width)])
 
     def _record(self, rays: Rays, kept: list[March]) -> Seen:
         composite, posed, stop = self._parts

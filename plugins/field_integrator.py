@@ -10,13 +10,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins import limits
 from mi_nerfattack.plugins.aovs import FieldChannels
 from mi_nerfattack.plugins.collector import FrozenComposite, RayCollector
 from mi_nerfattack.plugins.field_volume import AbstractFieldVolume
 from mi_nerfattack.plugins.film import FilmIntegrator
-from mi_nerfattack.plugins.nested import State, lay_over, look, sample_nested
+from mi_nerfattack.plugins.nested import (
+    State,
+    lay_over,
+    look,
+    push_forward,
+    sample_nested,
+)
 from mi_nerfattack.plugins.properties import (
     Mask,
     read_composite,
@@ -44,7 +49,8 @@ class FieldIntegrator(FilmIntegrator):
 
      * - (Nested plugin)
        - |volume|
-       - ``grid_field``, ``ngp_field``, ``splat_background``; one or more
+       - ``grid_field``, ``ngp_field``, ``brick_field``, ``splat_background``; one or
+         more
        - |exposed|, |differentiable|
 
      * - (Nested plugin)
@@ -137,7 +143,7 @@ class FieldIntegrator(FilmIntegrator):
     ``render.lighting.spectrum``; AOVs are RGB everywhere.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: mi.Properties, fewest: int = 1) -> None:
         super().__init__(props)
         spectrum.prepare()
         self.stop = read_stop(props)
@@ -145,7 +151,7 @@ class FieldIntegrator(FilmIntegrator):
         self.jitter = bool(props.get("jitter", False))
         has_aovs = bool(props.get("aovs", False))
         kinds = (AbstractFieldVolume, SplatBackgroundVolume)
-        self.volumes, others = read_nested(props, "field_integrator", kinds)
+        self.volumes, others = read_nested(props, "field_integrator", kinds, fewest)
         is_first = bool(others) and isinstance(others[0], mi.SamplingIntegrator)
         refuse_nested(
             others[1:] if is_first else others,
@@ -265,7 +271,7 @@ class FieldIntegrator(FilmIntegrator):
             self._backward(scene, sampler, attached, rays, state, δL, δsplats)
             return δL, valid, [], None
         limits.check_forward(attached)
-        tangent, t_splats = self._forward(scene, sampler, ray, rays, state)
+        tangent, t_splats = push_forward(self, scene, sampler, ray, rays, state)
         return tangent, valid, [], t_splats
 
     def _backward(
@@ -358,38 +364,25 @@ class FieldIntegrator(FilmIntegrator):
         self.collector.clear()
         self.differentiates_behind = self.collector.waits = False
 
-    def _forward(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        rays: Rays,
-        state: State,
-    ) -> tuple[Any, Any]:
-        """Return the tangents of the colour and of :meth:`splats`."""
-        tangent = self.composite.forward(self.posed, rays, state.seen, self.stop)
-        if len(tangent.layers) < len(self.channels.ids):
-            raise InputError(
-                "composite interleaved: the shares of single fields have no tangents; "
-                "set composite to depth, or aovs to false"
-            )
-        with dr.resume_grad():
-            leaf = state.copy()
-            dr.enable_grad(leaf.seen, leaf.behind)
-            dr.set_grad(leaf.seen.total, tangent.total)
-            for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
-                dr.set_grad(layer, part)
-            if self.differentiates_behind:
-                mode, inner = dr.ADMode.Forward, state.inner
-                t_behind, *_ = sample_nested(
-                    self.behind, mode, scene, sampler, ray, rays.active, state_in=inner
-                )
-                dr.set_grad(leaf.behind, t_behind)
-            colour = lay_over(self, leaf.seen.total, rays, leaf.behind, ray)
-            found = colour, *self.splats(leaf)
-            flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-            colour, alpha, aovs = dr.forward_to(found, flags=flags)
-        return colour, (alpha, aovs)
+    def check_camera(self, scene: mi.Scene) -> None:
+        """Raise InputError where rays have no derivative by the camera."""
+        limits.check_camera(self, scene, limits.ATTACHED)
+
+    def keep(self, state: State) -> State:
+        """Return a state whose march is that part of it which is costly."""
+        seen: Any = self.composite.keep(state.seen)
+        return replace(state, seen=seen)
+
+    def restore(self, ray: mi.Ray3f, kept: State) -> State:
+        """Return the state that :meth:`keep` was given.
+
+        Args:
+            ray: the rays again.
+            kept: of the state.
+        """
+        rays = Rays(ray.o, ray.d, gains=kept.gains)
+        seen = self.composite.restore(self.posed, rays, kept.seen, self.stop)
+        return replace(kept, seen=seen)
 
     def to_string(self) -> str:
         """Describe the checked parameters."""

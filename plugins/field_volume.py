@@ -1,4 +1,4 @@
-"""What the volumes `grid_field` and `ngp_field` share."""
+"""What the volumes `grid_field`, `ngp_field` and `brick_field` share."""
 
 from __future__ import annotations
 
@@ -11,13 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields import (
-    AbstractField,
-    BrickField,
-    GridField,
-    NGPField,
-    load_field,
-)
+from mi_nerfattack.fields import AbstractField, load_field
 from mi_nerfattack.fields.grid import check_positive
 from mi_nerfattack.plugins.properties import Mask, read_filename, read_pose
 from mi_nerfattack.render.camera.pose import Pose
@@ -27,20 +21,26 @@ from mi_nerfattack.render.posed import PosedField
 QUANTITIES = ("density", "radiance")
 
 
-def read_field(props: mi.Properties, kind: str) -> GridField | NGPField:
-    """Load the file named by the property `filename` and check its kind."""
+def read_field(
+    props: mi.Properties, kind: str, skips_thin: bool | None
+) -> AbstractField:
+    """Load the file named by the property `filename` and check its kind.
+
+    Args:
+        props: of the plugin.
+        kind: of the field.
+        skips_thin: whether rays skip what is thin; None if the property says it.
+    """
     name = read_filename(props)
     field = load_field(name)
-    if isinstance(field, BrickField):
-        raise InputError(
-            f"{name}: holds a {field.kind}, for scenarios; give the field that it was "
-            "baked from"
-        )
     if field.kind != kind:
         raise InputError(
             f'{name}: holds a {field.kind}; use <volume type="{field.kind}">'
         )
-    field.see_all()  # derivatives by rays, and media, do
+    if skips_thin is None:
+        skips_thin = bool(props.get("skip_thin", False))
+    if not skips_thin:
+        field.see_all()
     return field
 
 
@@ -89,25 +89,32 @@ class AbstractFieldVolume(mi.Volume):
     """Field of one kind as a Mitsuba volume.
 
     Members set `kind` and register themselves.
+
+    Args:
+        props: of the plugin.
+        posed: the field where it is, if it is loaded already: it is shared, and of the
+            properties, those of a file count for nothing.
     """
 
     kind = ""
-    field: GridField | NGPField
+    field: Any  # of that kind
+    skips_thin: bool | None = None
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: mi.Properties, posed: PosedField | None = None) -> None:
         spectrum.prepare()
-        quantity, pose = read_quantity(props), read_pose(props)
-        limit = read_limit(props)
-        field = read_field(props, self.kind)
-        field.refine(read_step(props, field.step_m))
-        super().__init__(place_unit_cube(props, field, pose))
+        quantity, limit = read_quantity(props), read_limit(props)
+        if posed is None:
+            pose = read_pose(props)
+            field = read_field(props, self.kind, self.skips_thin)
+            field.refine(read_step(props, field.step_m))
+            posed = PosedField(field, pose)
+        super().__init__(place_unit_cube(props, posed.field, posed.placed))
         self.quantity, self.limit = quantity, limit
-        self.field = field
         self.relit = bool(props.get("relit", False))
-        self.posed = PosedField(field, pose)
-        self._loaded = pose
+        self.field, self.posed = posed.field, posed
+        self._loaded = posed.placed
         # Mitsuba finds them here where `drjit.freeze` records a rendering
-        self.live = [field.live, self.posed.live]
+        self.live = [posed.field.live, posed.live]
 
     def parameters(self) -> dict[str, Any]:
         """Return what `traverse` exposes, by name: the same objects for good."""
@@ -115,9 +122,11 @@ class AbstractFieldVolume(mi.Volume):
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose the parameters of the field, and its pose."""
+        kind, moved = mi.ParamFlags, self.field.differentiable_by_position
         for name, value in self.parameters().items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
-        cb.put("to_world", self.posed.to_world, mi.ParamFlags.Differentiable)
+        by_pose = kind.Differentiable if moved else kind.NonDifferentiable
+        cb.put("to_world", self.posed.to_world, by_pose)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Hand changed parameters to the field; what is empty stays so.
@@ -211,6 +220,5 @@ class AbstractFieldVolume(mi.Volume):
     def to_string(self) -> str:
         """Describe the checked parameters."""
         return (
-            f"{self.kind}[{self.field.layout}, quantity={self.quantity}, "
-            f"bbox={self.bbox()}]"
+            f"{self.kind}[{self.field}, quantity={self.quantity}, bbox={self.bbox()}]"
         )

@@ -20,7 +20,7 @@ class GridFieldVolume(AbstractFieldVolume):
     ----------------------------------------------
 
     .. pluginparameters::
-     :extra-rows: 6
+     :extra-rows: 7
 
      * - filename
        - |string|
@@ -45,6 +45,11 @@ class GridFieldVolume(AbstractFieldVolume):
      * - step_m
        - |float|
        - Step of the march, metres in the field's frame. (Default: that of the file)
+
+     * - skip_thin
+       - |bool|
+       - Let rays skip parts of cells that the fit found too thin to matter, which is
+         faster; no derivative by ``to_world`` or the sensor then. (Default: |false|)
 
      * - relit
        - |bool|
@@ -96,7 +101,7 @@ class GridFieldVolume(AbstractFieldVolume):
     """
 
     kind = "grid_field"
-    field: GridField  # pyright: ignore[reportIncompatibleVariableOverride]
+    field: GridField
 
     def parameters(self) -> dict[str, Any]:
         """Return the colours of the finest level's vertices, and the densities."""

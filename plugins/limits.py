@@ -10,8 +10,9 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
-from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.backdrop import fields_by_rays
 
+ATTACHED = "attached"
 _RELIT = (
     "{}: has no derivative where fields are relit, since their light is a constant; "
     "set relit to false"
@@ -60,18 +61,25 @@ def check(
 
 
 def check_camera(integrator: Any, scene: mi.Scene, key: str) -> None:
-    """Raise InputError where rays have no derivative by the camera."""
+    """Raise InputError where rays have no derivative by the camera.
+
+    Args:
+        integrator: a `field_integrator`.
+        scene: that it renders.
+        key: of the sensor's parameter; ``attached`` for the drives of a loop.
+    """
+    other = "differentiate by to_world of the fields"
+    if key == ATTACHED:
+        other = "set attached to false"
     if scene.shapes() or integrator.behind is not None:
         raise InputError(
             f"{key}: surfaces and a nested integrator have no derivative by the "
-            "camera; take them out of the scene, or differentiate by to_world of the "
-            "fields"
+            f"camera; take them out of the scene, or {other}"
         )
     if integrator.relighting is not None:
         raise InputError(_RELIT.format(key))
-    for item in integrator.posed:
-        if isinstance(item, PosedField):
-            item.check_continuous(key)
+    for item in fields_by_rays(integrator.posed):
+        item.check_continuous(key)
 
 
 def _check_relit(integrator: Any, key: str, node: Any) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.properties import background
 from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.lighting import spectrum
@@ -113,3 +114,42 @@ def lay_over(
         return spectrum.emission(total.radiance, ray.wavelengths) + passed * behind
     sky = background(integrator.volumes, rays.direction) & (rays.t_max == dr.inf)
     return spectrum.emission(total.radiance + passed * sky, ray.wavelengths)
+
+
+def push_forward(
+    integrator: Any,
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    rays: Rays,
+    state: State,
+) -> tuple[Any, Any]:
+    """Return the tangents of the colour and of the integrator's `splats`.
+
+    Raises:
+        InputError: channels of single fields, which have no tangents in this composite.
+    """
+    fixed = integrator.posed, rays, state.seen, integrator.stop
+    tangent = integrator.composite.forward(*fixed)
+    if len(tangent.layers) < len(integrator.channels.ids):
+        raise InputError(
+            "composite interleaved: the shares of single fields have no tangents; "
+            "set composite to depth, or aovs to false"
+        )
+    with dr.resume_grad():
+        leaf = state.copy()
+        dr.enable_grad(leaf.seen, leaf.behind)
+        dr.set_grad(leaf.seen.total, tangent.total)
+        for layer, part in zip(leaf.seen.layers, tangent.layers, strict=False):
+            dr.set_grad(layer, part)
+        if integrator.differentiates_behind:
+            nested, mode = integrator.behind, dr.ADMode.Forward
+            t_behind, *_ = sample_nested(
+                nested, mode, scene, sampler, ray, rays.active, state_in=state.inner
+            )
+            dr.set_grad(leaf.behind, t_behind)
+        colour = lay_over(integrator, leaf.seen.total, rays, leaf.behind, ray)
+        found = colour, *integrator.splats(leaf)
+        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+        colour, alpha, aovs = dr.forward_to(found, flags=flags)
+    return colour, (alpha, aovs)

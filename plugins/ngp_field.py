@@ -15,7 +15,7 @@ class NGPFieldVolume(AbstractFieldVolume):
     ---------------------------------------
 
     .. pluginparameters::
-     :extra-rows: 6
+     :extra-rows: 7
 
      * - filename
        - |string|
@@ -41,6 +41,11 @@ class NGPFieldVolume(AbstractFieldVolume):
      * - step_m
        - |float|
        - Step of the march, metres in the field's frame. (Default: that of the file)
+
+     * - skip_thin
+       - |bool|
+       - Let rays skip parts of cells that the fit found too thin to matter, which is
+         faster; no derivative by ``to_world`` or the sensor then. (Default: |false|)
 
      * - relit
        - |bool|

@@ -54,15 +54,20 @@ def read_composite(props: mi.Properties) -> AbstractComposite:
 
 
 def read_nested(
-    props: mi.Properties, plugin: str, kinds: tuple[type, ...]
+    props: mi.Properties, plugin: str, kinds: tuple[type, ...], fewest: int = 1
 ) -> tuple[list[Any], list[Any]]:
-    """Split nested objects into volumes of some kinds, at least one, and the others."""
+    """Split nested objects into volumes of some kinds, and the others.
+
+    Raises:
+        InputError: there are too few volumes.
+    """
     volumes, others = [], []
     for _, item in props.objects():
         (volumes if isinstance(item, kinds) else others).append(item)
-    if not volumes:
+    if len(volumes) < fewest:
         raise InputError(
-            f"{plugin}: no nested grid_field or ngp_field; give one or more"
+            f"{plugin}: no nested volume; give one or more of grid_field, ngp_field "
+            "and brick_field"
         )
     return volumes, others
 
@@ -72,17 +77,17 @@ def refuse_nested(others: list[Any], plugin: str, also: str = "") -> None:
     if others:
         raise InputError(
             f"{plugin}: cannot use the nested {type(others[0]).__name__} "
-            f"{others[0].id()!r}; allowed: grid_field, ngp_field{also}"
+            f"{others[0].id()!r}; allowed: grid_field, ngp_field, brick_field{also}"
         )
 
 
 def background(volumes: list[Any], direction: mi.Vector3f) -> mi.Color3f:
-    """Return what lies behind the first NGP among the volumes; black without one.
+    """Return what lies behind the first volume with a sky; black without one.
 
     The sky turns with the field.
     """
     for volume in volumes:
         field = getattr(volume, "field", None)  # splats have none
-        if field is not None and field.kind == "ngp_field":
+        if field is not None and field.has_sky:
             return volume.posed.background(direction)
     return mi.Color3f(0)

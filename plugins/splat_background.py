@@ -67,13 +67,15 @@ class SplatBackgroundVolume(mi.Volume):
     It has no parameters in ``mi.traverse``, and nothing is differentiated by it.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(
+        self, props: mi.Properties, posed: SplatBackground | None = None
+    ) -> None:
         spectrum.prepare()
-        pose = read_pose(props)
-        name = read_filename(props)
+        if posed is None:
+            pose, name = read_pose(props), read_filename(props)
+            posed = SplatBackground(read_splats(name), pose)
         super().__init__(props)
-        self.splats = read_splats(name)
-        self.posed = SplatBackground(self.splats, pose)
+        self.posed = posed
         self.relit = False
 
     def eval(self, it: mi.Interaction3f, active: Mask = True) -> Any:
@@ -98,10 +100,7 @@ class SplatBackgroundVolume(mi.Volume):
 
     def to_string(self) -> str:
         """Describe the checked parameters."""
-        return (
-            f"splat_background[{self.splats.count} splats of degree "
-            f"{self.splats.degree}]"
-        )
+        return f"splat_background[{self.posed.name}]"
 
 
 mi.register_texture("splat_background", lambda props: SplatBackgroundVolume(props))

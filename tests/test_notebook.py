@@ -64,11 +64,11 @@ def assert_short(thing, *words):
 def test_reprs_of_a_loop_are_short(driven):
     loop, rollout, evaluation = driven
     observation = loop.sensor.observe(evaluation.trajectory.states[0], 0)
-    assert_short(loop, "FieldSensor", "Dubins", "0.1 s")
+    assert_short(loop, "SceneSensor", "Dubins", "0.1 s")
     assert_short(rollout, "3 periods", "detached")
     assert_short(evaluation, f"{evaluation.value:.6g}", "2 drives")
     assert_short(evaluation.trajectory, "2 drives, 3 periods of 0.1 s")
-    assert_short(loop.sensor, "24x10", "objects: 1")
+    assert_short(loop.sensor, "24x10", "fields.object.colour")
     assert_short(loop.sensor.fields[0], "2 x 2 x 2 m")
     assert_short(loop.policy, "SmoothPolicy", "IntegerGoal(count=3)")
     assert_short(observation, "2 images 24x10")

@@ -27,12 +27,12 @@ from bench.render.sides import STOP, Clock
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.gradient import GradientAttack
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import load_field, load_grid
 from mi_nerfattack.policy.preprocess import Preprocess
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds, Replay
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop, Step, simulate
 from mi_nerfattack.rollout.objective import StageSum
@@ -63,7 +63,7 @@ class OurAttack(AbstractAttack):
         hydrant = bundled("hydrant/field.safetensors")
         items = [PosedField(load_grid(hydrant), pose) for pose in job.object_poses()]
         scene = PosedField(load_field(bundled("intersection/field.safetensors")))
-        sensor = FieldSensor(scene, items, job.camera, MOUNT, stop=STOP)
+        sensor = field_sensor(scene, items, job.camera, MOUNT, stop=STOP)
         policy = TorchPolicy(network(), preprocess=Preprocess(job.transforms()))
         path = route()
         vehicle = Dubins(SPEED_MS, MAX_HEADING_RATE)
@@ -84,7 +84,7 @@ class OurAttack(AbstractAttack):
         self.loops = dict.fromkeys(set(ADJOINTS) - {BAKED}, self.loop)
         if baked is not None:
             view = job.camera, MOUNT, None, STOP
-            bricks = FieldSensor(PosedField(load_field(baked)), items, *view)
+            bricks = field_sensor(PosedField(load_field(baked)), items, *view)
             self.loops[BAKED] = replace(self.loop, sensor=bricks)
 
     def iterate(self, how: str) -> dict[str, float]:
@@ -110,8 +110,7 @@ class OurAttack(AbstractAttack):
         shares: list[float] = []
 
         def look(step: Step) -> None:
-            seen = step.observation.seen
-            assert seen is not None
+            seen = step.observation.kept.seen
             visible = seen.layers[1].opacity.numpy().reshape(self.job.poses, -1)
             shares.extend((visible > VISIBLE).mean(1).tolist())
 
@@ -178,6 +177,8 @@ def _timed(action: Callable[[], Any]) -> dict[str, float]:
 
 def _bytes(value: Any) -> int:
     """Count the bytes of Dr.Jit arrays in lists and data classes."""
+    if value is None:
+        return 0
     if is_dataclass(value):
         return sum(_bytes(getattr(value, item.name)) for item in fields(value))
     if isinstance(value, list | tuple):

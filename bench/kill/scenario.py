@@ -18,7 +18,7 @@ variant.ensure()
 import mi_nerfattack.experiment.results  # noqa: E402, F401  slow, so before the fork
 from mi_nerfattack.backend.determinism import one_thread  # noqa: E402  see above
 from mi_nerfattack.experiment.job import Job  # noqa: E402  see above
-from mi_nerfattack.fields import GridField, GridLayout, save_field  # noqa: E402  see above
+from mi_nerfattack.fields import GridField, GridLayout, Occupancy, save_field  # noqa: E402  see above
 from mi_nerfattack.policy.pilotnet import PilotNet  # noqa: E402  see above
 from mi_nerfattack.policy.torch_policy import TorchPolicy  # noqa: E402  see above
 from mi_nerfattack.scenario.scenario import load_scenario  # noqa: E402  see above
@@ -99,6 +99,9 @@ def _fog(finest: int, half: float, density: float, step: float, seed: int) -> Gr
     grid.set_parameter("density", value)
     colours = np.random.default_rng(seed).normal(0, 0.7, (count, 3))
     grid.set_parameter("texture", colours.astype(np.float32))
+    cells = np.ones((16, 16, 16), bool)
+    cells[0, 0, 0] = False  # so the density has a slope at the faces of the box
+    grid.occupy(Occupancy(cells))
     return grid
 
 

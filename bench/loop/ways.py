@@ -24,7 +24,7 @@ from bench.loop.setting import (
     load_scene,
 )
 from bench.render.sides import Clock
-from mi_nerfattack.attack.surrogate import surrogate_sensor
+from mi_nerfattack.deploy.surrogate.scene import scene_sensor
 from mi_nerfattack.policy.drjit_network import DrJitNetwork
 from mi_nerfattack.policy.goals import NoGoal
 from mi_nerfattack.policy.torch_policy import TorchPolicy
@@ -96,7 +96,7 @@ class RolloutLoop(AbstractLoop):
     ) -> None:
         super().__init__(policy, width, height)
         self.adjoint = adjoint
-        self.sensor = surrogate_sensor(self.scene, MOUNT, [HYDRANT])
+        self.sensor = scene_sensor(self.scene, MOUNT, [HYDRANT])
         module = TorchRule() if policy == "torch" else DrJitNetwork(self._network)
         driver = TorchPolicy(module, NoGoal())
         # mi.render rounds no image to eight bits

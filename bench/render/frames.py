@@ -13,9 +13,10 @@ import mitsuba as mi
 from bench.attack.drive import MOUNT, Job
 from bench.render.sides import STOP
 from mi_nerfattack import variant
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import load_field, load_grid
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.scenes import bundled
 from mi_nerfattack.vehicle.state import to_state
 
@@ -54,14 +55,14 @@ def run(
     return document
 
 
-def _sensor(job: Job) -> FieldSensor:
+def _sensor(job: Job) -> SceneSensor:
     scene = PosedField(load_field(bundled("intersection/field.safetensors")))
     hydrant = load_grid(bundled("hydrant/field.safetensors"))
     items = [PosedField(hydrant, pose) for pose in job.object_poses()]
-    return FieldSensor(scene, items, job.camera, MOUNT, stop=STOP)
+    return field_sensor(scene, items, job.camera, MOUNT, stop=STOP)
 
 
-def _row(sensor: FieldSensor, state: Any, repeats: int) -> dict[str, float]:
+def _row(sensor: SceneSensor, state: Any, repeats: int) -> dict[str, float]:
     sensor.observe(state, 0)
     dr.sync_thread()
     dr.flush_malloc_cache()

@@ -50,7 +50,7 @@ def measure(world: World) -> list[dict[str, float]]:
             f"{world.scenario.name!r}: its control is in {place.car.control_unit}; "
             f"give a sweep with a vehicle steered in {UNIT}"
         )
-    sensor, period_m = world.surrogate.showing([]), route.speed_ms * place.period
+    sensor, period_m = world.without_objects(), route.speed_ms * place.period
 
     def control(pose: np.ndarray, step: int) -> float:
         seen = np.array(sensor.observe(to_state(pose[None]), step).image)[0]

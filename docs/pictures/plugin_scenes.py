@@ -12,6 +12,13 @@ import numpy as np
 from images import write_jpeg
 from PIL import Image
 
+from mi_nerfattack.fields import load_field, save_field
+from mi_nerfattack.fit.bake.bake import BakeOptions, bake, plan_bricks
+from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
+from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.scenes import bundled
+from mi_nerfattack.vehicle.route.route import load_routes
+
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH_PX, HEIGHT_PX = 320, 200
 SPP = {"field_emitter": 256}  # path-traced, so noisier than the others
@@ -86,6 +93,22 @@ def intersection() -> Description:
     """Show a reconstructed scene as a driver sees it."""
     view = camera([-4, -1.75, 1.4], [6, -4, 1.1], type="perspective", fov=65)
     return composite(view, scene=field("ngp_field", "intersection"))
+
+
+def intersection_in_bricks() -> Description:
+    """Show the same scene, baked in a pass of few views."""
+    camera_on_car = from_fov(200, 66, 90.0)
+    scene = PosedField(load_field(bundled("intersection/field.safetensors")))
+    routes = load_routes(bundled("intersection/routes.json"))
+    options = BakeOptions(passes=1, views=10)
+    plan = plan_bricks(scene, routes, options)
+    bricks = bake(scene, routes, camera_on_car, CameraMount(), options, plan)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "bricks.safetensors"
+        save_field(path, bricks)
+        volume = mi.load_dict({"type": "brick_field", "filename": str(path)})
+    view = camera([-4, -1.75, 1.4], [6, -4, 1.1], type="perspective", fov=65)
+    return composite(view, scene=volume)
 
 
 def hydrant_at_the_road() -> Description:
@@ -177,6 +200,7 @@ def write_wall_of_splats(path: Path) -> None:
 SCENES: dict[str, Callable[[], Description]] = {
     "grid_field": hydrant_alone,
     "ngp_field": intersection,
+    "brick_field": intersection_in_bricks,
     "splat_background": hydrant_before_splats,
     "field_emitter": hydrant_as_lamp,
     "field_integrator": hydrant_at_the_road,

@@ -4,5 +4,4 @@ from .objectives import CrossTrackDeviation as CrossTrackDeviation
 from .objectives import DepartureTime as DepartureTime
 from .objectives import HeadingDeviation as HeadingDeviation
 from .objectives import TargetDistance as TargetDistance
-from .surrogate import surrogate_sensor as surrogate_sensor
 from .user_cost import UserCost as UserCost

@@ -152,14 +152,14 @@ class Train:
         return Result(document, show)
 
     def _draw(self, picture: Path, place: Place, routes: list[Route]) -> None:
+        from mi_nerfattack.deploy.surrogate.scene import field_sensor
         from mi_nerfattack.fields import load_field
         from mi_nerfattack.render.posed import PosedField
         from mi_nerfattack.report.plots.place import routes_picture
-        from mi_nerfattack.rollout.field_sensor import FieldSensor
 
         look, sensor = (place.camera, place.mount), None
         if place.field is not None:
-            sensor = FieldSensor(PosedField(load_field(place.field)), [], *look)
+            sensor = field_sensor(PosedField(load_field(place.field)), [], *look)
         title = f"{self.output.name}: where it was trained"
         routes_picture(picture, place.scene, routes, *look, sensor, title)
 

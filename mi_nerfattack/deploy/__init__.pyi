@@ -30,5 +30,8 @@ from .sites import Weather as Weather
 from .stress.timing import DroppedFrames as DroppedFrames
 from .stress.timing import LateControls as LateControls
 from .stress.timing import LateFrames as LateFrames
+from .surrogate.scene import field_sensor as field_sensor
+from .surrogate.scene import scene_sensor as scene_sensor
+from .surrogate.scene import showing as showing
 from .vehicle import AbstractVehicle as AbstractVehicle
 from .views.paste import paste_layers as paste_layers

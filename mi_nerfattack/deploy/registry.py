@@ -9,11 +9,9 @@ from mi_nerfattack.deploy.built_in import built_in_shapes
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, Place
-from mi_nerfattack.deploy.simulated import (
-    AbstractSimulation,
-    SimulatedEnvironment,
-    SurrogateEnvironment,
-)
+from mi_nerfattack.deploy.simulated import AbstractSimulation, SimulatedEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.deploy.vehicle import AbstractVehicle
 from mi_nerfattack.deploy.views.base import AbstractView
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView
@@ -22,7 +20,6 @@ from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.render.pathtrace.daylight import set_daylight
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.dynamics import Ackermann, Dubins
 
 
@@ -51,7 +48,7 @@ def _surrogate(place: Place, conditions: Conditions) -> AbstractEnvironment:
         )
     _refuse_built_in("surrogate", conditions)
     scene = PosedField(load_field(place.field), place.field_pose)
-    sensor = FieldSensor(scene, [], place.camera, place.mount)
+    sensor = field_sensor(scene, [], place.camera, place.mount)
     return SurrogateEnvironment(sensor, kinematic_vehicle(place))
 
 

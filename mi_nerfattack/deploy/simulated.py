@@ -5,31 +5,22 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.kinematic import KinematicVehicle
 from mi_nerfattack.deploy.vehicle import AbstractVehicle, checked_pose
 from mi_nerfattack.deploy.views.base import AbstractView
-from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.disturbance import disturbed
 from mi_nerfattack.render.camera.intrinsics import (
     Camera,
     CameraMount,
     camera_to_body,
-    mount_matrix,
 )
-from mi_nerfattack.render.rays import March
-from mi_nerfattack.rollout.field_sensor import FieldSensor
-from mi_nerfattack.rollout.sensor import Observation
 from mi_nerfattack.vehicle.route.route import Route
-from mi_nerfattack.vehicle.state import to_state
 
 
 class AbstractSimulation(AbstractEnvironment):
@@ -129,81 +120,3 @@ class SimulatedEnvironment(AbstractSimulation):
         # 32 bits each: a seed of its own for every frame of every drive
         sequence = np.random.SeedSequence([self._seed, self._steps])
         return self.view.render(pose, int(sequence.generate_state(1)[0]))
-
-
-class SurrogateEnvironment(AbstractSimulation):
-    """The differentiable rollout of one vehicle: its sensor and its transition.
-
-    Frames are the images of an attack in eight bits, which is what the policy gets in
-    a `ClosedLoop`; the seed has no effect. The depth is the expected depth of all that
-    a ray meets, infinite where it meets less than half an opacity.
-
-    Args:
-        sensor: sees.
-        vehicle: moves.
-    """
-
-    def __init__(self, sensor: FieldSensor, vehicle: KinematicVehicle) -> None:
-        super().__init__("surrogate", vehicle, sensor.camera, vehicle.period)
-        self.sensor = sensor
-
-    def show(self, objects: Sequence[Any]) -> None:
-        """Compose other fields with the scene's; grid fields, no two of one texture."""
-        require_fields(objects)
-        self.sensor = self.sensor.showing(list(objects))
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-    def _observe(self) -> CameraFrame:
-        state, sensor = self.state[None], self.sensor
-        pose = mount_matrix(state[:, :3], sensor.mount)[0]
-        found = sensor.observe(to_state(state), self._steps)
-        seen, rays, ends = found.seen, found.rays, found.ends
-        assert seen is not None and rays is not None
-        shape = (self.camera.height, self.camera.width)
-        total, far = seen.total, dr.inf if ends is None else ends.t_max
-        linear = total.radiance + (1 - total.opacity) * sensor.behind(found)
-        depth = dr.select(total.opacity >= OPAQUE, total.depth, far)
-        start = mi.Float(0)
-        if sensor.clip.near_m:  # where rays start
-            start = dr.norm(rays.origin - mi.Point3f(*map(float, pose[:3, 3])))
-        return CameraFrame(
-            np.round(255 * np.array(found.image)[0]).astype(np.uint8),
-            (depth + start).numpy().reshape(shape),
-            pose,
-            linear.numpy().T.reshape(*shape, 3),
-            partial(_split, sensor, found, start, shape),
-        )
-
-
-def _split(
-    sensor: FieldSensor,
-    found: Observation,
-    start: mi.Float,
-    shape: tuple[int, int],
-    objects: Sequence[str],
-) -> dict[str, np.ndarray]:
-    """Take an observation apart; see :meth:`CameraFrame.layers`.
-
-    Args:
-        sensor: that observed.
-        found: what it observed.
-        start: (n,) or one, metres from the camera to where rays start.
-        shape: height and width.
-        objects: names.
-    """
-    seen, ends = found.seen, found.ends
-    assert seen is not None
-    passed = 1 - seen.total.opacity
-    far = dr.inf if ends is None else ends.t_max
-    behind = March(passed * sensor.behind(found), passed)
-    shares = sensor.composite.shares(seen)
-    names = [f"scene{k or ''}" for k in range(len(shares) - len(objects))]
-    parts = zip((*names, *objects), shares, (m.depth for m in shares), strict=True)
-    layers = {}
-    for name, part, depth in (*parts, ("background", behind, far)):
-        layers |= part.images(name, shape)
-        depth = dr.select(part.opacity > 0, depth + start, dr.inf)
-        layers[f"{name}.Z"] = depth.numpy().reshape(shape)
-    return layers

@@ -39,7 +39,7 @@ def texture_figures(
     states = [to_state(driven.states[None, step]) for step in picked]
     weights = seen_weights(world.surrogate, world.fields, states)
     world.show(attacked)
-    camera = world.surrogate.camera
+    camera = world.surrogate.intrinsics
     # A colour's sigmoid rises by a quarter there, in each channel of a pixel it fills.
     filled = 3 / 4 * camera.width * camera.height * len(states)
     found = {

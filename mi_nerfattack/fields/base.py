@@ -32,9 +32,11 @@ class AbstractField(ABC):
         window: factor of the density that is 0 in empty space.
         differentiable_by_position: whether density and radiance are continuous, so that
             derivatives by rays are those of the picture.
+        has_sky: whether :meth:`background` is a picture, not black.
     """
 
     kind: str
+    has_sky = False
     differentiable_by_position = True
     lower: np.ndarray
     upper: np.ndarray

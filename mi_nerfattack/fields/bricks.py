@@ -123,6 +123,7 @@ class BrickField(AbstractField):
     """
 
     kind = "brick_field"
+    has_sky = True
     differentiable_by_position = False
 
     def __init__(
@@ -223,6 +224,12 @@ class BrickField(AbstractField):
         corners = self.corners(self.unit(point), active)
         density, radiance = self.codes.quantities(self.interpolate(corners, active))
         return density & active, radiance & active
+
+    def density_bound(self) -> float:
+        """Return the largest density of all vertices, which no point exceeds."""
+        top = float(dr.max(self.vertices & 255)[0])
+        none = mi.Float(0)
+        return float(self.codes.quantities([mi.Float(top), none, none, none])[0][0])
 
     def background(self, direction: mi.Vector3f) -> mi.Color3f:
         """Interpolate the sky image bilinearly, (3, n), linear."""

@@ -139,6 +139,7 @@ class NGPField(AbstractField):
     """
 
     kind = "ngp_field"
+    has_sky = True
     sh_order = SH_ORDER
 
     def __init__(

@@ -6,9 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
-
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
@@ -42,10 +39,6 @@ class AbstractBackdrop(ABC):
     @abstractmethod
     def state(self) -> list[Any]:
         """Return all that a kernel reads or was compiled for, for `drjit.freeze`."""
-
-    def background(self, direction: mi.Vector3f) -> mi.Color3f:
-        """Return what lies behind it, (3, n), linear: black."""
-        return dr.zeros(mi.Color3f, dr.width(direction))
 
 
 Layer = PosedField | AbstractBackdrop

@@ -77,16 +77,24 @@ class PosedField:
         self._attached = self.to_world if attached else None
 
     def check_continuous(self, parameter: str) -> None:
-        """Raise InputError if the density jumps at the faces of the field's box.
+        """Raise InputError if the density jumps, or rays skip thin parts of it.
 
         Args:
             parameter: that moves rays or box, for the message.
         """
-        if self.field.window.is_open:
+        field = self.field
+        if field.window.is_open:
             raise InputError(
-                f"{parameter}: the {self.field.kind} has no empty cell, so its density "
+                f"{parameter}: the {field.kind} has no empty cell, so its density "
                 "ends at the faces of its box at once, which has no derivative; leave "
                 "cells at its border empty"
+            )
+        skips = field.occupancy.octants is not None
+        if skips and field.differentiable_by_position:  # others are refused elsewhere
+            raise InputError(
+                f"{parameter}: rays skip thin parts of the {field.kind}, whose "
+                "derivative would be left out; set skip_thin to false (in Python, call "
+                "see_all() of the field)"
             )
 
     def _matrix(self) -> np.ndarray:
@@ -125,11 +133,6 @@ class PosedField:
         return twin
 
     @property
-    def origin(self) -> mi.Point3f:
-        """Where the origin of the field's frame is in the world, metres."""
-        return self._origin
-
-    @property
     def has_gradients(self) -> bool:
         """Whether derivatives by the field's parameters are asked for."""
         return self.field.has_gradients
@@ -144,11 +147,6 @@ class PosedField:
         if self._attached is None:
             return []
         return [row for column in self._attached.matrix for row in column]
-
-    @property
-    def has_gain(self) -> bool:
-        """Whether the radiance is multiplied ray by ray."""
-        return self._gain is not None
 
     def in_world(self, density: mi.Float) -> mi.Float:
         """Turn a density per metre of the field's frame into one per world metre."""

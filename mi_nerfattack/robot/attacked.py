@@ -204,7 +204,7 @@ def _placed(found: FoundAttack) -> tuple[list[Pose], Views]:
         poses = [item.pose for item in scenario.objects]
     else:
         sensor = build_surrogate(scenario)
-        camera = sensor.camera
+        camera = sensor.intrinsics
         poses = [posed.pose for posed in sensor.objects]
     pattern = f"{SURROGATE}_{ATTACK}_*.safetensors"
     driven = [

@@ -3,7 +3,6 @@ from .adjoint import Checkpointed as Checkpointed
 from .adjoint import KeptBackgrounds as KeptBackgrounds
 from .adjoint import Replay as Replay
 from .drive import Drive as Drive
-from .field_sensor import FieldSensor as FieldSensor
 from .function import Evaluation as Evaluation
 from .function import Rollout as Rollout
 from .loop import CameraPath as CameraPath

@@ -80,7 +80,7 @@ class Replay(AbstractAdjoint):
 class KeptBackgrounds(AbstractAdjoint):
     """Keeps how scene and objects looked in each frame; renders nothing again.
 
-    Memory: what :class:`Replay` keeps and 20 bytes a layer, pixel and period (colour,
+    Memory: what :class:`Replay` keeps and 20 bytes a layer, sample and period (colour,
     opacity and depth in single precision): with a scene and one object, 0.5 MB a
     vehicle and period at 200x66, 2.8 MB at 366x188. Exact composites keep 20 more.
     Time: as Replay without rendering, so that forward and backward

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.posed import PosedField
 
 
 def offset_pose(pose: Pose, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -55,18 +50,3 @@ def left_jacobian(vector: np.ndarray) -> np.ndarray:
     first = (1 - np.cos(angle)) / angle**2
     second = (angle - np.sin(angle)) / angle**3
     return np.eye(3) + first * cross + second * cross @ cross
-
-
-def wrench_of(posed: PosedField, rays: Any, seen_as: Any) -> list[Any]:
-    """Sum the derivatives by rays into the six numbers of :func:`offset_gradient`.
-
-    Args:
-        posed: the object where it is.
-        rays: n rays.
-        seen_as: the objective's `RayGradient`.
-    """
-    by_origin, by_direction = seen_as.origin, seen_as.direction
-    arm = mi.Vector3f(rays.origin - posed.origin)
-    torque = dr.cross(arm, by_origin) + dr.cross(rays.direction, by_direction)
-    double = dr.float64_array_t(mi.Float)
-    return [dr.sum(double(row)) for row in (*by_origin, *torque)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,27 +12,15 @@ import numpy as np
 from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.fields.vertex_colours import gradient, start_gradient
+from mi_nerfattack.fields.vertex_colours import gradient
+from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.conventions import from_mitsuba
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.camera import SceneCamera
 from mi_nerfattack.rollout.offset import offset_gradient, offset_pose
-from mi_nerfattack.rollout.scene_camera import SceneCamera
+from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
-
-
-@runtime_checkable
-class CollectsRays(Protocol):
-    """An integrator that marches the rays of several frames together."""
-
-    def start_gradient(self, scene: mi.Scene, keys: list[str]) -> None:
-        """Collect rays from now on; InputError where a key has no derivative."""
-
-    def finish_gradient(self) -> None:
-        """Accumulate the gradients of all collected rays."""
-
-    def stop_gradient(self) -> None:
-        """Collect no more, and forget the rays that wait."""
 
 
 class SceneSensor(AbstractDifferentiableSensor):
@@ -52,12 +40,17 @@ class SceneSensor(AbstractDifferentiableSensor):
         params: keys of `mi.traverse(scene)` to differentiate by, for instance
             ``hydrant.colour``; a rollout that is called with parameters chooses them
             by itself.
-        sensor: index of the scene's sensor.
+        sensor: index of the scene's sensor, or another one.
         seed: of all random numbers, renewed each control period.
+        integrator: in the place of the scene's own, as of `mi.render`; its parameters
+            are not among those of the scene.
+        centred: let rays go through the middles of n x n squares of a pixel, not
+            through random places in it; the sensor's samples per pixel are n^2.
 
     Raises:
-        InputError: no such key or sensor, or an integrator without that protocol.
-        SetupError: the variant is spectral.
+        InputError: no such key or sensor, samples that are no square of a number, or
+            an integrator without that protocol.
+        SetupError: the variant has other colours than red, green and blue.
     """
 
     def __init__(
@@ -65,58 +58,34 @@ class SceneSensor(AbstractDifferentiableSensor):
         scene: mi.Scene,
         mount: CameraMount | None = None,
         params: Sequence[str] = (),
-        sensor: int = 0,
+        sensor: int | mi.Sensor = 0,
         seed: int = 0,
+        integrator: Any = None,
+        centred: bool = False,
     ) -> None:
-        if mi.is_spectral:
+        if not mi.is_rgb:
             raise SetupError(
-                f"variant {mi.variant()!r}: a policy's camera has three colours; call "
+                f"variant {mi.variant()!r}: a policy's camera has three colours; set "
+                "MI_NERFATTACK_VARIANT=llvm_ad_rgb, or call "
                 "mitsuba.set_variant('llvm_ad_rgb')"
             )
-        count = len(scene.sensors())
-        if not 0 <= sensor < count:
-            raise InputError(f"sensor: {sensor}; the scene has {count}, from 0 on")
         self.scene = scene
-        self.integrator: Any = scene.integrator()
+        self.integrator: Any = integrator or scene.integrator()
         if not isinstance(self.integrator, mi.ad.integrators.common.RBIntegrator):
             raise InputError(
                 f"scene: its integrator {self.integrator.class_name()} cannot be "
                 "differentiated ray by ray; use field_integrator or prb"
             )
-        self.camera = SceneCamera(scene.sensors()[sensor], mount or CameraMount(), seed)
+        if isinstance(sensor, int):
+            sensor = _sensor_of(scene, sensor)
+        self.camera = SceneCamera(sensor, mount or CameraMount(), seed, centred)
         #: A `field_integrator`, which marches rays of several frames together.
         self._collector: CollectsRays | None = None
         if isinstance(self.integrator, CollectsRays):
             self._collector = self.integrator
-        self._before: dict[str, Any] = {}
-        self._leaves: dict[str, Any] = {}
-        self._arrays: list[tuple[GridField, mi.Float]] = []
-        self.params: Any = mi.traverse(scene)
+        self._parameters = Differentiated(scene, self._collector)
         self.select(params)
         self.renders: int = 0
-
-    def select(self, keys: Sequence[str]) -> None:
-        """Differentiate by other parameters.
-
-        Args:
-            keys: of `mi.traverse(scene)`.
-
-        Raises:
-            InputError: there is no such parameter, or it has no derivative here.
-        """
-        for key in keys:
-            if key not in self.params:
-                near = ", ".join(name for name in self.params.keys() if "." in name)
-                raise InputError(f"{key}: no parameter of the scene; there are: {near}")
-            _, _, node, flags = self.params.properties[key]
-            constant = mi.ParamFlags.NonDifferentiable | mi.ParamFlags.Discontinuous
-            if isinstance(node, mi.Sensor | mi.Film | mi.Sampler) or flags & constant:
-                raise InputError(
-                    f"{key}: a constant of the derivative, as lens, film and the shape "
-                    "of surfaces are; leave it out of params (mi.render differentiates "
-                    "by the lens, prb_projective by shapes)"
-                )
-        self.keys: tuple[str, ...] = tuple(keys)
 
     def __repr__(self) -> str:
         """Name integrator, size and parameters."""
@@ -125,22 +94,35 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def observe(self, state: Any, step: int) -> Observation:
         """Render a frame; see :meth:`AbstractSensor.observe`."""
-        self.renders += dr.width(state)
+        count = dr.width(state)
+        self.renders += count
         with dr.suspend_grad():
-            sampler, ray, weight = self.camera.rays(_pose(state), dr.width(state), step)
+            sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
             colour, _, _, kept = self._sample(dr.ADMode.Primal, sampler, ray)
             linear = self.camera.pixels(colour * weight)
             dr.eval(linear, kept)
-        return self._observation(linear, kept, dr.width(state), step)
+        return self._observation(linear, kept, count, step)
 
     def keep(self, observation: Observation) -> Any:
-        """Keep the pixels, and what the integrator hands to its derivatives."""
+        """Keep what the integrator has to, or else the pixels and its whole state."""
+        if self._collector is not None:
+            return self._collector.keep(observation.kept)
         return observation.linear, observation.kept
 
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """See :meth:`AbstractDifferentiableSensor.restore`."""
-        linear, inner = kept
-        return self._observation(linear, inner, dr.width(state), step)
+        count = dr.width(state)
+        if self._collector is None:
+            linear, inner = kept
+            return self._observation(linear, inner, count, step)
+        with dr.suspend_grad():
+            sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
+            inner = self._collector.restore(ray, kept)
+            mode = dr.ADMode.Primal
+            colour, *_ = self._sample(mode, sampler, ray, state_in=inner)
+            linear = self.camera.pixels(colour * weight)
+            dr.eval(linear, inner)
+        return self._observation(linear, inner, count, step)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -152,10 +134,10 @@ class SceneSensor(AbstractDifferentiableSensor):
         """
         count = dr.width(state)
         if attached:
-            self._check_attached()
+            self.check_attached()
         # From the developed image back to the radiance of each sample
         d_linear = vjp(_develop, observation.linear, _colours(d_image))
-        leaf = _pose(state)
+        leaf = pose_of(state)
         if attached:
             dr.enable_grad(leaf)
         with dr.suspend_grad(when=not attached):
@@ -204,9 +186,30 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     # Parameters
 
+    @property
+    def params(self) -> Any:
+        """All parameters of the scene, `mi.traverse(scene)`."""
+        return self._parameters.params
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the parameters that are differentiated."""
+        return self._parameters.keys
+
+    def select(self, keys: Sequence[str]) -> None:
+        """Differentiate by other parameters.
+
+        Args:
+            keys: of `mi.traverse(scene)`.
+
+        Raises:
+            InputError: there is no such parameter, or it has no derivative here.
+        """
+        self._parameters.select(keys)
+
     def parameters(self) -> dict[str, Any]:
         """Return the values of the parameters that are differentiated, by key."""
-        return {key: self.params[key] for key in self.keys}
+        return self._parameters.values()
 
     def set_parameters(self, values: Mapping[str, Any]) -> None:
         """Replace parameters by detached values.
@@ -218,12 +221,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         Raises:
             InputError: there is no such parameter, or its value is not allowed.
         """
-        for key, value in values.items():
-            if key not in self.params:
-                raise InputError(f"{key}: no parameter of the scene")
-            if not _is_same(self.params[key], value):
-                self.params[key] = dr.detach(value) if _is_array(value) else value
-        self.params.update()
+        self._parameters.assign(values)
 
     def start_gradient(self, poses: bool = False) -> None:
         """Let the gradients of all parameters be zero.
@@ -234,73 +232,21 @@ class SceneSensor(AbstractDifferentiableSensor):
         Raises:
             InputError: a parameter has no derivative; the message names what works.
         """
-        self.stop_gradient()
         moved = [f"{name}.to_world" for name in self._objects()] if poses else []
-        try:
-            self._start(list(dict.fromkeys([*self.keys, *moved])))
-        except BaseException:
-            self.stop_gradient()
-            raise
-
-    def _start(self, keys: list[str]) -> None:
-        if self._collector is not None:
-            self._collector.start_gradient(self.scene, keys)
-        for key in keys:
-            if self._packed(key) is None:
-                value = self.params[key]
-                self._before[key] = type(value)(value)
-                leaf = type(value)(dr.detach(value))
-                dr.enable_grad(leaf)
-                self.params[key] = self._leaves[key] = leaf
-        if self._leaves:  # an update evaluates the values of all parameters
-            self.params.update()
-        self._arrays = [(field, start_gradient(field)) for field in self._fields()]
+        self._parameters.start(moved)
 
     def gradients(self) -> dict[str, Any]:
         """Return what has been accumulated, by key, each of its parameter's shape."""
-        if self._collector is not None:
-            self._collector.finish_gradient()
-        found = {}
-        for key in self.keys:
-            field = self._packed(key)
-            name = key.rpartition(".")[2]
-            leaf = self._leaves.get(key)
-            found[key] = dr.grad(leaf) if field is None else gradient(field, name)
-        dr.eval(found)
-        return found
+        return self._parameters.gradients()
 
     def stop_gradient(self) -> None:
         """See :meth:`AbstractDifferentiableSensor.stop_gradient`."""
-        if self._collector is not None:
-            self._collector.stop_gradient()
-        for key, value in self._before.items():
-            self.params[key] = value
-        if self._before:
-            self.params.update()
-        for field, packed in self._arrays:
-            field.packed = packed
-        self._before, self._leaves, self._arrays = {}, {}, []
-
-    def _packed(self, key: str) -> GridField | None:
-        """Return the grid field whose packed array a parameter is part of."""
-        node = self.params.properties[key][2]
-        field = getattr(node, "field", None)
-        is_part = key.rpartition(".")[2] in ("colour", "density")
-        return field if is_part and isinstance(field, GridField) else None
-
-    def _fields(self) -> list[GridField]:
-        found = {id(field): field for key in self.keys if (field := self._packed(key))}
-        return list(found.values())
+        self._parameters.stop()
 
     # Objects: grid fields with colours among the parameters
 
     def _objects(self) -> dict[str, Any]:
-        """Return the volumes by the prefix of their keys."""
-        return {
-            key.rpartition(".")[0]: self.params.properties[key][2]
-            for key in self.keys
-            if key.endswith(".colour") and self._packed(key) is not None
-        }
+        return self._parameters.objects()
 
     @property
     def fields(self) -> list[GridField]:
@@ -313,9 +259,31 @@ class SceneSensor(AbstractDifferentiableSensor):
         return [volume.posed for volume in self._objects().values()]
 
     @property
+    def layers(self) -> list[Layer]:
+        """All fields that a `field_integrator` shows, objects among them."""
+        return list(getattr(self.integrator, "posed", []))
+
+    @property
     def intrinsics(self) -> Camera:
-        """The lens of the scene's sensor, for other environments."""
-        return from_mitsuba(self.camera.sensor)[0]
+        """The lens, for other environments.
+
+        Raises:
+            InputError: the sensor is no pinhole camera, or its film is cropped.
+        """
+        name = self.camera.sensor.id()
+        if self.camera.sensor.needs_aperture_sample():
+            raise InputError(f"sensor {name!r}: has an aperture; use perspective")
+        found, _ = from_mitsuba(self.camera.sensor)
+        if self.camera.size != (found.width, found.height):
+            raise InputError(
+                f"sensor {name!r}: its film has a crop window; remove crop_* from it"
+            )
+        return found
+
+    @property
+    def mount(self) -> CameraMount:
+        """Pose of the camera on the vehicle."""
+        return self.camera.mount
 
     def textures(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.textures`."""
@@ -328,8 +296,7 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     def texture_gradients(self) -> list[Any]:
         """See :meth:`AbstractDifferentiableSensor.texture_gradients`."""
-        if self._collector is not None:
-            self._collector.finish_gradient()
+        self._parameters.finish()
         return [gradient(field, "texture") for field in self.fields]
 
     def offsets(self) -> np.ndarray:
@@ -353,7 +320,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.offset_gradients`."""
         found = []
         for name, volume in self._objects().items():
-            leaf = self._leaves[f"{name}.to_world"]
+            leaf = self._parameters.leaf(f"{name}.to_world")
             matrix, slope = (
                 np.array(x, np.float64).reshape(4, 4)[:3]
                 for x in (dr.detach(leaf.matrix), dr.grad(leaf.matrix))
@@ -363,31 +330,28 @@ class SceneSensor(AbstractDifferentiableSensor):
             found.append(offset_gradient(wrench, volume.posed.offset))
         return np.array(found).reshape(-1, 6)
 
-    def _check_attached(self) -> None:
+    def check_attached(self) -> None:
+        """Raise InputError where images have no derivative by the state."""
         if self._collector is None:
             raise InputError(
                 f"attached: {type(self.integrator).__name__} has no derivative by the "
                 "camera; set attached to false, or show fields by a field_integrator"
             )
+        self._collector.check_camera(self.scene)
 
 
-def _is_array(value: Any) -> bool:
-    return bool(dr.detail.collect_indices(value))
-
-
-def _is_same(a: Any, b: Any) -> bool:
-    """Tell whether two values are one and the same in memory, or equal numbers."""
-    if not _is_array(a) or not _is_array(b):
-        return bool(np.all(np.equal(a, b)))
-    one, other = (dr.detail.collect_indices(dr.detach(value)) for value in (a, b))
-    return one == other
+def _sensor_of(scene: mi.Scene, index: int) -> mi.Sensor:
+    count = len(scene.sensors())
+    if not 0 <= index < count:
+        raise InputError(f"sensor: {index}; the scene has {count}, from 0 on")
+    return scene.sensors()[index]
 
 
 def _develop(linear: mi.Color3f) -> mi.Color3f:
     return dr.linear_to_srgb(linear)
 
 
-def _pose(state: Any) -> Any:
+def pose_of(state: Any) -> Any:
     """Return the rows px, py, theta of a state, (3, n), detached."""
     kind = dr.float64_array_t(mi.Vector3f)
     return kind(*[dr.detach(state[i]) for i in range(3)])

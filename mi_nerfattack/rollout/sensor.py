@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.render.composite import Seen
-from mi_nerfattack.render.rays import Rays
-from mi_nerfattack.render.surroundings import Ends
 
 
 @dataclass(frozen=True)
@@ -21,19 +18,13 @@ class Observation:
 
     Attributes:
         image: tensor (n, height, width, 3), sRGB in [0, 1], evaluated.
-        seen: the composite, one ray a pixel, its layers scene first; None where the
-            sensor has no fields.
-        rays: n height width rays; None where the sensor traces none.
-        ends: where surfaces end the rays, and what is seen there; None without any.
-        step: of a `SceneSensor`, the index of the control period.
-        linear: of a `SceneSensor`, (3, n height width), before the sRGB curve.
-        kept: of a `SceneSensor`, what its integrator hands to its derivatives.
+        step: index of the control period.
+        linear: (3, n height width), before the sRGB curve; None where the sensor has
+            no derivatives.
+        kept: what the scene's integrator hands to its derivatives.
     """
 
     image: Any
-    seen: Seen | None = None
-    rays: Rays | None = None
-    ends: Ends | None = None
     step: int = 0
     linear: Any = None
     kept: Any = None

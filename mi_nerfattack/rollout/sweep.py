@@ -372,7 +372,7 @@ def differentiable(loop: ClosedLoop) -> AbstractDifferentiableSensor:
     """
     if not isinstance(loop.sensor, AbstractDifferentiableSensor):
         raise TypeError(
-            f"{type(loop.sensor).__name__}: has no derivatives; use a FieldSensor, "
+            f"{type(loop.sensor).__name__}: has no derivatives; use a SceneSensor, "
             "or use a gradient-free method"
         )
     if not loop.policy.differentiable:

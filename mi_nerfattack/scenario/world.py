@@ -10,27 +10,25 @@ from typing import Any
 import numpy as np
 
 from mi_nerfattack.attack.base import AbstractAttack
-from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.kinematic import Motion
 from mi_nerfattack.deploy.place import Place
 from mi_nerfattack.deploy.registry import kinematic_vehicle
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.scene import field_sensor, scene_sensor, showing
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import GridField, load_field, load_grid
 from mi_nerfattack.fields.splats import read_splats
 from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import Camera
-from mi_nerfattack.render.interleaved import COMPOSITES
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.splats import SplatBackground
-from mi_nerfattack.render.surroundings import ATTACHED
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import AbstractObjective
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.scenario.deployment import SURROGATE, Deployment, deployments
 from mi_nerfattack.scenario.method import Task
@@ -73,8 +71,8 @@ class World:
     scenario: Scenario
     route: Route
     fields: list[GridField]
-    surrogate: FieldSensor
-    optimised: FieldSensor
+    surrogate: SceneSensor
+    optimised: SceneSensor
     place: Place
     deployments: Mapping[str, Deployment]
     policy: AbstractPolicy
@@ -131,8 +129,12 @@ class World:
         objects = [] if empty else self.surrogate.objects
         if label != SURROGATE:
             return self.deployments[label].open(objects)
-        sensor = self.surrogate.showing([]) if empty else self.surrogate
+        sensor = self.without_objects() if empty else self.surrogate
         return SurrogateEnvironment(sensor, kinematic_vehicle(self.place))
+
+    def without_objects(self) -> SceneSensor:
+        """Return the sensor in the scene's field, with no object in view."""
+        return showing(self.surrogate, [])
 
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
@@ -150,7 +152,7 @@ class World:
         return sum(sensor.renders for sensor in self._sensors)
 
     @property
-    def _sensors(self) -> list[FieldSensor]:
+    def _sensors(self) -> list[SceneSensor]:
         same = self.optimised is self.surrogate
         return [self.surrogate] if same else [self.surrogate, self.optimised]
 
@@ -174,11 +176,11 @@ def build_world(scenario: Scenario, policy: AbstractPolicy) -> World:
     optimised = surrogate
     if place.bricks is not None:
         bricks = _load_layer(scenario, place.bricks.file)
-        optimised = surrogate.showing(surrogate.objects, bricks)
+        optimised = showing(surrogate, surrogate.objects, bricks)
     motion = scenario.vehicle.motion()
     route = driven_route(scenario, motion)
     objective = scenario.objective.build(scenario, route, motion.dynamics)
-    where = place_of(scenario, surrogate.camera, motion)
+    where = place_of(scenario, surrogate.intrinsics, motion)
     return World(
         scenario,
         route,
@@ -250,7 +252,7 @@ def judged_frames(scenario: Scenario) -> int:
     return scenario.attack.method.rendered(steps) * scenario.attack.poses
 
 
-def build_surrogate(scenario: Scenario) -> FieldSensor:
+def build_surrogate(scenario: Scenario) -> SceneSensor:
     """Make the sensor that an attack is made through.
 
     Raises:
@@ -258,12 +260,15 @@ def build_surrogate(scenario: Scenario) -> FieldSensor:
             the scenario asks for.
     """
     place, (camera, mount) = scenario.scene, scenario.camera.build()
+    names = [item.id for item in scenario.objects]
     if place.surrogate is not None:
-        xml, seed = load_scene(place.surrogate.file), scenario.seed
-        names = [item.id for item in scenario.objects]
-        sensor = surrogate_sensor(xml, mount, names, seed)
-        if scenario.attack.attached and sensor.surroundings is not None:
-            raise InputError(f"{place.surrogate}: {ATTACHED}")
+        xml = load_scene(place.surrogate.file)
+        sensor = scene_sensor(xml, mount, names, scenario.seed)
+        if scenario.attack.attached:
+            try:
+                sensor.check_attached()
+            except InputError as err:
+                raise InputError(f"{place.surrogate}: {err}") from err
         return sensor
     posed = []
     for item in scenario.objects:
@@ -272,10 +277,10 @@ def build_surrogate(scenario: Scenario) -> FieldSensor:
         field.refine(item.step_m or field.step_m)
         posed.append(PosedField(field, item.pose))
     jitter = scenario.seed if scenario.attack.jitter else None
-    look = place.stop, COMPOSITES[place.composite]()
+    look = jitter, place.stop, place.composite, names
     assert place.field is not None  # checked by SceneSection
     scene = _load_layer(scenario, place.field.file)
-    return FieldSensor(scene, posed, camera, mount, jitter, *look)
+    return field_sensor(scene, posed, camera, mount, *look)
 
 
 def build_rollout(world: World) -> tuple[Rollout, Any]:

@@ -26,6 +26,7 @@ from bench.torch.loop import (
 from bench.torch.ngp import TorchNGP
 from bench.torch.object import BagLookup, ObjectData, SelectLookup, TorchObject
 from mi_nerfattack.attack.objectives import CrossTrackDeviation
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import NGPLayout, Occupancy, save_field
 from mi_nerfattack.fit.loss import huber
 from mi_nerfattack.policy.preprocess import Crop, Preprocess, Resize
@@ -36,7 +37,6 @@ from mi_nerfattack.render.composite import Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.render.rays import March, Rays
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.rollout.objective import StageSum
@@ -262,7 +262,7 @@ def peer(scene: NGPData, item: ObjectData, grid=TunedHashGrid, lookup=None):
 )
 def test_the_peer_drives_and_differentiates_as_we_do(rng, scene, grid, lookup):
     item = PosedField(blob(rng, peak=4.0), POSE)
-    sensor = FieldSensor(PosedField(scene.field()), [item], CAMERA, MOUNT, stop=STOP)
+    sensor = field_sensor(PosedField(scene.field()), [item], CAMERA, MOUNT, stop=STOP)
     policy = TorchPolicy(Gain(), preprocess=Preprocess(STAGES))
     loop = ClosedLoop(sensor, policy, 0, Dubins(5.0, 1.5), RK4(), 0.1, eight_bit=False)
     rollout = Rollout(loop, StageSum(CrossTrackDeviation(ROUTE, 0.05)), HORIZON)

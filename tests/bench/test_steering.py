@@ -17,7 +17,7 @@ from bench.table2.steering import errors, lines, measure
 from mi_nerfattack import cli
 from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.deploy.registry import kinematic_vehicle
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.sweep.replay import read_replay
 from mi_nerfattack.experiment.sweep.table import RESULTS, read_table, write_table
@@ -37,9 +37,6 @@ class Sensor:
 
     def __init__(self, fields: list[Any]) -> None:
         self.fields = fields
-
-    def showing(self, objects: list[Any]) -> Sensor:
-        return Sensor(objects)
 
     def observe(self, state: Any, step: int) -> Any:
         x, y, heading = np.array(state)[:, 0]
@@ -79,6 +76,7 @@ def world(unit: str = "rad/s") -> Any:
         route=Route("slant", 0, np.array([[0.0, 0], [20, 20]])),
         place=SimpleNamespace(car=car, period=0.1),
         surrogate=Sensor([field]),
+        without_objects=lambda: Sensor([]),
         fields=[field],
         policy=Policy(),
         horizon=5,
@@ -161,7 +159,7 @@ def test_the_command_sees_what_an_environment_shows(one_place, monkeypatch, caps
     [cell] = read_replay(one_place, ["0"]).cells
     world = build_world(cell.scenario, cell.scenario.policy.build())
     vehicle = kinematic_vehicle(world.place)
-    shown = SurrogateEnvironment(world.surrogate.showing([]), vehicle)
+    shown = SurrogateEnvironment(world.without_objects(), vehicle)
     look, route = place["looks"][0], world.route
     controls = []
     for aside in (steering.ASIDE_M, -steering.ASIDE_M):

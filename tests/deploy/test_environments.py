@@ -24,7 +24,8 @@ from mi_nerfattack.deploy.car import CAR, SMALL_CAR
 from mi_nerfattack.deploy.kinematic import KinematicVehicle, Motion
 from mi_nerfattack.deploy.place import Conditions, bundled_place
 from mi_nerfattack.deploy.registry import kinematic_vehicle, make_environment
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.deploy.views.mitsuba import MitsubaView, _parts
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import (
@@ -35,7 +36,6 @@ from mi_nerfattack.render.camera.intrinsics import (
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT, set_daylight
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.route.route import Route, load_routes
 from mi_nerfattack.vehicle.state import to_state
@@ -151,11 +151,11 @@ def test_surrogate_shows_what_the_sensor_of_attacks_sees():
     scene = PosedField(small_ngp())
     objects = [PosedField(blob(np.random.default_rng(0)), Pose.upright((1, 0, 0), 0.3))]
     vehicle = KinematicVehicle(Motion(Dubins()), 0.1, 1.5)
-    environment = SurrogateEnvironment(FieldSensor(scene, [], CAMERA, mount), vehicle)
+    environment = SurrogateEnvironment(field_sensor(scene, [], CAMERA, mount), vehicle)
     for shown in ([], objects):
         environment.show(shown)
         frame = environment.reset(a_route(), state[0])
-        sensor = FieldSensor(scene, shown, CAMERA, mount)
+        sensor = field_sensor(scene, shown, CAMERA, mount)
         expected = sensor.observe(to_state(state), 0).image.numpy()[0]
         assert (frame.image == np.round(255 * expected)).all()
     assert frame.image.std() > 5

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 FIFTY = (  # without converging before
     "max_iterations = 6\nlearning_rate = 0.5",
-    "max_iterations = 50\nlearning_rate = 0.01" + ROBUST,
+    "max_iterations = 50\nlearning_rate = 0.02" + ROBUST,
 )
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from helpers import small_fields as small
 
 from mi_nerfattack.fields import save_field
-from mi_nerfattack.fields.occupancy import Occupancy
 
 
 def T() -> Any:
@@ -20,9 +19,7 @@ def T() -> Any:
 def write_blob(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
     """Write a blob in [-1, 1]^3, its border empty, and describe it as a volume."""
     path, field = folder / "blob.safetensors", small.blob(rng, step_m=0.05)
-    cells = np.zeros((16, 16, 16), bool)
-    cells[1:-1, 1:-1, 1:-1] = True
-    field.occupy(Occupancy(cells))
+    small.empty_border(field)
     save_field(path, field)
     return {"type": "grid_field", "id": "blob", "filename": str(path)}
 

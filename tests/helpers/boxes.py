@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers import attack_jobs
-from helpers.small_fields import vertices
+from helpers.small_fields import empty_border, vertices
 
 from mi_nerfattack.fields import GridField, GridLayout, save_field
 from mi_nerfattack.render.camera.pose import Pose
@@ -79,6 +79,7 @@ def attacked_run(folder: Path, field: GridField) -> Path:
             "[attack]\n": '[attack]\nparameters = "both"\npose_limit_m = 0.2\n',
         },
     )
+    empty_border(field)
     save_field(folder / "object.safetensors", field)
     (folder / "smooth.py").write_text("from helpers.toy_loop import SmoothPolicy\n")
     scenario, text = load_scenario(folder / "scenario.toml")

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.fields import (
+    AbstractField,
     BrickField,
     GridField,
     GridLayout,
@@ -51,6 +52,13 @@ def homogeneous(density: float = 0.7, raw_colour: float = 0.3) -> GridField:
     field.set_parameter("density", np.full(n, np.log(density) / 2, np.float32))
     field.set_parameter("texture", np.full((n, 3), raw_colour / 2, np.float32))
     return field
+
+
+def empty_border(field: AbstractField, count: int = 16) -> None:
+    """Make the border of a field empty, as that of fitted ones is."""
+    cells = np.zeros((count,) * 3, bool)
+    cells[1:-1, 1:-1, 1:-1] = True
+    field.occupy(Occupancy(cells))
 
 
 def blob(rng: np.random.Generator, peak: float = 2.0, step_m: float = 0.04):

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.render.composite import depth_composite
-from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.sums import absorption
 from mi_nerfattack.render.walk import Path, Walk
 
@@ -32,16 +32,20 @@ def leaf(value):
 
 
 def taped_image(sensor, state, textures, offsets):
-    """Render what a `FieldSensor` sees; its textures stay attached."""
-    key = dr.opaque(mi.UInt32, 0)
-    rays = sensor._make_rays([state[i] for i in range(3)], key, None, dr.width(state))
-    layers = [taped_march(layer, rays, sensor.stop) for layer in sensor.scene]
-    for k, (posed, texture) in enumerate(zip(sensor.objects, textures, strict=True)):
+    """Render what fields show a `SceneSensor`; their textures stay attached."""
+    count, stop = dr.width(state), sensor.integrator.stop
+    _, ray, _ = sensor.camera.rays([state[i] for i in range(3)], count, 0)
+    rays = Rays(ray.o, ray.d)
+    objects = sensor.objects
+    scene = [layer for layer in sensor.layers if layer not in objects]
+    layers = [taped_march(layer, rays, stop) for layer in scene]
+    for k, (posed, texture) in enumerate(zip(objects, textures, strict=True)):
         posed.field.packed = posed.field.pack(mi.Float(texture.array))
         posed = moved(posed, [mi.Float(offsets[k, i].array) for i in range(6)])
-        layers.append(taped_march(posed, rays, sensor.stop))
-    pixels = sensor._develop(depth_composite(layers), rays.direction, None)
-    return sensor._tensor(pixels, dr.width(state))
+        layers.append(taped_march(posed, rays, stop))
+    pixels = dr.linear_to_srgb(depth_composite(layers).radiance)  # before black
+    width, height = sensor.camera.size
+    return mi.TensorXf(dr.ravel(pixels), (count, height, width, 3))
 
 
 def moved(posed, offset):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from helpers.small_fields import vertices
+from helpers.small_fields import empty_border, vertices
 
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import GridField, GridLayout
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.loop import ClosedLoop
 from mi_nerfattack.vehicle.dynamics import Dubins
 from mi_nerfattack.vehicle.integrators import ExplicitEuler
@@ -57,7 +57,7 @@ class SmoothPolicy(torch.nn.Module):
 
 
 def make_loop(
-    integrator=None, jitter_seed=None, coarse=False, composite=None, disturbance=None
+    integrator=None, jitter_seed=None, coarse=False, composite="depth", disturbance=None
 ) -> tuple[ClosedLoop, GridField]:
     """Return a loop through a foggy scene with one object, and the object's field.
 
@@ -66,7 +66,9 @@ def make_loop(
     wider = 12 if coarse else 1
     scene = blob(GridLayout(2, 6, 9), 25.0, -2.0, 0.5 * wider, 1)
     item = blob(GridLayout(3, 6, 12), 1.0, 2.5, 0.08 * wider, 2)
-    sensor = FieldSensor(
+    for field in (scene, item):
+        empty_border(field)
+    sensor = field_sensor(
         PosedField(scene),
         [PosedField(item, OBJECT_POSE)],
         from_fov(WIDTH, HEIGHT, 70.0),

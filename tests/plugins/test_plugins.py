@@ -181,7 +181,7 @@ def test_volumes_refuse_files(paths, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inside", "message"),
     [
-        ("", "no nested grid_field or ngp_field; give one or more"),
+        ("", "no nested volume; give one or more of grid_field"),
         ('<float name="stop" value="1"/>', "stop: 1.0; allowed is 0 <= stop < 1"),
         ('<float name="stop" value="-0.1"/>', "stop: -0.1"),
         ('<bsdf type="diffuse"/>', "cannot use the nested BSDF"),

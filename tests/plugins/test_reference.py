@@ -24,6 +24,7 @@ NESTED = "(Nested plugin)"
 KINDS = {
     "grid_field": "volume",
     "ngp_field": "volume",
+    "brick_field": "volume",
     "splat_background": "volume",
     "field_emitter": "emitter",
     "field_integrator": "integrator",
@@ -94,6 +95,7 @@ def folder(tmp_path_factory) -> Path:
     mi.set_variant("llvm_ad_rgb")
     save_field(folder / "hydrant.safetensors", small_fields.homogeneous())
     rng = np.random.default_rng(0)
+    save_field(folder / "bricks.safetensors", small_fields.small_bricks(rng))
     save_field(folder / "field.safetensors", small_fields.small_ngp())
     columns = splat_files.columns(splat_files.cloud(rng, 3))
     splat_files.write_ply(folder / "street.ply", columns)
@@ -111,7 +113,11 @@ def in_the_folder(variant, folder, monkeypatch) -> None:
 def minimal(name: str) -> dict[str, Any]:
     """Describe a plugin by what it requires."""
     grid = {"type": "grid_field", "filename": "hydrant.safetensors"}
-    files = {"ngp_field": "field.safetensors", "splat_background": "street.ply"}
+    files = {
+        "ngp_field": "field.safetensors",
+        "brick_field": "bricks.safetensors",
+        "splat_background": "street.ply",
+    }
     required: dict[str, Any] = {"filename": files.get(name, "hydrant.safetensors")}
     if name.startswith("field_"):
         required = {"object": grid}

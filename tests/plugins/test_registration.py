@@ -79,7 +79,7 @@ REFUSED = [
     if not name.startswith("cuda")
 ]
 PLUGINS = {
-    "volume": ("grid_field", "ngp_field", "splat_background"),
+    "volume": ("grid_field", "ngp_field", "brick_field", "splat_background"),
     "emitter": ("field_emitter",),
     "integrator": ("field_integrator",),
     "sensor": ("opencv_camera",),

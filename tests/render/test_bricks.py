@@ -9,6 +9,7 @@ import pytest
 from helpers import small_fields as small
 from helpers import toy_loop as toy
 
+from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.composite import DepthComposite, Seen
 from mi_nerfattack.render.interleaved import InterleavedComposite
@@ -34,7 +35,7 @@ def test_bricks_have_no_derivatives_by_rays(composite, rng) -> None:
 def test_an_attached_gradient_through_bricks_is_refused(rng) -> None:
     loop, item = toy.make_loop()
     bricks = PosedField(small.small_bricks(rng))
-    sensor = loop.sensor.showing(loop.sensor.objects, bricks)
+    sensor = showing(loop.sensor, loop.sensor.objects, bricks)
     state = loop.initial(np.zeros((1, 3)))
     seen = sensor.observe(state, 0)
     d_image = dr.ones(mi.TensorXf, seen.image.shape)

@@ -166,16 +166,15 @@ def loop() -> Any:
 
     from helpers import toy_loop as toy
 
-    from mi_nerfattack.rollout.field_sensor import FieldSensor
+    from mi_nerfattack.deploy.surrogate.scene import field_sensor
 
     loop, item = toy.make_loop()
     rng = np.random.default_rng(3)
     places = rng.uniform([2, -6, 0], [20, 6, 4], (200, 3))
     street = made.splats(places, rng.random((200, 3)), 0.5, rng.uniform(0.1, 0.8, 200))
     old = loop.sensor
-    sensor = FieldSensor(
-        SplatBackground(street), old.objects, old.camera, old.mount, stop=0.0
-    )
+    view = old.intrinsics, old.mount
+    sensor = field_sensor(SplatBackground(street), old.objects, *view, stop=0.0)
     return replace(loop, sensor=sensor), item
 
 
@@ -216,10 +215,9 @@ def test_nothing_is_compiled_after_the_first_steps(loop) -> None:
 
 
 def test_a_sensor_refuses_to_merge_splats(loop) -> None:
-    from mi_nerfattack.rollout.field_sensor import FieldSensor
+    from mi_nerfattack.deploy.surrogate.scene import field_sensor
 
     old = loop[0].sensor
     with pytest.raises(InputError, match="set composite to depth"):
-        FieldSensor(
-            old.scene, old.objects, old.camera, composite=InterleavedComposite()
-        )
+        parts = old.layers[:1], old.objects, old.intrinsics
+        field_sensor(*parts, composite="interleaved")

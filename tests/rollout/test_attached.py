@@ -41,7 +41,7 @@ def test_one_frame(world: World) -> None:
     rng = np.random.default_rng(0)
     shifts = rng.uniform(0, 25, 8), rng.normal(0, 0.3, 8), rng.normal(0, 0.05, 8)
     poses = world.route.pose_at(*shifts)
-    height, width = sensor.camera.height, sensor.camera.width
+    width, height = sensor.camera.size
     y, x = np.mgrid[0:height, 0:width]
     rows = [
         np.cos(3 * x / width + c) * np.sin(2 * y / height + 1 + c) for c in range(3)

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mi_nerfattack.fields import load_grid
@@ -50,3 +51,18 @@ def test_scene_is_attacked_from_xml(monkeypatch, capsys):
     *rows, traced, last = capsys.readouterr().out.splitlines()
     assert len(rows) == 2 and traced.startswith("path-traced: mean error 0.")
     assert last in ("the failure transfers", "the failure does not transfer")
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_bitmap_is_attacked_through_prb(monkeypatch, capsys, tmp_path):
+    """The policy sees the board: its colours change, and are written."""
+    monkeypatch.setattr(sys, "argv", ["attack_billboard.py", "3", "1"])
+    monkeypatch.chdir(tmp_path)
+    names = runpy.run_path(str(GUIDE.parent / "examples/attack_billboard.py"))
+    rows = capsys.readouterr().out.splitlines()
+    assert [row[:22] for row in rows] == [f"step {k}: mean error 0.0" for k in (0, 1)]
+    scene, key = mi.load_file(str(names["file"]), parallel=False), names["key"]
+    before, after = (mi.traverse(s)[key].numpy() for s in (scene, names["scene"]))
+    changed = np.abs(after - before).max(-1) > 0.05
+    assert changed.mean() > 0.01
+    assert (tmp_path / "billboard.png").stat().st_size > 1000

@@ -24,12 +24,11 @@ from helpers.rollouts import (
     unit,
 )
 
+from mi_nerfattack.deploy.surrogate.scene import field_sensor, showing
 from mi_nerfattack.render import composite
 from mi_nerfattack.render.camera.disturbance import Disturbance
 from mi_nerfattack.render.camera.intrinsics import CameraMount
-from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.rollout import sweep
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.loop import CameraPath
 from mi_nerfattack.rollout.sensor import AbstractSensor
 from mi_nerfattack.vehicle.integrators import RK4, ImplicitMidpoint
@@ -47,7 +46,7 @@ POSES = np.array([[0.0, 0.35, 0.02], [0.1, 0.2, -0.03]])
         *((horizon, {"integrator": RK4()}) for horizon in (1, 2, 10)),
         (3, {"integrator": ImplicitMidpoint()}),
         (3, {"jitter_seed": 7}),
-        (3, {"composite": InterleavedComposite()}),
+        (3, {"composite": "interleaved"}),
         (3, {"jitter_seed": 7, "disturbance": DISTURBANCE}),
     ],
 )
@@ -115,7 +114,7 @@ def test_gradient_by_the_pose_of_an_object():
 
 
 def test_gradient_by_the_pose_through_the_interleaved_composite():
-    loop, _ = toy.make_loop(composite=InterleavedComposite())
+    loop, _ = toy.make_loop(composite="interleaved")
     rollout = make_rollout(loop, 3, attached=True)
     found = gradient(rollout, offsets=True).offsets[0, 2]
 
@@ -199,7 +198,7 @@ def test_the_heap_is_released_after_each_derivative_of_the_policy(monkeypatch):
     "changes",
     [
         {"jitter_seed": 7, "disturbance": DISTURBANCE},
-        {"composite": InterleavedComposite()},
+        {"composite": "interleaved"},
     ],
 )
 def test_periods_together_give_the_gradient_of_periods_alone(
@@ -246,15 +245,16 @@ def test_horizon_below_one_and_bad_states_are_refused():
 def test_objects_that_share_a_field_are_refused():
     old = toy.make_loop()[0].sensor
     with pytest.raises(ValueError, match="two of them share a field"):
-        FieldSensor(old.scene, 2 * old.objects, old.camera)
+        field_sensor(old.layers[0], 2 * old.objects, old.intrinsics)
 
 
 def test_another_mount_makes_another_image():
     loop, _ = toy.make_loop()
     state = loop.initial(INITIAL)
     before = loop.sensor.observe(state, 0).image.numpy().copy()
-    loop.sensor.mount = CameraMount(height_m=1.6, forward_m=0.3, pitch_deg=4.0)
-    assert np.abs(loop.sensor.observe(state, 0).image.numpy() - before).max() > 0.01
+    mount = CameraMount(height_m=1.6, forward_m=0.3, pitch_deg=4.0)
+    other = showing(loop.sensor, loop.sensor.objects, mount=mount)
+    assert np.abs(other.observe(state, 0).image.numpy() - before).max() > 0.01
 
 
 def test_kept_frames_are_not_rendered_again():
@@ -264,8 +264,8 @@ def test_kept_frames_are_not_rendered_again():
     kept = evaluation.trajectory.kept
     bytes_kept = sum(
         4 * dr.width(array)
-        for layers, _ in kept
-        for march in layers
+        for state, _ in kept
+        for march in state.seen
         for array in (*march.radiance, march.opacity, march.moment)
     )
     assert bytes_kept == 3 * toy.WIDTH * toy.HEIGHT * 2 * 20  # as its docstring says

@@ -12,11 +12,10 @@ import pytest
 from helpers import toy_loop as toy
 from helpers import walled_scene as walled
 from helpers.derivatives import central_difference
+from helpers.small_fields import empty_border
 
-from mi_nerfattack.attack import surrogate_sensor
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields import load_field, save_field
-from mi_nerfattack.fields.occupancy import Occupancy
 from mi_nerfattack.policy.torch_policy import TorchPolicy
 from mi_nerfattack.rollout import (
     ClosedLoop,
@@ -38,12 +37,10 @@ KEY = "fields.near.colour"
 def folder(tmp_path: Path, variant: str) -> Path:
     """Fields whose border is empty, as that of fitted ones."""
     walled.write_fields(tmp_path)
-    cells = np.zeros((16, 16, 16), bool)
-    cells[1:-1, 1:-1, 1:-1] = True
     for name in ("near", "far", "fog"):
         path = tmp_path / f"{name}.safetensors"
         field = load_field(path)
-        field.occupy(Occupancy(cells))
+        empty_border(field)
         save_field(path, field)
     return tmp_path
 
@@ -130,26 +127,6 @@ def test_vehicles_are_rendered_together(folder) -> None:
     alone = [sensor.observe(loop.initial(BOTH[k : k + 1]), 0) for k in (0, 1)]
     for image, one in zip(both, alone, strict=True):
         np.testing.assert_allclose(image, one.image.numpy()[0], atol=1e-6)
-
-
-@pytest.mark.parametrize("composite", ["depth", "interleaved"])
-def test_texture_gradient_is_the_field_sensors(folder, composite) -> None:
-    loaded = scene(folder, composite=composite)
-    former = surrogate_sensor(loaded, toy.MOUNT, ["near"])
-    sensor = SceneSensor(loaded, toy.MOUNT, [KEY])
-    state = close(sensor).initial(BOTH)
-    shape = former.observe(state, 0).image.shape
-    weight = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    found = []
-    for one in (former, sensor):
-        one.start_gradient(poses=True)
-        one.vjp(one.observe(state, 0), state, mi.TensorXf(weight), False)
-        texture = one.texture_gradients()[0].numpy().copy()
-        found.append((texture, one.offset_gradients()))
-        one.stop_gradient()
-    (expected, by_offset), (texture, other) = found
-    assert np.abs(texture - expected).sum() < 1e-5 * np.abs(expected).sum()
-    np.testing.assert_allclose(other, by_offset, rtol=2e-3, atol=1e-4)
 
 
 def direction(colours: np.ndarray) -> np.ndarray:

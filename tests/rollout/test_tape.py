@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from helpers import toy_loop as toy
 from helpers.rollouts import OFFSET
+from helpers.small_fields import empty_border
 from helpers.tape import leaf, taped_image, tensor64
 
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import GridLayout
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -26,11 +27,14 @@ def test_products_of_the_sensor_are_those_of_the_tape(rng):
     old, state = loop.sensor, loop.initial(BOTH)
     near = toy.blob(GridLayout(2, 6, 9), 0.8, 2.0, 0.2, 3)
     objects = [*old.objects, PosedField(near, Pose.upright((5.0, 0.3, 0.9), -0.4))]
-    sensor = FieldSensor(old.scene, objects, old.camera, old.mount, stop=0.0)
+    empty_border(near)
+    view = old.intrinsics, old.mount
+    sensor = field_sensor(old.layers[0], objects, *view, stop=0.0)
     offsets = np.concatenate([OFFSET, -0.5 * OFFSET])
     sensor.set_offsets(offsets)
     seen = sensor.observe(state, 0)
-    both = (seen.seen.layers[1].opacity > 0.1) & (seen.seen.layers[2].opacity > 0.1)
+    layers = seen.kept.seen.layers
+    both = (layers[1].opacity > 0.1) & (layers[2].opacity > 0.1)
     assert dr.count(both)[0] > 3
     d_image = mi.TensorXf(rng.normal(size=seen.image.shape).astype(np.float32))
     found = []

@@ -186,7 +186,7 @@ def test_a_scenario_drives_among_splats(build) -> None:
     from mi_nerfattack.vehicle.state import to_state
 
     sensor = build(SCENARIO).surrogate
-    seen = sensor.observe(to_state(np.zeros((1, 3))), 0).seen
+    seen = sensor.observe(to_state(np.zeros((1, 3))), 0).kept.seen
     depth = seen.layers[0].depth.numpy().reshape(6, 12)  # the wall at x = 9
     ahead = np.cos(np.arctan(1 / 12)) * np.cos(np.radians(6) - np.arctan(1 / 12))
     assert depth[2, 6] == pytest.approx((9 - 0.5) / ahead, rel=0.02)
@@ -195,7 +195,7 @@ def test_a_scenario_drives_among_splats(build) -> None:
 def test_steps_and_the_end_of_rays_are_the_scenarios(build) -> None:
     text = SCENARIO.replace("[[objects]]", "stop = 0.01\n[[objects]]\nstep_m = 0.5")
     world = build(text)
-    assert (world.surrogate.stop, world.fields[0].step_m) == (0.01, 0.5)
+    assert (world.surrogate.integrator.stop, world.fields[0].step_m) == (0.01, 0.5)
 
 
 def test_scenarios_with_splats_refuse_what_they_cannot_do(build) -> None:

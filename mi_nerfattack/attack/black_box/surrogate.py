@@ -17,9 +17,9 @@ from mi_nerfattack.attack.black_box.search import (
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.attack.schedule import has_settled
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.vehicle.route.route import Route
 
 
@@ -132,12 +132,12 @@ class SurrogateSearch(AbstractAttack):
         self.restore_best()
 
 
-def textured(loop: ClosedLoop) -> FieldSensor:
+def textured(loop: ClosedLoop) -> SceneSensor:
     """Return a loop's sensor, whose objects have textures.
 
     Raises:
         InputError: it shows no fields.
     """
-    if not isinstance(loop.sensor, FieldSensor):
+    if not isinstance(loop.sensor, SceneSensor):
         raise InputError(f"{type(loop.sensor).__name__}: has no textures to change")
     return loop.sensor

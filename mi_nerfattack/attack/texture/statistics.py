@@ -71,6 +71,7 @@ def seen_weights(
             sensor.vjp(seen, state, ones, False)
         gradients = sensor.texture_gradients()
     finally:
+        sensor.stop_gradient()
         sensor.set_textures(textures)
     return [
         _finest(field, np.array(gradient).sum(axis=1))

@@ -39,7 +39,7 @@ class PoseError:
 
         Args:
             offsets: (k, 6), shift in metres and rotation vector of each object, world
-                axes, as `FieldSensor.set_offsets` takes them.
+                axes, as `SceneSensor.set_offsets` takes them.
             seed: of the drive.
 
         Returns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -15,39 +16,37 @@ from mi_nerfattack.render.camera.conventions import mitsuba_sensor_dict
 from mi_nerfattack.render.camera.intrinsics import ray_lengths
 from mi_nerfattack.render.camera.outside import Overhead
 from mi_nerfattack.render.pathtrace.views import require_colour
-from mi_nerfattack.render.surroundings import Clip
-from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.vehicle.state import to_state
 
 #: What is higher is left out of the surrogate's picture, metres: from where no view
 #: was fitted, fields hold matter that no view sees.
 TOP_M = 4.0
+_NEAR_M, _FAR_M = 0.01, 1e5
 
 
 def surrogate_above(
-    sensor: FieldSensor, overhead: Overhead, top_m: float = TOP_M
+    sensor: SceneSensor, overhead: Overhead, top_m: float = TOP_M
 ) -> np.ndarray:
     """Render the surrogate and its objects from above.
 
     Args:
-        sensor: gives fields, objects and composite.
+        sensor: gives the scene.
         overhead: camera.
         top_m: what is higher is left out.
 
     Returns:
         (height, width, 3), uint8, sRGB.
     """
-    camera, clip = overhead.camera, Clip(overhead.height_m - top_m)
-    around = sensor.surroundings
-    above = FieldSensor(
+    spp = math.ceil(math.sqrt(sensor.camera.spp)) ** 2
+    described = mitsuba_sensor_dict(overhead.camera, np.eye(4), spp)
+    clip = {"near_clip": max(overhead.height_m - top_m, _NEAR_M), "far_clip": _FAR_M}
+    above = SceneSensor(
         sensor.scene,
-        sensor.objects,
-        camera,
         overhead.mount,
-        stop=sensor.stop,
-        composite=sensor.composite,
-        surroundings=None if around is None else around.through(camera, clip),
-        clip=clip,
+        sensor=mi.load_dict({**described, **clip}),
+        integrator=sensor.integrator,
+        centred=True,
     )
     image = above.observe(to_state(overhead.state[None]), 0).image
     return np.round(255 * np.array(image)[0].clip(0, 1)).astype(np.uint8)
@@ -73,7 +72,7 @@ def scene_above(
     camera, pose = overhead.camera, overhead.camera_to_world
     near = max(overhead.height_m - _lid(scene, open_at), 0.01)
     description = mitsuba_sensor_dict(camera, pose, spp)
-    clip = {"near_clip": near, "far_clip": overhead.height_m + 1e4}
+    clip = {"near_clip": near, "far_clip": _FAR_M}
     sensor = mi.load_dict({**description, **clip})
     image: Any = mi.render(scene, sensor=sensor, spp=spp, seed=mi.UInt32(0))
     linear = np.array(image)[..., :3]

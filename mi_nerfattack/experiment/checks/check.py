@@ -85,7 +85,7 @@ class Check:
         base = self.frames.get(SURROGATE)
         for label, frame in self.frames.items():
             if label != SURROGATE and base is not None:
-                camera = world.surrogate.camera
+                camera = world.surrogate.intrinsics
                 found = likeness_findings(camera, base, frame, label)
                 self.doubts += found
 
@@ -186,7 +186,7 @@ class Check:
         grounds = {"Surrogate, from above": surrogate_above(world.surrogate, overhead)}
         looks = {
             f"First image in {label}": Look(
-                frame.image, world.surrogate.camera, frame.camera_to_world
+                frame.image, world.surrogate.intrinsics, frame.camera_to_world
             )
             for label, frame in list(self.frames.items())[:2]
         }
@@ -224,7 +224,7 @@ class Check:
             {n: _top(item) for n, item in zip(names, posed, strict=True)},
             world.initial,
             scenario.vehicle.width_m,
-            world.surrogate.camera,
+            world.surrogate.intrinsics,
             paths,
         )
 

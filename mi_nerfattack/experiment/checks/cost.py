@@ -14,7 +14,8 @@ from mi_nerfattack.scenario.world import World, build_attack
 from mi_nerfattack.system.memory import peak_memory_mb
 
 _PERIODS = 6  # of the iterations that are timed
-_KEPT_BYTES = 20  # of a pixel, layer, period and pose
+_KEPT_BYTES = 20  # of a sample, layer, period and pose
+_BEHIND_BYTES = 13  # of a sample of the nested integrator: colour, and whether it hits
 _PICTURES_MB = 10.0
 
 
@@ -121,9 +122,14 @@ def _field_bytes(world: World) -> int:
 
 def _kept_mb(world: World) -> float:
     """Return what `kept_backgrounds` keeps for all periods but the timed ones."""
-    section, camera = world.scenario.attack, world.surrogate.camera
+    section, sensor = world.scenario.attack, world.surrogate
     if not isinstance(section.adjoint.build(), KeptBackgrounds):
         return 0.0
-    layers = len(world.surrogate.scene) + len(world.fields)
-    pixels = camera.width * camera.height * section.poses
-    return _KEPT_BYTES * layers * pixels * max(0, world.horizon - _PERIODS) / 1e6
+    kept = _KEPT_BYTES * len(sensor.layers)
+    if world.scenario.scene.composite != "depth":
+        kept += _KEPT_BYTES
+    if sensor.integrator.behind is not None:
+        kept += _BEHIND_BYTES
+    width, height = sensor.camera.size
+    samples = width * height * sensor.camera.spp * section.poses
+    return kept * samples * max(0, world.horizon - _PERIODS) / 1e6

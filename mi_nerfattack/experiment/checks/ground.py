@@ -77,7 +77,8 @@ def ground_findings(world: World, scene: Any, name: str) -> Iterator[str]:
 def box_findings(world: World) -> Iterator[str]:
     """Tell of a route that leaves the box of the surrogate's field."""
     arc, points = driven_points(world)
-    layers = world.surrogate.scene
+    objects = world.surrogate.objects
+    layers = [item for item in world.surrogate.layers if item not in objects]
     if len(layers) != 1 or not isinstance(layers[0], PosedField):
         return
     field, pose = layers[0].field, layers[0].placed

@@ -16,7 +16,7 @@ import numpy as np
 
 from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.deploy.environment import AbstractEnvironment, CameraFrame
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.evaluation.metrics import environment_order
 from mi_nerfattack.experiment.finished import Finished, Frames
 from mi_nerfattack.experiment.pictures.recording import FrameFolder

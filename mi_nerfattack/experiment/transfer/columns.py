@@ -9,9 +9,10 @@ from typing import Any
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.place import Conditions
 from mi_nerfattack.deploy.registry import kinematic_vehicle
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
 from mi_nerfattack.deploy.stress.pose_error import PoseError
 from mi_nerfattack.deploy.stress.timing import DroppedFrames, LateControls, LateFrames
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.scene import showing
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.ranges import Finite, NonNegative, Share, Whole, checked
 from mi_nerfattack.render.pathtrace.daylight import DAYLIGHT
@@ -198,8 +199,7 @@ class Column:
         place = replace(world.place, mount=mount)
         blur, noise = condition.blur_px, condition.noise_sd
         if self.environment == SURROGATE:
-            sensor = world.surrogate.showing(list(objects))
-            sensor.mount = mount
+            sensor = showing(world.surrogate, list(objects), mount=mount)
             found = SurrogateEnvironment(sensor, kinematic_vehicle(place))
             found.blur_px, found.noise_sd = blur, noise
             return condition.around(found)

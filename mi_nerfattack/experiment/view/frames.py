@@ -34,7 +34,7 @@ class FrameSource:
 
     def __init__(self, viewed: ViewedRun) -> None:
         self.viewed = viewed
-        self._bare = viewed.world.surrogate.showing([])
+        self._bare = viewed.world.without_objects()
         self._open: dict[tuple[str, str | None], AbstractEnvironment] = {}
         self._stack = ExitStack()
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.registry import kinematic_vehicle
-from mi_nerfattack.deploy.simulated import SurrogateEnvironment
+from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.deploy.views.rays import PixelRays
 from mi_nerfattack.scenario.world import World
 
@@ -51,9 +51,9 @@ def scene_cloud(
         states: (n, 3) of a drive, metres and radians.
         on_frame: told how many frames are done, of how many.
     """
-    sensor = world.surrogate.showing([])
+    sensor = world.without_objects()
     environment = SurrogateEnvironment(sensor, kinematic_vehicle(world.place))
-    rays, parts = PixelRays(sensor.camera), []
+    rays, parts = PixelRays(sensor.intrinsics), []
     places = _places(states)
     for number, pose in enumerate(places, start=1):
         parts.append(frame_points(environment.reset(world.route, pose), rays))

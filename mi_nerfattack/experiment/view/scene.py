@@ -143,7 +143,7 @@ class RunScene:
             name = f"/objects/{item.id}"
             self._frames.append(scene.add_frame(name, show_axes=False))
             self._looks.append(self._add_object(name, posed.pose.scale, field, shape))
-        camera = viewed.world.surrogate.camera
+        camera = viewed.world.surrogate.intrinsics
         high, wide = camera.height / (2 * camera.fy), camera.width / (2 * camera.fx)
         volume = float(np.cbrt(high * wide / 3))  # that viser scales to 1
         self._ahead = _FRAME_M / (2 * wide)  # of the frame, metres

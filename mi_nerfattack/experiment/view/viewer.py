@@ -133,7 +133,7 @@ class Viewer:
         self.slider = gui.add_slider("Period", 0, len(drive.controls), 1, 0)
         self.play = gui.add_button("Play")
         self.told = gui.add_markdown("")
-        camera = self.viewed.world.surrogate.camera
+        camera = self.viewed.world.surrogate.intrinsics
         black = np.zeros((camera.height, camera.width, 3), np.uint8)
         self.seen = gui.add_image(black, label=SEEN, format="png")
         label = "Where the attack acts: difference to the objects' own textures"

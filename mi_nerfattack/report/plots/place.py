@@ -25,7 +25,7 @@ from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_ma
 from mi_nerfattack.render.camera.outside import Overhead, seen_at
 from mi_nerfattack.render.pathtrace.load import load_scene
 from mi_nerfattack.report.plots.charts import DPI, RC, save
-from mi_nerfattack.rollout.field_sensor import FieldSensor
+from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.vehicle.route.route import Route
 
 WIDTH_PX = 1600
@@ -149,7 +149,7 @@ def routes_picture(
     routes: Sequence[Route],
     camera: Camera,
     mount: CameraMount | None = None,
-    sensor: FieldSensor | None = None,
+    sensor: SceneSensor | None = None,
     title: str = "",
 ) -> None:
     """Write the picture of a scene with all its routes, without objects and drives.

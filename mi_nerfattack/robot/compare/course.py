@@ -53,7 +53,7 @@ class Course:
         scenario, route = found.scenario, found.route
         camera, mount = scenario.camera.build()
         if scenario.scene.surrogate is not None:
-            camera = build_surrogate(scenario).camera
+            camera = build_surrogate(scenario).intrinsics
         period, car = scenario.vehicle.dt_s, scenario.vehicle.car()
         stretch = scenario.drive.stretch(route, period)
         rest = camera, mount, period, car.control_unit, car.wheelbase

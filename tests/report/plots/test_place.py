@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.tiny_place import write_place
 
+from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields.io import load_field
 from mi_nerfattack.io import files
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.report.plots.place import Overlay, car_outline, routes_picture
-from mi_nerfattack.rollout.field_sensor import FieldSensor
 from mi_nerfattack.vehicle.route.route import load_routes
 
 
@@ -18,7 +18,7 @@ from mi_nerfattack.vehicle.route.route import load_routes
 def test_scene_field_and_routes(tmp_path):
     place = write_place(tmp_path)
     assert place.field is not None
-    sensor = FieldSensor(PosedField(load_field(place.field)), [], place.camera)
+    sensor = field_sensor(PosedField(load_field(place.field)), [], place.camera)
     routes, path = load_routes(place.routes), tmp_path / "place.png"
     routes_picture(path, place.scene, routes, place.camera, place.mount, sensor, "a")
     height, width, _ = files.read_image(path).shape

@@ -1,7 +1,8 @@
-"""Mitsuba scenes as sensors: equal images, derivatives, what is refused."""
+"""Scenes of fields as sensors: with other objects, from above, what is refused."""
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from helpers import toy_loop as toy
 from helpers import walled_scene as walled
 from helpers.kernels import nothing_compiled
 
-from mi_nerfattack.attack.surrogate import surrogate_sensor
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
+from mi_nerfattack.deploy.surrogate.scene import scene_sensor, showing
 from mi_nerfattack.deploy.views.above import surrogate_above
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.outside import Overhead
@@ -35,29 +36,7 @@ def folder(variant: str, tmp_path: Path) -> Path:
 
 
 def sensor_of(description, attacked=("far", "near"), mount=toy.MOUNT):
-    return surrogate_sensor(walled.load(description), mount, attacked)
-
-
-@pytest.mark.parametrize(
-    ("lens", "walls", "composite"),
-    [
-        (walled.LENS, True, "depth"),
-        (walled.PERSPECTIVE, True, "interleaved"),
-        (walled.PERSPECTIVE, False, "depth"),
-    ],
-)
-def test_images_are_mitsubas(folder, lens, walls, composite):
-    """All vehicles of a batch; with a wall, or the sky of a field, behind."""
-    sky = {"type": "ngp_field", "filename": str(folder / "sky.safetensors")}
-    more = {} if walls else {"sky": sky}
-    description = walled.scene_dict(folder, lens, walls, composite=composite, **more)
-    sensor = sensor_of(description)
-    seen = sensor.observe(walled.close_loop(sensor).initial(STATES), 0)
-    for image, state in zip(seen.image.numpy(), STATES, strict=True):
-        wanted = linear_to_srgb_numpy(walled.rendered(description, state))
-        error = abs(image - wanted)
-        assert np.sqrt((error**2).mean()) <= 1e-5
-        assert (error <= 1e-4).mean() >= 0.999
+    return scene_sensor(walled.load(description), mount, attacked)
 
 
 def test_without_objects_it_shows_the_rest(folder):
@@ -69,7 +48,7 @@ def test_without_objects_it_shows_the_rest(folder):
     del integrator["scene"]
     for parts, wanted in ((fog_alone, fog_alone), (integrator, integrator["behind"])):
         full = {**description, "integrator": {**parts, **objects}}
-        sensor = sensor_of(full).showing([])
+        sensor = showing(sensor_of(full), [])
         state = walled.close_loop(sensor).initial(STATES[:1])
         image = sensor.observe(state, 0).image.numpy()[0]
         bare = walled.rendered({**description, "integrator": wanted}, STATES[0])
@@ -112,6 +91,8 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
     drive = whole.run(initial)
     found = whole.gradient(drive).textures
     directions = [rng.normal(size=texture.shape) for texture in found]
+    gc.collect()  # kernels depend on all BSDFs of the process
+    whole.run(initial)
     replayed = replace(whole, adjoint=Replay())
     with nothing_compiled():
         again = replayed.run(initial)
@@ -123,29 +104,21 @@ def test_detached_gradient_is_that_of_the_held_camera(folder, rng):
     assert along(found, directions) == pytest.approx(wanted, 1e-3)
 
 
-def test_attached_gradient_is_that_of_the_loop(folder, rng):
-    """Without surfaces."""
-    sensor = sensor_of(walled.scene_dict(folder, walls=False))
-    whole = rollout(sensor, 10, attached=True)
-    initial = whole.loop.initial(STATES)
-    found = whole.gradient(whole.run(initial)).textures
-    directions = [rng.normal(size=texture.shape) for texture in found]
-    wanted = difference(lambda: whole.run(initial).value, sensor, directions, 0.05)
-    assert along(found, directions) == pytest.approx(wanted, 0.05)
-
-
 def test_attached_with_surfaces_is_refused(folder):
     sensor = sensor_of(walled.scene_dict(folder))
     whole = rollout(sensor, 1, attached=True)
     drive = whole.run(whole.loop.initial(STATES))
-    with pytest.raises(InputError, match="constants of a frame.*set attached to false"):
+    with pytest.raises(
+        InputError,
+        match="attached: surfaces and a nested integrator",
+    ):
         whole.gradient(drive)
 
 
 def test_the_scene_shows_what_the_sensor_wears(folder):
     """Fields are shared, so that parameters count by their keys."""
     scene = walled.load(walled.scene_dict(folder))
-    sensor = surrogate_sensor(scene, toy.MOUNT)
+    sensor = scene_sensor(scene, toy.MOUNT, ["far", "near"])
     parameters = mi.traverse(scene)
     for name, texture in zip(("far", "near"), sensor.textures(), strict=True):
         (key,) = (k for k in parameters.keys() if k.endswith(f"{name}.colour"))
@@ -161,11 +134,7 @@ def test_the_scene_shows_what_the_sensor_wears(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"integrator": {"type": "path"}}, "PathIntegrator; a surrogate needs"),
-        ({"sensor": {"type": "thinlens", "aperture_radius": 0.1}}, "use perspective"),
-        ({"sensor": {"type": "orthographic"}}, "only perspective"),
-        ({"sensor.film.crop_width": 5}, "remove crop_"),
-        ({"integrator.far.relit": True}, "set relit to false"),
+        ({"integrator": {"type": "path"}}, "PathIntegrator cannot be differentiated"),
         ({"integrator.far.type": "ngp_field"}, "no grid_field 'far'; .*: near, scene$"),
     ],
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.render.camera.intrinsics import CameraMount, mount_pose
 
 
@@ -18,10 +20,22 @@ class SceneCamera:
             does not.
         mount: pose on the vehicle.
         seed: of all random numbers, renewed each control period.
+        centred: let rays go through the middles of n x n squares of a pixel.
+
+    Raises:
+        InputError: `centred`, and a number of samples that is no square.
     """
 
-    def __init__(self, sensor: Any, mount: CameraMount, seed: int) -> None:
+    def __init__(
+        self, sensor: Any, mount: CameraMount, seed: int, centred: bool = False
+    ) -> None:
         self.sensor, self.mount, self.seed = sensor, mount, seed
+        self.centred = centred
+        if centred and math.isqrt(self.spp) ** 2 != self.spp:
+            raise InputError(
+                f"samples per pixel: {self.spp}; rays through the middles of squares "
+                "need 1, 4, 9, ..."
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -56,12 +70,12 @@ class SceneCamera:
             dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
         )[0]
         sampler.seed(key, total)
-        # A ray of the scene's own sensor, through a random place in its pixel
+        # A ray of the scene's own sensor, through a place in its pixel
         index = dr.arange(mi.UInt32, total) // spp
         vehicle = index // (width * height)
         pixel = index - vehicle * (width * height)
         row = pixel // width
-        place = mi.Vector2f(pixel - row * width, row) + sampler.next_2d()
+        place = mi.Vector2f(pixel - row * width, row) + self._within(sampler, index)
         aperture = mi.Point2f(0)
         if self.sensor.needs_aperture_sample():
             aperture = sampler.next_2d()
@@ -75,13 +89,7 @@ class SceneCamera:
             to_local = self.sensor.world_transform().inverse()
             o, d = to_local @ ray.o, to_local @ ray.d
         # Mitsuba's cameras look along +z with x to the left and y up
-        origin, columns = mount_pose(
-            (mi.Float(pose[0]), mi.Float(pose[1]), mi.Float(pose[2])),
-            self.mount.height_m,
-            self.mount.forward_m,
-            self.mount.pitch_deg,
-        )
-        dr.eval(origin, columns)
+        origin, columns = self._place(pose)
         right, down, forward = (dr.gather(mi.Vector3f, c, vehicle) for c in columns)
         moved = mi.Ray3f(ray)  # without differentials, which are the scene sensor's
         moved.o = dr.gather(mi.Point3f, origin, vehicle) + (
@@ -90,13 +98,45 @@ class SceneCamera:
         moved.d = d.z * forward - d.x * right - d.y * down
         return sampler, moved, weight
 
+    def eye(self, pose: Any, count: int) -> mi.Point3f:
+        """Return where the eye of each ray of :meth:`rays` is, (3, n)."""
+        origin, _ = self._place(pose)
+        width, height = self.size
+        rays = width * height * self.spp
+        return dr.gather(mi.Point3f, origin, dr.arange(mi.UInt32, count * rays) // rays)
+
+    def nearest(self, distances: mi.Float) -> mi.Float:
+        """Return the least of the samples (n spp,) of each pixel."""
+        return dr.block_reduce(dr.ReduceOp.Min, distances, self.spp)
+
+    def _place(self, pose: Any) -> tuple[mi.Point3f, Any]:
+        """Return the cameras' positions, and the columns of their rotations."""
+        mount = self.mount
+        state = mi.Float(pose[0]), mi.Float(pose[1]), mi.Float(pose[2])
+        found = mount_pose(state, mount.height_m, mount.forward_m, mount.pitch_deg)
+        dr.eval(found)
+        return found
+
+    def _within(self, sampler: mi.Sampler, index: mi.UInt32) -> mi.Point2f:
+        """Return where rays meet their pixels, (2, n), from 0 to 1."""
+        if not self.centred:
+            return sampler.next_2d()
+        side = math.isqrt(self.spp)
+        sample = dr.arange(mi.UInt32, dr.width(index)) - index * self.spp
+        row = sample // side
+        return mi.Point2f(sample - row * side + 0.5, row + 0.5) / side
+
     def pixels(self, colour: Any) -> mi.Color3f:
         """Average the samples of each pixel, as linear RGB."""
+        return self.average(mi.Color3f(colour))
+
+    def average(self, values: Any) -> Any:
+        """Average the samples (..., n spp) of each pixel."""
         spp = self.spp
-        rgb = mi.Color3f(colour.x) if mi.is_monochromatic else mi.Color3f(colour)
         if spp == 1:
-            return rgb
-        return mi.Color3f(*[dr.block_sum(mi.Float(c), spp) / spp for c in rgb])
+            return values
+        parts = values if dr.depth_v(values) > 1 else [values]
+        return type(values)(*[dr.block_sum(mi.Float(x), spp) / spp for x in parts])
 
     def spread(self, d_linear: mi.Color3f) -> Any:
         """Transpose of :meth:`pixels`."""
@@ -104,4 +144,4 @@ class SceneCamera:
         if spp > 1:
             index = dr.arange(mi.UInt32, dr.width(d_linear) * spp) // spp
             d_linear = dr.gather(mi.Color3f, d_linear, index) / spp
-        return mi.Spectrum(dr.sum(d_linear) if mi.is_monochromatic else d_linear)
+        return mi.Spectrum(d_linear)

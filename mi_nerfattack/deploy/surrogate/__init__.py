@@ -1,0 +1,1 @@
+"""The surrogate: scenes of fields as sensors, and one vehicle in them."""

@@ -1,0 +1,141 @@
+"""The surrogate as an environment: its sensor, one vehicle, frames taken apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_nerfattack.deploy.environment import CameraFrame
+from mi_nerfattack.deploy.kinematic import KinematicVehicle
+from mi_nerfattack.deploy.simulated import AbstractSimulation
+from mi_nerfattack.deploy.surrogate.scene import showing
+from mi_nerfattack.deploy.views.paste import OPAQUE, require_fields
+from mi_nerfattack.render.camera.intrinsics import mount_matrix
+from mi_nerfattack.render.rays import March
+from mi_nerfattack.render.surroundings import nearest_surface
+from mi_nerfattack.rollout.scene_sensor import SceneSensor, pose_of
+from mi_nerfattack.rollout.sensor import Observation
+from mi_nerfattack.vehicle.state import to_state
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What reaches the camera, pixel by pixel; depths count from the camera.
+
+    Attributes:
+        total: of all fields.
+        others: share of each field that is no object.
+        objects: share of each object of the sensor that is no emitter's.
+        behind: of what is seen behind all fields; its moment is zero.
+        far_m: (n,), metres to the first surface, infinite without one.
+    """
+
+    total: March
+    others: list[March]
+    objects: list[March]
+    behind: March
+    far_m: mi.Float
+
+
+def take_apart(sensor: SceneSensor, observation: Observation, state: Any) -> Layers:
+    """Take a frame apart.
+
+    Args:
+        sensor: that observed.
+        observation: what it observed.
+        state: (m, n), where it did.
+    """
+    camera, pose = sensor.camera, pose_of(state)
+    with dr.suspend_grad():
+        _, ray, _ = camera.rays(pose, dr.width(state), observation.step)
+        start = dr.norm(ray.o - camera.eye(pose, dr.width(state)))
+        far = start + nearest_surface(sensor.scene, ray, mi.Bool(True))
+        seen = getattr(observation.kept, "seen", None)
+        if seen is None:  # no fields
+            none = March.zeros(dr.width(observation.linear))
+            total, shares = none, []
+        else:
+            total, *shares = (
+                _of_pixels(camera, layer, start)
+                for layer in (seen.total, *sensor.integrator.composite.shares(seen))
+            )
+        own = [id(posed) for posed in sensor.objects]
+        ids = [id(layer) for layer in sensor.layers]
+        behind = March(observation.linear - total.radiance, 1 - total.opacity)
+        others = [part for k, part in zip(ids, shares, strict=True) if k not in own]
+        objects = [shares[ids.index(k)] for k in own if k in ids]
+        return Layers(total, others, objects, behind, camera.nearest(far))
+
+
+def _of_pixels(camera: Any, layer: March, start: mi.Float) -> March:
+    """Average a layer over the samples of pixels, with depths from the camera."""
+    parts = layer.radiance, layer.opacity, layer.moment + layer.opacity * start
+    return March(*(camera.average(part) for part in parts))
+
+
+class SurrogateEnvironment(AbstractSimulation):
+    """The differentiable rollout of one vehicle: its sensor and its transition.
+
+    Frames are the images of an attack in eight bits, which is what the policy gets in
+    a `ClosedLoop`; the seed has no effect. The depth is the expected depth of all that
+    a ray meets, infinite where it meets less than half an opacity.
+
+    Args:
+        sensor: sees.
+        vehicle: moves.
+    """
+
+    def __init__(self, sensor: SceneSensor, vehicle: KinematicVehicle) -> None:
+        super().__init__("surrogate", vehicle, sensor.intrinsics, vehicle.period)
+        self.sensor = sensor
+
+    def show(self, objects: Sequence[Any]) -> None:
+        """Compose other fields with the scene's; grid fields, no two of one texture."""
+        require_fields(objects)
+        self.sensor = showing(self.sensor, list(objects))
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _observe(self) -> CameraFrame:
+        sensor, state = self.sensor, to_state(self.state[None])
+        found = sensor.observe(state, self._steps)
+        layers = take_apart(sensor, found, state)
+        total = layers.total
+        depth = dr.select(total.opacity >= OPAQUE, total.depth, layers.far_m)
+        shape = (self.camera.height, self.camera.width)
+        can_split = len(layers.objects) == len(sensor.objects)
+        return CameraFrame(
+            np.round(255 * np.array(found.image)[0]).astype(np.uint8),
+            depth.numpy().reshape(shape),
+            mount_matrix(self.state[None, :3], sensor.mount)[0],
+            found.linear.numpy().T.reshape(*shape, 3),
+            partial(_split, layers, shape) if can_split else None,
+        )
+
+
+def _split(
+    layers: Layers, shape: tuple[int, int], objects: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Take a frame apart; see :meth:`CameraFrame.layers`.
+
+    Args:
+        layers: what it shows.
+        shape: height and width.
+        objects: names.
+    """
+    names = [f"scene{k or ''}" for k in range(len(layers.others))]
+    parts = zip((*names, *objects), layers.others + layers.objects, strict=True)
+    images = {}
+    for name, part in parts:
+        images |= part.images(name, shape)
+    images |= layers.behind.images("background", shape)
+    passed = layers.behind.opacity > 0
+    far = dr.select(passed, layers.far_m, dr.inf)
+    return images | {"background.Z": far.numpy().reshape(shape)}
