@@ -252,9 +252,10 @@ class FieldIntegrator(FilmIntegrator):
         attached, ray = ray, mi.Ray3f(dr.detach(ray))
         active = mi.Bool(active)
         jitter = sampler.next_1d(active) if self.jitter else mi.Float(0.5)
-        # Fields end at the first surface that light does not pass straight.
+        # Where the fields end: the first surface that light does not pass straight
         t_max = nearest_surface(scene, ray, active)
         rays = Rays(ray.o, ray.d, t_max, jitter, active)
+        # I and a of the fields (A.1 to A.6), and L_b behind them
         if state_in is None:  # primal mode, or forward mode, which comes without
             inner = sampler if mode == dr.ADMode.Primal else sampler.clone()
             state_in = look(self, scene, inner, ray, rays, width)
@@ -263,13 +264,14 @@ class FieldIntegrator(FilmIntegrator):
         valid = state.seen.total.opacity > 0
         if state.valid is not None:
             valid |= state.valid
-        if mode == dr.ADMode.Primal:
+        if mode == dr.ADMode.Primal:  # L = I + (1 - a) L_b
             radiance = lay_over(self, state.seen.total, rays, state.behind, ray)
             aovs = [*self.channels.of_sample(state.seen), *state.aovs]
             return radiance, valid, aovs, state
-        if mode == dr.ADMode.Backward:
+        if mode == dr.ADMode.Backward:  # from dJ/dL to the parameters, and to the ray
             self._backward(scene, sampler, attached, rays, state, δL, δsplats)
             return δL, valid, [], None
+        # Forward: from tangents of the parameters to that of L
         limits.check_forward(attached)
         tangent, t_splats = push_forward(self, scene, sampler, ray, rays, state)
         return tangent, valid, [], t_splats
@@ -305,6 +307,7 @@ class FieldIntegrator(FilmIntegrator):
             cotangent = dr.grad(leaf.seen)
             δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
             by_sky = dr.grad(direction) if by_camera else None
+        # From dJ/dL_b to BSDFs, bitmaps and lights
         if self.differentiates_behind:
             sample_nested(
                 self.behind,
@@ -316,6 +319,7 @@ class FieldIntegrator(FilmIntegrator):
                 δbehind,
                 state.inner,
             )
+        # From dJ/dI and dJ/da to densities and colours: a march again, perhaps later
         if not by_camera and not any(item.has_pose_gradients for item in self.posed):
             self.collector.add(rays, state.seen, cotangent)
             return
@@ -333,8 +337,10 @@ class FieldIntegrator(FilmIntegrator):
         found = self.composite.backward_rays(
             self.posed, rays, state.seen, cotangent, self.stop, wanted
         )
+        # A field that moves is seen as by rays that move against it
         for k, by_rays in zip(wanted, found, strict=True):
             self.posed[k].backward_pose(rays, by_rays)
+        # The camera moves all rays alike, and with them what they see of the sky
         if by_sky is not None:
             by_origin = sum((part.origin for part in found), mi.Vector3f(0))
             by_direction = sum((part.direction for part in found), by_sky)

@@ -109,6 +109,14 @@ def area(size: int, target: int) -> torch.Tensor:
     return covered.clamp(min=0) * (target / size)
 
 
+#: Filters by the names of scenario files.
+FILTERS: dict[str, Filter] = {
+    "antialias": antialias,
+    "bilinear": bilinear,
+    "area": area,
+}
+
+
 class Resize(AbstractTransform):
     """Resample to a size, pixel centres at half-integers, borders repeated.
 
@@ -252,6 +260,15 @@ def time_first(frames: torch.Tensor) -> torch.Tensor:
 def time_channels_last(frames: torch.Tensor) -> torch.Tensor:
     """Return (n, t, h, w, c)."""
     return frames.permute(0, 1, 3, 4, 2)
+
+
+#: Layouts by the names of scenario files: frames, time, channels, height, width.
+LAYOUTS: dict[str, Layout] = {
+    "NCHW": channels_first,
+    "NHWC": channels_last,
+    "NTCHW": time_first,
+    "NTHWC": time_channels_last,
+}
 
 
 class Preprocess:

@@ -96,6 +96,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         """Render a frame; see :meth:`AbstractSensor.observe`."""
         count = dr.width(state)
         self.renders += count
+        # From the state to rays, to their radiance, and to linear pixels
         with dr.suspend_grad():
             sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
             colour, _, _, kept = self._sample(dr.ADMode.Primal, sampler, ray)
@@ -115,6 +116,7 @@ class SceneSensor(AbstractDifferentiableSensor):
         if self._collector is None:
             linear, inner = kept
             return self._observation(linear, inner, count, step)
+        # The same rays again, whose fields are not marched again
         with dr.suspend_grad():
             sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
             inner = self._collector.restore(ray, kept)

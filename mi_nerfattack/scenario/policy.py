@@ -26,6 +26,8 @@ from mi_nerfattack.policy.http_policy import HttpPolicy
 from mi_nerfattack.policy.one_image import OneImage
 from mi_nerfattack.policy.pilotnet import PilotNet, stored_unit
 from mi_nerfattack.policy.preprocess import (
+    FILTERS,
+    LAYOUTS,
     AbstractTransform,
     Crop,
     FractionalCrop,
@@ -33,13 +35,6 @@ from mi_nerfattack.policy.preprocess import (
     Preprocess,
     Resize,
     ToLinear,
-    antialias,
-    area,
-    bilinear,
-    channels_first,
-    channels_last,
-    time_channels_last,
-    time_first,
     to_bgr,
     to_grey,
     to_yuv,
@@ -51,13 +46,6 @@ from mi_nerfattack.scenario.named_file import Code, File
 from mi_nerfattack.scenario.section import Kinds, Section, Trust, read_section, refuse
 from mi_nerfattack.scenario.user_code import check_trust
 
-FILTERS = {"antialias": antialias, "bilinear": bilinear, "area": area}
-LAYOUTS = {
-    "NCHW": channels_first,
-    "NHWC": channels_last,
-    "NTCHW": time_first,
-    "NTHWC": time_channels_last,
-}
 COLOURS: dict[str, Callable[[], AbstractTransform]] = {
     "linear": ToLinear,
     "yuv": to_yuv,
