@@ -62,23 +62,13 @@ class SceneCamera:
             the sampler after the camera's draws, the rays, and their weights.
         """
         width, height = self.size
-        sampler = self.sensor.sampler().clone()
-        spp = self.spp
-        sampler.set_samples_per_wavefront(spp)
-        total = count * width * height * spp
-        key = mi.sample_tea_32(
-            dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
-        )[0]
-        sampler.seed(key, total)
+        sampler, within, aperture = self._draw(count, step)
         # A ray of the scene's own sensor, through a place in its pixel
-        index = dr.arange(mi.UInt32, total) // spp
+        index = dr.arange(mi.UInt32, count * width * height * self.spp) // self.spp
         vehicle = index // (width * height)
         pixel = index - vehicle * (width * height)
         row = pixel // width
-        place = mi.Vector2f(pixel - row * width, row) + self._within(sampler, index)
-        aperture = mi.Point2f(0)
-        if self.sensor.needs_aperture_sample():
-            aperture = sampler.next_2d()
+        place = mi.Vector2f(pixel - row * width, row) + within
         with dr.suspend_grad():
             ray, weight = self.sensor.sample_ray_differential(
                 time=self.sensor.shutter_open(),
@@ -97,6 +87,22 @@ class SceneCamera:
         )
         moved.d = d.z * forward - d.x * right - d.y * down
         return sampler, moved, weight
+
+    def sampler(self, count: int, step: int) -> mi.Sampler:
+        """Return the sampler that :meth:`rays` gives, as it was then."""
+        return self._draw(count, step)[0]
+
+    def _draw(self, count: int, step: int) -> tuple[mi.Sampler, Any, mi.Point2f]:
+        """Return a sampler, places in pixels (2, n) from 0 to 1, and on apertures."""
+        width, height = self.size
+        total = count * width * height * self.spp
+        sampler = self.sensor.sampler().clone()
+        sampler.set_samples_per_wavefront(self.spp)
+        seed = dr.opaque(mi.UInt32, self.seed), dr.opaque(mi.UInt32, step)
+        sampler.seed(mi.sample_tea_32(*seed)[0], total)
+        within = self._centres(total) if self.centred else sampler.next_2d()
+        lens = self.sensor.needs_aperture_sample()
+        return sampler, within, sampler.next_2d() if lens else mi.Point2f(0)
 
     def eye(self, pose: Any, count: int) -> mi.Point3f:
         """Return where the eye of each ray of :meth:`rays` is, (3, n)."""
@@ -117,12 +123,10 @@ class SceneCamera:
         dr.eval(found)
         return found
 
-    def _within(self, sampler: mi.Sampler, index: mi.UInt32) -> mi.Point2f:
-        """Return where rays meet their pixels, (2, n), from 0 to 1."""
-        if not self.centred:
-            return sampler.next_2d()
+    def _centres(self, total: int) -> mi.Point2f:
+        """Return the middles of the squares of pixels, (2, total)."""
         side = math.isqrt(self.spp)
-        sample = dr.arange(mi.UInt32, dr.width(index)) - index * self.spp
+        sample = dr.arange(mi.UInt32, total) % self.spp
         row = sample // side
         return mi.Point2f(sample - row * side + 0.5, row + 0.5) / side
 

@@ -98,11 +98,9 @@ class SceneSensor(AbstractDifferentiableSensor):
         self.renders += count
         # From the state to rays, to their radiance, and to linear pixels
         with dr.suspend_grad():
-            sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
-            colour, _, _, kept = self._sample(dr.ADMode.Primal, sampler, ray)
-            linear = self.camera.pixels(colour * weight)
-            dr.eval(linear, kept)
-        return self._observation(linear, kept, count, step)
+            sampler, *view = self.camera.rays(pose_of(state), count, step)
+            linear, kept = self._render(sampler, view, None)
+        return self._observation(linear, kept, view, count, step)
 
     def keep(self, observation: Observation) -> Any:
         """Keep what the integrator has to, or else the pixels and its whole state."""
@@ -113,18 +111,16 @@ class SceneSensor(AbstractDifferentiableSensor):
     def restore(self, state: Any, step: int, kept: Any) -> Observation:
         """See :meth:`AbstractDifferentiableSensor.restore`."""
         count = dr.width(state)
-        if self._collector is None:
-            linear, inner = kept
-            return self._observation(linear, inner, count, step)
         # The same rays again, whose fields are not marched again
         with dr.suspend_grad():
-            sampler, ray, weight = self.camera.rays(pose_of(state), count, step)
-            inner = self._collector.restore(ray, kept)
-            mode = dr.ADMode.Primal
-            colour, *_ = self._sample(mode, sampler, ray, state_in=inner)
-            linear = self.camera.pixels(colour * weight)
-            dr.eval(linear, inner)
-        return self._observation(linear, inner, count, step)
+            sampler, *view = self.camera.rays(pose_of(state), count, step)
+            if self._collector is None:
+                linear, inner = kept
+            else:
+                dr.eval(view)
+                inner = self._collector.restore(view[0], kept)
+                linear, inner = self._render(sampler, view, inner)
+        return self._observation(linear, inner, view, count, step)
 
     def vjp(
         self, observation: Observation, state: Any, d_image: Any, attached: bool
@@ -134,26 +130,38 @@ class SceneSensor(AbstractDifferentiableSensor):
         Raises:
             InputError: `attached`, and the integrator has no derivative by its rays.
         """
-        count = dr.width(state)
-        if attached:
-            self.check_attached()
         # From the developed image back to the radiance of each sample
         d_linear = vjp(_develop, observation.linear, _colours(d_image))
-        leaf = pose_of(state)
+        leaf, view = None, observation.view
+        count, step = dr.width(state), observation.step
         if attached:
+            self.check_attached()
+            leaf = pose_of(state)
             dr.enable_grad(leaf)
-        with dr.suspend_grad(when=not attached):
-            sampler, ray, weight = self.camera.rays(leaf, count, observation.step)
+            _, *view = self.camera.rays(leaf, count, step)
         with dr.suspend_grad():
+            ray, weight = view
             δL = self.camera.spread(d_linear) * dr.detach(weight)
             # From the radiance to the parameters and, through its rays, to the state
             with dr.isolate_grad():
-                self._sample(dr.ADMode.Backward, sampler, ray, δL, observation.kept)
-        if not attached:
+                sampler, kept = self.camera.sampler(count, step), observation.kept
+                self._sample(dr.ADMode.Backward, sampler, ray, δL, kept)
+        if leaf is None:
             return None
         result = dr.grad(leaf)
         dr.eval(result)
         return result
+
+    def _render(
+        self, sampler: mi.Sampler, view: Any, state_in: Any
+    ) -> tuple[mi.Color3f, Any]:
+        """Return linear pixels, and the integrator's state."""
+        ray, weight = view
+        mode = dr.ADMode.Primal
+        colour, _, _, kept = self._sample(mode, sampler, ray, None, state_in)
+        linear = self.camera.pixels(colour * weight)
+        dr.eval(linear, kept)
+        return linear, kept
 
     def _sample(
         self,
@@ -177,14 +185,14 @@ class SceneSensor(AbstractDifferentiableSensor):
         )
 
     def _observation(
-        self, linear: mi.Color3f, kept: Any, count: int, step: int
+        self, linear: mi.Color3f, kept: Any, view: Any, count: int, step: int
     ) -> Observation:
         width, height = self.camera.size
         with dr.suspend_grad():
             pixels = dr.ravel(_develop(linear))
             dr.eval(pixels)
         image = mi.TensorXf(pixels, (count, height, width, 3))
-        return Observation(image, step=step, linear=linear, kept=kept)
+        return Observation(image, step, linear, kept, view)
 
     # Parameters
 

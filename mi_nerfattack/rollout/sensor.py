@@ -22,12 +22,14 @@ class Observation:
         linear: (3, n height width), before the sRGB curve; None where the sensor has
             no derivatives.
         kept: what the scene's integrator hands to its derivatives.
+        view: rays and their weights.
     """
 
     image: Any
     step: int = 0
     linear: Any = None
     kept: Any = None
+    view: Any = None
 
     def __repr__(self) -> str:
         count, height, width, _ = self.image.shape
