@@ -51,10 +51,9 @@ def take_apart(sensor: SceneSensor, observation: Observation, state: Any) -> Lay
         observation: what it observed.
         state: (m, n), where it did.
     """
-    camera, pose = sensor.camera, pose_of(state)
+    camera, (ray, _) = sensor.camera, observation.view
     with dr.suspend_grad():
-        _, ray, _ = camera.rays(pose, dr.width(state), observation.step)
-        start = dr.norm(ray.o - camera.eye(pose, dr.width(state)))
+        start = dr.norm(ray.o - camera.eye(pose_of(state), dr.width(state)))
         far = start + nearest_surface(sensor.scene, ray, mi.Bool(True))
         seen = getattr(observation.kept, "seen", None)
         if seen is None:  # no fields
