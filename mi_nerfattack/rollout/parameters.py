@@ -38,10 +38,11 @@ class CollectsRays(Protocol):
 
 
 class Differentiated:
-    """Parameters of a scene, some of which gradients are accumulated of.
+    """Parameters of a scene, and the gradients of some of them.
 
-    Between :meth:`start` and :meth:`stop` their values are leaves of Dr.Jit's graph. A
-    grid field's colours and densities have one leaf, the array that marches read.
+    Between :meth:`start` and :meth:`stop`, the values of the selected parameters are
+    leaves of Dr.Jit's graph. Colours and densities of a grid field share a leaf: the
+    array that marches read.
 
     Args:
         scene: that is rendered.
