@@ -11,6 +11,7 @@ import drjit as dr
 from mi_nerfattack.backend.freeze import freeze_method
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.composite import AbstractComposite, Seen, Task, TaskQueue
+from mi_nerfattack.render.march import RayGradient
 from mi_nerfattack.render.rays import March, Rays
 from mi_nerfattack.render.scene_march import AbstractSceneMarch
 
@@ -32,7 +33,9 @@ class RayCollector:
     ) -> None:
         self.waits = False
         self._parts = composite, list(posed), stop
+        self._wanted: tuple[int, ...] = ()
         self._queue = TaskQueue(freeze_method(self._accumulate, self._state))
+        self._by_rays = freeze_method(self._march_back, self._rays_state)
 
     def add(self, rays: Rays, seen: Seen, cotangent: Seen) -> None:
         """Take rays; see :meth:`AbstractComposite.backward`."""
@@ -41,6 +44,27 @@ class RayCollector:
             self._queue.add(task)
         if not self.waits:
             self._queue.finish()
+
+    def by_rays(
+        self, rays: Rays, seen: Seen, cotangent: Seen, wanted: Sequence[int]
+    ) -> list[RayGradient]:
+        """See :meth:`AbstractComposite.backward_rays`; marches at once."""
+        self._wanted = tuple(wanted)
+        if not self.waits:  # a render, which somebody may be recording
+            return self._march_back(rays, seen, cotangent)
+        dr.make_opaque(rays, seen, cotangent)
+        return self._by_rays(rays, seen, cotangent)
+
+    def _march_back(self, rays: Rays, seen: Seen, cotangent: Seen) -> list[RayGradient]:
+        composite, posed, stop = self._parts
+        return composite.backward_rays(posed, rays, seen, cotangent, stop, self._wanted)
+
+    def _rays_state(self, rays: Rays, *more: Any) -> list[Any]:
+        """Return what the frozen :meth:`_march_back` reads beside its arguments."""
+        composite, posed, stop = self._parts
+        del more
+        sizes = dr.width(rays.direction), self._wanted
+        return [composite, stop, sizes, [item.state() for item in posed]]
 
     def clear(self) -> None:
         """Forget the rays that wait."""

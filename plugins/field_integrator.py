@@ -305,6 +305,8 @@ class FieldIntegrator(FilmIntegrator):
                 result += alpha * δalpha + sum((x * δ for x, δ in pairs), mi.Float(0))
             dr.backward_from(result)
             cotangent = dr.grad(leaf.seen)
+            if δsplats is None:  # the colour depends on the total alone
+                cotangent = Seen(cotangent.total)
             δbehind = None if leaf.behind is None else dr.grad(leaf.behind)
             by_sky = dr.grad(direction) if by_camera else None
         # From dJ/dL_b to BSDFs, bitmaps and lights
@@ -334,9 +336,7 @@ class FieldIntegrator(FilmIntegrator):
             for k, item in enumerate(self.posed)
             if by_sky is not None or item.has_gradients or item.has_pose_gradients
         ]
-        found = self.composite.backward_rays(
-            self.posed, rays, state.seen, cotangent, self.stop, wanted
-        )
+        found = self.collector.by_rays(rays, state.seen, cotangent, wanted)
         # A field that moves is seen as by rays that move against it
         for k, by_rays in zip(wanted, found, strict=True):
             self.posed[k].backward_pose(rays, by_rays)
