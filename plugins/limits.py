@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.backend.differentiate import differentiates_rays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.field_emitter import FieldEmitter
 from mi_nerfattack.render.backdrop import fields_by_rays
@@ -133,7 +134,7 @@ def _shared(integrator: Any, scene: mi.Scene, attached: list[Any]) -> list[str]:
 
 
 def _check_behind(integrator: Any, key: str) -> None:
-    if not isinstance(integrator.behind, mi.ad.integrators.common.RBIntegrator):
+    if not differentiates_rays(integrator.behind):
         raise InputError(
             f"{key}: its effect through the nested {integrator.behind.class_name()} "
             'has no derivative; nest <integrator type="prb"/> in its place'

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_nerfattack.backend.differentiate import differentiates_rays
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.plugins.properties import background
 from mi_nerfattack.render.composite import Seen
@@ -52,7 +53,7 @@ def sample_nested(
     state_in: Any = None,
 ) -> tuple[Any, ...]:
     """Sample another integrator, whichever of Mitsuba's two interfaces it has."""
-    if not isinstance(integrator, mi.ad.integrators.common.RBIntegrator):
+    if not differentiates_rays(integrator):
         ray = mi.RayDifferential3f(ray)
         return integrator.sample(scene, sampler, ray, active=active)
     return integrator.sample(

@@ -8,6 +8,15 @@ from typing import Any
 import drjit as dr
 
 
+def differentiates_rays(integrator: Any) -> bool:
+    """Tell whether an integrator has the protocol of Mitsuba's `RBIntegrator`.
+
+    By the name of its base class: other packages and changes of variant leave several
+    copies of that class in a process.
+    """
+    return any(base.__name__ == "RBIntegrator" for base in type(integrator).__mro__)
+
+
 def vjp(f: Callable[[Any], Any], x: Any, dy: Any) -> Any:
     """Multiply a cotangent by the derivative of a function (reverse mode).
 

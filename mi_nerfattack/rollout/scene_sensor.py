@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.differentiate import vjp
+from mi_nerfattack.backend.differentiate import differentiates_rays, vjp
 from mi_nerfattack.errors import InputError, SetupError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.vertex_colours import gradient
@@ -71,7 +71,7 @@ class SceneSensor(AbstractDifferentiableSensor):
             )
         self.scene = scene
         self.integrator: Any = integrator or scene.integrator()
-        if not isinstance(self.integrator, mi.ad.integrators.common.RBIntegrator):
+        if not differentiates_rays(self.integrator):
             raise InputError(
                 f"scene: its integrator {self.integrator.class_name()} cannot be "
                 "differentiated ray by ray; use field_integrator or prb"
