@@ -48,10 +48,10 @@ class BrickFieldVolume(AbstractFieldVolume):
        - |bool|
        - Must be false: bricks have no normals. (Default: |false|)
 
-    A reconstructed scene that is fast to look up: density and radiance at the vertices
-    of a brick in each occupied cell, interpolated trilinearly, with an image of the sky
-    behind. It shows what the ``ngp_field`` with ``skip_thin`` shows that it was baked
-    from, without the effects of direction.
+    A reconstructed scene that is fast to look up. Each occupied cell has a brick, and
+    each vertex of a brick a density and a radiance, which are interpolated trilinearly.
+    An image of the sky lies behind. The volume shows what an ``ngp_field`` with
+    ``skip_thin`` shows that it was baked from, without the effects of direction.
 
     .. tabs::
         .. code-tab:: xml

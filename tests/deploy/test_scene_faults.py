@@ -15,7 +15,7 @@ from helpers import toy_loop as toy
 from helpers import walled_scene as walled
 
 from mi_nerfattack.attack.texture.statistics import seen_weights
-from mi_nerfattack.deploy.surrogate.environment import take_apart
+from mi_nerfattack.deploy.surrogate.environment import measure, take_apart
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, scene_sensor, showing
 from mi_nerfattack.deploy.views.above import surrogate_above
 from mi_nerfattack.errors import InputError, SetupError
@@ -194,11 +194,13 @@ def test_fields_of_emitters_are_no_objects(folder):
     scene = walled.load(described)
     with pytest.raises(InputError, match="PRBIntegrator; objects are shown by"):
         scene_sensor(scene, toy.MOUNT, ["near"])
-    (key,) = (k for k in mi.traverse(scene).keys() if k.endswith(".colour"))  # noqa: SIM118
+    (key,) = (k for k in mi.traverse(scene).keys() if k.endswith(".colour"))  # noqa: SIM118  not a dict
     sensor, state = SceneSensor(scene, toy.MOUNT, [key]), to_state(STATE)
-    layers = take_apart(sensor, sensor.observe(state, 0), state)
+    found = sensor.observe(state, 0)
+    distances = measure(sensor, found, state)
+    layers = take_apart(sensor, found, distances.start)
     assert layers.objects == [] and dr.all(layers.behind.opacity == 1)
-    assert 0 < np.isfinite(layers.far_m.numpy()).sum() < layers.far_m.numpy().size
+    assert 0 < np.isfinite(distances.far.numpy()).sum() < distances.far.numpy().size
 
 
 def test_grey_variants_are_refused(no_variant_left):

@@ -25,26 +25,35 @@ from mi_nerfattack.vehicle.state import to_state
 
 
 @dataclass(frozen=True)
+class Distances:
+    """Where the rays of a frame begin and end, metres from the camera.
+
+    Attributes:
+        start: (n spp,), where they begin.
+        far: (n,), the first surface in a pixel, infinite without one.
+    """
+
+    start: mi.Float
+    far: mi.Float
+
+
+@dataclass(frozen=True)
 class Layers:
     """What reaches the camera, pixel by pixel; depths count from the camera.
 
     Attributes:
-        total: of all fields.
         others: share of each field that is no object.
         objects: share of each object of the sensor that is no emitter's.
         behind: of what is seen behind all fields; its moment is zero.
-        far_m: (n,), metres to the first surface, infinite without one.
     """
 
-    total: March
     others: list[March]
     objects: list[March]
     behind: March
-    far_m: mi.Float
 
 
-def take_apart(sensor: SceneSensor, observation: Observation, state: Any) -> Layers:
-    """Take a frame apart.
+def measure(sensor: SceneSensor, observation: Observation, state: Any) -> Distances:
+    """Measure the rays of a frame.
 
     Args:
         sensor: that observed.
@@ -55,21 +64,36 @@ def take_apart(sensor: SceneSensor, observation: Observation, state: Any) -> Lay
     with dr.suspend_grad():
         start = dr.norm(ray.o - camera.eye(pose_of(state), dr.width(state)))
         far = start + nearest_surface(sensor.scene, ray, mi.Bool(True))
-        seen = getattr(observation.kept, "seen", None)
-        if seen is None:  # no fields
-            none = March.zeros(dr.width(observation.linear))
-            total, shares = none, []
-        else:
-            total, *shares = (
-                _of_pixels(camera, layer, start)
-                for layer in (seen.total, *sensor.integrator.composite.shares(seen))
-            )
-        own = [id(posed) for posed in sensor.objects]
-        ids = [id(layer) for layer in sensor.layers]
-        behind = March(observation.linear - total.radiance, 1 - total.opacity)
-        others = [part for k, part in zip(ids, shares, strict=True) if k not in own]
-        objects = [shares[ids.index(k)] for k in own if k in ids]
-        return Layers(total, others, objects, behind, camera.nearest(far))
+        return Distances(start, camera.nearest(far))
+
+
+def total_of(sensor: SceneSensor, observation: Observation, start: mi.Float) -> March:
+    """Return what all fields show in a frame; depths count from the camera.
+
+    Args:
+        sensor: that observed.
+        observation: what it observed.
+        start: of :class:`Distances`.
+    """
+    seen = getattr(observation.kept, "seen", None)
+    if seen is None:  # no fields
+        return March.zeros(dr.width(observation.linear))
+    return _of_pixels(sensor.camera, seen.total, start)
+
+
+def take_apart(
+    sensor: SceneSensor, observation: Observation, start: mi.Float
+) -> Layers:
+    """Take a frame apart; arguments as of :func:`total_of`."""
+    total, shares = total_of(sensor, observation, start), []
+    if sensor.layers:
+        parts = sensor.integrator.composite.shares(observation.kept.seen)
+        shares = [_of_pixels(sensor.camera, part, start) for part in parts]
+    own = [id(posed) for posed in sensor.objects]
+    ids = [id(layer) for layer in sensor.layers]
+    behind = March(observation.linear - total.radiance, 1 - total.opacity)
+    others = [part for k, part in zip(ids, shares, strict=True) if k not in own]
+    return Layers(others, [shares[ids.index(k)] for k in own if k in ids], behind)
 
 
 def _of_pixels(camera: Any, layer: March, start: mi.Float) -> March:
@@ -105,36 +129,43 @@ class SurrogateEnvironment(AbstractSimulation):
     def _observe(self) -> CameraFrame:
         sensor, state = self.sensor, to_state(self.state[None])
         found = sensor.observe(state, self._steps)
-        layers = take_apart(sensor, found, state)
-        total = layers.total
-        depth = dr.select(total.opacity >= OPAQUE, total.depth, layers.far_m)
+        distances = measure(sensor, found, state)
+        total = total_of(sensor, found, distances.start)
+        depth = dr.select(total.opacity >= OPAQUE, total.depth, distances.far)
         shape = (self.camera.height, self.camera.width)
-        can_split = len(layers.objects) == len(sensor.objects)
+        shown = [id(layer) for layer in sensor.layers]
+        can_split = all(id(posed) in shown for posed in sensor.objects)
         return CameraFrame(
             np.round(255 * np.array(found.image)[0]).astype(np.uint8),
             depth.numpy().reshape(shape),
             mount_matrix(self.state[None, :3], sensor.mount)[0],
             found.linear.numpy().T.reshape(*shape, 3),
-            partial(_split, layers, shape) if can_split else None,
+            partial(_split, sensor, found, distances, shape) if can_split else None,
         )
 
 
 def _split(
-    layers: Layers, shape: tuple[int, int], objects: Sequence[str]
+    sensor: SceneSensor,
+    found: Observation,
+    distances: Distances,
+    shape: tuple[int, int],
+    objects: Sequence[str],
 ) -> dict[str, np.ndarray]:
     """Take a frame apart; see :meth:`CameraFrame.layers`.
 
     Args:
-        layers: what it shows.
+        sensor: that observed.
+        found: what it observed.
+        distances: of its rays.
         shape: height and width.
         objects: names.
     """
+    layers = take_apart(sensor, found, distances.start)
     names = [f"scene{k or ''}" for k in range(len(layers.others))]
     parts = zip((*names, *objects), layers.others + layers.objects, strict=True)
     images = {}
     for name, part in parts:
         images |= part.images(name, shape)
     images |= layers.behind.images("background", shape)
-    passed = layers.behind.opacity > 0
-    far = dr.select(passed, layers.far_m, dr.inf)
+    far = dr.select(layers.behind.opacity > 0, distances.far, dr.inf)
     return images | {"background.Z": far.numpy().reshape(shape)}

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mi_nerfattack.attack.black_box.random_looks import equal_count
+from mi_nerfattack.render.interleaved import InterleavedComposite
 from mi_nerfattack.rollout.adjoint import KeptBackgrounds
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import World, build_attack
@@ -126,7 +127,7 @@ def _kept_mb(world: World) -> float:
     if not isinstance(section.adjoint.build(), KeptBackgrounds):
         return 0.0
     kept = _KEPT_BYTES * len(sensor.layers)
-    if world.scenario.scene.composite != "depth":
+    if isinstance(sensor.integrator.composite, InterleavedComposite):
         kept += _KEPT_BYTES
     if sensor.integrator.behind is not None:
         kept += _BEHIND_BYTES
