@@ -107,15 +107,13 @@ class RolloutLoop(AbstractLoop):
     def value(self, frames: int) -> Any:
         """See :meth:`AbstractLoop.value`."""
         rollout = Rollout(self.loop, StageSum(cost), frames, adjoint=self.adjoint)
-        self.leaf = _leaf(self.sensor.textures()[0])
-        return rollout([self.leaf], self.loop.initial(np.array([START])))
+        (key,) = self.sensor.keys
+        self.leaf = _leaf(self.sensor.params[key])
+        return rollout({key: self.leaf}, self.loop.initial(np.array([START])))
 
     def by_colour(self) -> np.ndarray:
         """See :meth:`AbstractLoop.by_colour`."""
-        field: Any = self.sensor.objects[0].field
-        finest = dr.grad(self.leaf).numpy()[field.levels()[-1].vertices]
-        colour = field.colours.value.numpy()
-        return finest / (colour * (1 - colour))  # texture = logit(colour)
+        return dr.grad(self.leaf).numpy()
 
     def _network(self, features: Any) -> Any:
         """Return controls (1, n) of features (3 height width, n), colour by colour."""

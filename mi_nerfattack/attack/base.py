@@ -74,7 +74,7 @@ class AbstractAttack(ABC):
         self.history: list[IterationRecord] = []
         self.best_objective: float = np.inf
         self.best_mean_m: float = 0.0
-        self.best_offsets: np.ndarray = self._offsets()
+        self.best_offsets: np.ndarray = self.offsets()
         self.whole = True
 
     @property
@@ -152,8 +152,7 @@ class AbstractAttack(ABC):
     def restore_best(self) -> None:
         """Give the objects the parameters of the iteration with the least objective."""
         self.sensor.set_textures(self.best)
-        if self.sensor.offsets() is not None:
-            self.sensor.set_offsets(self.best_offsets)
+        self.move(self.best_offsets)
 
     def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
         """Drive in a closed loop through another sensor, with the present textures.
@@ -199,11 +198,15 @@ class AbstractAttack(ABC):
             "counts no longer; start a new run folder"
         )
 
-    def _offsets(self) -> np.ndarray:
-        """Return the objects' offsets, (k, 6); zeros where they cannot be moved."""
-        offsets = self.sensor.offsets()
-        count = len(self.sensor.fields)
-        return np.zeros((count, 6)) if offsets is None else offsets
+    def offsets(self) -> np.ndarray:
+        """Return where the objects were moved to, (k, 6): see ``Pose.moved``."""
+        found = [posed.offset for posed in self.sensor.objects]
+        return np.array(found).reshape(-1, 6)
+
+    def move(self, offsets: np.ndarray) -> None:
+        """Move the objects by offsets (k, 6) from where they were put."""
+        for posed, offset in zip(self.sensor.objects, offsets, strict=True):
+            posed.move(offset)
 
 
 def history_tensors(history: Sequence[IterationRecord]) -> dict[str, np.ndarray]:

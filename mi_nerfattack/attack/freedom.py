@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.camera.pose import offset_gradient
+from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
+from mi_nerfattack.rollout.sweep import Gradient
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -54,3 +59,26 @@ class Freedom:
         """Return the nearest offsets (k, 6) within the limits and the free axes."""
         limit = np.repeat([self.limit_m, self.limit_rad], 3)
         return self.mask * np.clip(offsets, -limit, limit)
+
+
+def offset_gradients(
+    sensor: AbstractDifferentiableSensor, gradient: Gradient
+) -> np.ndarray:
+    """Return the derivative by the offsets of a sensor's objects, (k, 6).
+
+    Args:
+        sensor: with the objects where they were.
+        gradient: with that by their poses among its parameters.
+    """
+    pairs = zip(sensor.objects, sensor.pose_keys, strict=True)
+    found = [
+        offset_gradient(
+            _matrix(posed.to_world), _matrix(gradient.parameters[key]), posed.offset
+        )
+        for posed, key in pairs
+    ]
+    return np.array(found).reshape(-1, 6)
+
+
+def _matrix(transform: Any) -> np.ndarray:
+    return np.array(dr.detach(transform.matrix), np.float64).reshape(4, 4)

@@ -19,7 +19,7 @@ from mi_nerfattack.attack.base import (
     history_tensors,
     read_history,
 )
-from mi_nerfattack.attack.freedom import Freedom
+from mi_nerfattack.attack.freedom import Freedom, offset_gradients
 from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring
 from mi_nerfattack.backend.adam import adam_tensors, load_adam
@@ -99,7 +99,7 @@ class GradientAttack(AbstractAttack):
         self._install()
         evaluation = self.rollout.run(self.initial, on_step)
         record = self._record(evaluation)
-        moved = self.freedom.pose_rate is not None
+        moved = self.sensor.pose_keys if self.freedom.pose_rate is not None else ()
         gradient = self.rollout.gradient(evaluation, moved, on_step=on_step)
         values = self._values(gradient)
         self.whole = False
@@ -143,7 +143,7 @@ class GradientAttack(AbstractAttack):
         """See ``AbstractAttack.without_gradient``."""
         if not self.history:
             return []
-        found = np.zeros(len(self.sensor.fields), bool)
+        found = np.zeros(len(self.sensor.objects), bool)
         tensors = adam_tensors(self.optimiser)
         for key in self.optimiser:
             moment = tensors[f"first.{key}"]  # of all gradients so far
@@ -172,8 +172,9 @@ class GradientAttack(AbstractAttack):
             )
             for key, colouring in self._colourings.items()
         }
-        if gradient.offsets is not None:
-            values[OFFSETS] = _tensor(gradient.offsets * self.freedom.mask)
+        if self.freedom.pose_rate is not None:
+            by_offsets = offset_gradients(self.sensor, gradient)
+            values[OFFSETS] = _tensor(by_offsets * self.freedom.mask)
         values = {key: values[key] for key in self.optimiser}
         for key, value in values.items():
             if not np.isfinite(value.numpy()).all():
@@ -205,7 +206,7 @@ class GradientAttack(AbstractAttack):
             self.sensor.set_textures([_tensor(texture) for texture in textures])
         if self.freedom.pose_rate is not None:
             offsets = dr.detach(self.optimiser[OFFSETS])
-            self.sensor.set_offsets(np.array(offsets, np.float64))
+            self.move(np.array(offsets, np.float64))
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""
@@ -284,7 +285,7 @@ class GradientAttack(AbstractAttack):
         mean, value = float(error.mean()), seen.value
         value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
         if value < self.best_objective:
-            self._best, self.best_offsets = colours, self._offsets()
+            self._best, self.best_offsets = colours, self.offsets()
             self.best_objective, self.best_mean_m = value, mean
         costs = tuple(map(float, seen.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)

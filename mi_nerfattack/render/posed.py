@@ -39,18 +39,26 @@ class PosedField:
     def place(self, pose: Pose) -> None:
         """Give the field another pose, from which :meth:`move` counts."""
         self._set(pose)
-        self.move(pose.rotation, pose.translation)
+        self.move(np.zeros(6))
 
-    def move(self, rotation: np.ndarray, translation: np.ndarray) -> None:
+    def move(self, offset: np.ndarray) -> None:
         """Put the field elsewhere: `placed`; `pose` stays what it was.
 
         Args:
-            rotation: (3, 3), field to world.
-            translation: (3,) of the field's origin, metres in the world.
+            offset: (6,) from `pose`, see :meth:`Pose.moved`.
+
+        Raises:
+            ValueError: another shape, or a number that is not finite.
         """
-        self._put(Pose(rotation, translation, self.pose.scale))
+        offset = np.array(offset, np.float64)
+        if offset.shape != (6,) or not np.isfinite(offset).all():
+            raise ValueError(f"offset: {offset.tolist()}; expected 6 finite numbers")
+        self.offset = offset
+        placed = self.pose.moved(self.offset)
+        self._put(placed)
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.pose.scale * rotation, translation
+        matrix[:3, :3] = placed.scale * placed.rotation
+        matrix[:3, 3] = placed.translation
         mi.set_property(self.to_world, mi.AffineTransform4f(matrix))
         self._attached: Any = None
         self._followed = self._matrix()
@@ -102,7 +110,7 @@ class PosedField:
 
     def _set(self, pose: Pose) -> None:
         self.pose: Pose = pose
-        #: (6,), where an attack has moved it to from `pose`; see `rollout.offset`.
+        #: (6,), where it was moved to from `pose`.
         self.offset: np.ndarray = np.zeros(6)
         self._inverse_scale = mi.Float(1 / pose.scale)
         self._step = mi.Float(self.field.step_m * pose.scale)

@@ -26,7 +26,6 @@ from mi_nerfattack.io import files
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.rollout.drive import ATTACK
-from mi_nerfattack.rollout.offset import offset_pose
 from mi_nerfattack.scenario.deployment import SURROGATE
 from mi_nerfattack.scenario.world import build_surrogate
 
@@ -157,9 +156,7 @@ def read_box(
         raise InputError(f"--object: is missing; {run} has {', '.join(boxes)}")
     poses, views = _placed(found)
     number, field = names.index(boxes[0]), fields[boxes[0]]
-    pose = poses[number]
-    moved = offset_pose(pose, found.offsets[number])
-    placed = Pose(*moved, pose.scale)
+    placed = poses[number].moved(found.offsets[number])
     lower, upper, images = box_pictures(field, texture_px)
     label, digest = found.label, found.digest
     return AttackedBox(boxes[0], label, digest, lower, upper, placed, images), views

@@ -1,4 +1,4 @@
-"""The closed loop as a function of textures, object poses and initial states."""
+"""The closed loop as a function of parameters and initial states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from mi_nerfattack.rollout.loop import (
 )
 from mi_nerfattack.rollout.objective import AbstractObjective
 from mi_nerfattack.rollout.reduction import AbstractReduction, Cost, Mean
-from mi_nerfattack.rollout.scene_sensor import SceneSensor
 from mi_nerfattack.rollout.sweep import (
     Gradient,
     Options,
@@ -55,14 +54,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Rollout:
-    """``J(textures, initial states, offsets)`` of a batch of drives.
+    """``J(parameters, initial states)`` of a batch of drives.
 
     Call it with Dr.Jit arrays and differentiate by `dr.backward`; for torch tensors
     wrap it by ``dr.wrap(source="torch", target="drjit")``. Or, without either's graph,
     :meth:`run` and :meth:`gradient`.
 
     Attributes:
-        loop: the closed loop; its sensor's textures are replaced.
+        loop: the closed loop; its sensor's parameters are replaced.
         objective: cost of one drive.
         horizon: control periods.
         reduction: of the costs of the batch.
@@ -114,7 +113,7 @@ class Rollout:
         return replace(self, camera_path=CameraPath(states, frame))
 
     def run(self, initial: Any, on_step: OnStep | None = None) -> Evaluation:
-        """Drive with the textures and offsets that the sensor has.
+        """Drive with the parameters that the sensor has.
 
         Args:
             initial: (m, n) from :meth:`ClosedLoop.initial`.
@@ -155,7 +154,7 @@ class Rollout:
     def gradient(
         self,
         evaluation: Evaluation,
-        offsets: bool = False,
+        more: Sequence[str] = (),
         recorder: StepRecorder | None = None,
         on_step: OnStep | None = None,
         scale: float = 1.0,
@@ -164,7 +163,7 @@ class Rollout:
 
         Args:
             evaluation: from :meth:`run`.
-            offsets: whether to differentiate by the objects' offsets, too.
+            more: keys of parameters to differentiate by, besides the sensor's.
             recorder: takes the texture's gradient apart by control periods.
             on_step: called after each control period with its index.
             scale: factor of all derivatives.
@@ -173,7 +172,7 @@ class Rollout:
             TypeError: there are no such derivatives.
         """
         cost = Cost(self.objective, self.reduction, scale)
-        options = Options(self.attached, offsets, recorder, on_step)
+        options = Options(self.attached, more, recorder, on_step)
         drive = evaluation.trajectory
         return self.adjoint.gradient(self.loop, drive, cost, options)
 
@@ -190,70 +189,35 @@ class Rollout:
         d_states = Cost(self.objective, self.reduction).by_states(drive)
         return backward_to_images(self.loop, drive, d_states, steps, self.attached)
 
-    def __call__(
-        self,
-        textures: Sequence[Any] | Mapping[str, Any],
-        initial: Any,
-        offsets: Any = None,
-    ) -> Any:
+    def __call__(self, values: Mapping[str, Any], initial: Any) -> Any:
         """Evaluate J as one differentiable operation of Dr.Jit.
 
         Args:
-            textures: of a `SceneSensor`, parameters by key, for instance the result
-                of ``mi.traverse(scene)`` or an optimiser; all are set, and those that
-                are attached are differentiated. Of other sensors, one tensor
-                (n_vertices, 3) an object, raw colours.
+            values: parameters of the sensor by key, for instance the result of
+                ``mi.traverse(scene)`` or an optimiser; all are set, and those that are
+                attached are differentiated.
             initial: (m, n) from :meth:`ClosedLoop.initial`.
-            offsets: tensor (k, 6), shift (metres) and rotation vector (radians) of
-                each object from where it was put; left alone when left out.
 
         Returns:
-            one entry, attached to whatever of the three is. Reverse mode only.
+            one entry, attached to whatever of both is. Reverse mode only.
         """
-        if not isinstance(textures, Sequence):
-            # Mitsuba's parameters and optimisers are no `Mapping` by inheritance
-            values = {key: textures[key] for key in textures.keys()}  # noqa: SIM118
-            attached = {k: v for k, v in values.items() if dr.grad_enabled(v)}
-            others = {k: v for k, v in values.items() if k not in attached}
-            return dr.custom(_SceneOp, _Held(self, others), attached, initial)
-        moved = [] if offsets is None else [offsets]
-        return dr.custom(_RolloutOp, _Held(self), list(textures), initial, moved)
-
-    def install(self, textures: Sequence[Any], offsets: np.ndarray | None) -> None:
-        """Give the sensor's objects textures and offsets.
-
-        Args:
-            textures: one array (n_vertices, 3) an object.
-            offsets: (k, 6); None leaves them as they are.
-
-        Raises:
-            ValueError: not one texture for each object.
-        """
-        sensor = differentiable(self.loop)
-        count = len(sensor.textures())
-        if len(textures) != count:
-            raise ValueError(f"textures: {len(textures)} given for {count} objects")
-        sensor.set_textures(list(textures))
-        if offsets is not None:
-            sensor.set_offsets(offsets)
-
-    def installed(self) -> np.ndarray | None:
-        """Return the offsets that the sensor has; None where nothing can move."""
-        return differentiable(self.loop).offsets()
+        # Mitsuba's parameters and optimisers are no `Mapping` by inheritance
+        every = {key: values[key] for key in values.keys()}  # noqa: SIM118
+        attached = {k: v for k, v in every.items() if dr.grad_enabled(v)}
+        others = {k: v for k, v in every.items() if k not in attached}
+        return dr.custom(_RolloutOp, _Held(self, others), attached, initial)
 
 
 class _Held:
     """A rollout that Dr.Jit does not look into for arrays."""
 
-    def __init__(
-        self, rollout: Rollout, constants: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, rollout: Rollout, constants: Mapping[str, Any]) -> None:
         self.rollout = rollout
-        self.constants: Mapping[str, Any] = constants or {}
+        self.constants = constants
 
 
-class _SceneOp(dr.CustomOp):
-    """As `_RolloutOp`, of a scene's parameters."""
+class _RolloutOp(dr.CustomOp):
+    """Forward: a batch of drives. Backward: the rollout's adjoint."""
 
     def eval(self, held: _Held, values: dict[str, Any], initial: Any) -> Any:
         self.rollout = held.rollout
@@ -274,12 +238,7 @@ class _SceneOp(dr.CustomOp):
     @contextmanager
     def _installed(self) -> Iterator[None]:
         """Set the parameters, and differentiate by those that were attached."""
-        sensor = self.rollout.loop.sensor
-        if not isinstance(sensor, SceneSensor):
-            raise TypeError(
-                f"{type(sensor).__name__}: takes textures, one tensor an object; for "
-                "parameters of a scene use a SceneSensor"
-            )
+        sensor = differentiable(self.rollout.loop)
         before = sensor.keys
         sensor.set_parameters(self.values)
         sensor.select(self.keys)
@@ -287,30 +246,3 @@ class _SceneOp(dr.CustomOp):
             yield
         finally:
             sensor.select(before)
-
-
-class _RolloutOp(dr.CustomOp):
-    """Forward: a batch of drives. Backward: the rollout's adjoint."""
-
-    def eval(
-        self, held: _Held, textures: list[Any], initial: Any, offsets: list[Any]
-    ) -> Any:
-        self.rollout = held.rollout
-        values = [np.array(dr.detach(value), np.float64) for value in offsets]
-        self.offset_type = type(offsets[0]) if offsets else None
-        self.textures = dr.detach(textures)
-        self.rollout.install(self.textures, *(values or [None]))
-        self.offsets = self.rollout.installed()
-        self.evaluation = self.rollout.run(dr.detach(initial))
-        return dr.value_t(type(initial))([self.evaluation.value])
-
-    def backward(self) -> None:
-        self.rollout.install(self.textures, self.offsets)  # others may have driven
-        scale = float(dr.detach(self.grad_out())[0])
-        moved = self.offset_type is not None
-        found = self.rollout.gradient(self.evaluation, offsets=moved, scale=scale)
-        pairs = zip(self.textures, found.textures, strict=True)
-        self.set_grad_in("textures", [type(like)(value) for like, value in pairs])
-        self.set_grad_in("initial", found.initial)
-        if self.offset_type is not None:
-            self.set_grad_in("offsets", [self.offset_type(found.offsets)])

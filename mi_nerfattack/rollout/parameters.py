@@ -55,6 +55,7 @@ class Differentiated:
 
     def __init__(self, scene: mi.Scene, collector: CollectsRays | None) -> None:
         self._scene, self._collector = scene, collector
+        self._started: tuple[str, ...] = ()
         self._before: dict[str, Any] = {}
         self._leaves: dict[str, Any] = {}
         self._arrays: list[tuple[GridField, mi.Float, mi.Float]] = []
@@ -113,7 +114,8 @@ class Differentiated:
         """
         self.stop()
         try:
-            self._start(list(dict.fromkeys([*self.keys, *more])))
+            self._started = tuple(dict.fromkeys([*self.keys, *more]))
+            self._start(list(self._started))
         except BaseException:
             self.stop()
             raise
@@ -139,7 +141,7 @@ class Differentiated:
         """Return what has been accumulated, by key, each of its parameter's shape."""
         self.finish()
         found = {}
-        for key in self.keys:
+        for key in self._started:
             field = self.packed(key)
             name = key.rpartition(".")[2]
             leaf = self._leaves.get(key)
@@ -151,10 +153,6 @@ class Differentiated:
         """March the rays that wait, so that gradients are complete."""
         if self._collector is not None:
             self._collector.finish_gradient()
-
-    def leaf(self, key: str) -> Any:
-        """Return the leaf of a parameter that is no part of a grid field."""
-        return self._leaves[key]
 
     def stop(self) -> None:
         """Leave no parameter attached; what has been replaced since stays so."""

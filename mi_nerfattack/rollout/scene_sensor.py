@@ -7,18 +7,15 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_nerfattack.backend.differentiate import differentiates_rays, vjp
 from mi_nerfattack.errors import InputError, SetupError
-from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.vertex_colours import gradient
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.conventions import from_mitsuba
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.camera import SceneCamera
-from mi_nerfattack.rollout.offset import offset_gradient, offset_pose
 from mi_nerfattack.rollout.parameters import CollectsRays, Differentiated
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor, Observation
 
@@ -203,18 +200,11 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Keys of the parameters that are differentiated."""
+        """See :meth:`AbstractDifferentiableSensor.keys`."""
         return self._parameters.keys
 
     def select(self, keys: Sequence[str]) -> None:
-        """Differentiate by other parameters.
-
-        Args:
-            keys: of `mi.traverse(scene)`.
-
-        Raises:
-            InputError: there is no such parameter, or it has no derivative here.
-        """
+        """See :meth:`AbstractDifferentiableSensor.select`; keys of :attr:`params`."""
         self._parameters.select(keys)
 
     def parameters(self) -> dict[str, Any]:
@@ -222,31 +212,15 @@ class SceneSensor(AbstractDifferentiableSensor):
         return self._parameters.values()
 
     def set_parameters(self, values: Mapping[str, Any]) -> None:
-        """Replace parameters by detached values.
-
-        Args:
-            values: by key of `mi.traverse(scene)`. A value that the scene has already
-                is left as it is, with its derivatives.
-
-        Raises:
-            InputError: there is no such parameter, or its value is not allowed.
-        """
+        """See :meth:`AbstractDifferentiableSensor.set_parameters`."""
         self._parameters.assign(values)
 
-    def start_gradient(self, poses: bool = False) -> None:
-        """Let the gradients of all parameters be zero.
-
-        Args:
-            poses: collect those of :meth:`offsets`, too.
-
-        Raises:
-            InputError: a parameter has no derivative; the message names what works.
-        """
-        moved = [f"{name}.to_world" for name in self._objects()] if poses else []
-        self._parameters.start(moved)
+    def start_gradient(self, more: Sequence[str] = ()) -> None:
+        """See :meth:`AbstractDifferentiableSensor.start_gradient`."""
+        self._parameters.start(more)
 
     def gradients(self) -> dict[str, Any]:
-        """Return what has been accumulated, by key, each of its parameter's shape."""
+        """See :meth:`AbstractDifferentiableSensor.gradients`."""
         return self._parameters.gradients()
 
     def stop_gradient(self) -> None:
@@ -255,18 +229,15 @@ class SceneSensor(AbstractDifferentiableSensor):
 
     # Objects: grid fields with colours among the parameters
 
-    def _objects(self) -> dict[str, Any]:
-        return self._parameters.objects()
-
     @property
-    def fields(self) -> list[GridField]:
-        """See :meth:`AbstractDifferentiableSensor.fields`."""
-        return [volume.field for volume in self._objects().values()]
+    def pose_keys(self) -> tuple[str, ...]:
+        """See :meth:`AbstractDifferentiableSensor.pose_keys`."""
+        return tuple(f"{name}.to_world" for name in self._parameters.objects())
 
     @property
     def objects(self) -> list[PosedField]:
-        """The objects where they are, as environments show them."""
-        return [volume.posed for volume in self._objects().values()]
+        """See :meth:`AbstractDifferentiableSensor.objects`."""
+        return [volume.posed for volume in self._parameters.objects().values()]
 
     @property
     def layers(self) -> list[Layer]:
@@ -308,37 +279,6 @@ class SceneSensor(AbstractDifferentiableSensor):
         """See :meth:`AbstractDifferentiableSensor.texture_gradients`."""
         self._parameters.finish()
         return [gradient(field, "texture") for field in self.fields]
-
-    def offsets(self) -> np.ndarray:
-        """See :meth:`AbstractDifferentiableSensor.offsets`."""
-        volumes = self._objects().values()
-        return np.array([volume.posed.offset for volume in volumes]).reshape(-1, 6)
-
-    def set_offsets(self, offsets: np.ndarray) -> None:
-        """See :meth:`AbstractDifferentiableSensor.set_offsets`."""
-        volumes = list(self._objects().values())
-        offsets = np.asarray(offsets, np.float64)
-        if offsets.shape != (len(volumes), 6) or not np.isfinite(offsets).all():
-            raise ValueError(
-                f"offsets: shape {offsets.shape}; expected finite ({len(volumes)}, 6)"
-            )
-        for volume, offset in zip(volumes, offsets, strict=True):
-            volume.posed.move(*offset_pose(volume.posed.pose, offset))
-            volume.posed.offset = offset.copy()
-
-    def offset_gradients(self) -> np.ndarray:
-        """See :meth:`AbstractDifferentiableSensor.offset_gradients`."""
-        found = []
-        for name, volume in self._objects().items():
-            leaf = self._parameters.leaf(f"{name}.to_world")
-            matrix, slope = (
-                np.array(x, np.float64).reshape(4, 4)[:3]
-                for x in (dr.detach(leaf.matrix), dr.grad(leaf.matrix))
-            )
-            torque = np.cross(matrix[:, :3].T, slope[:, :3].T).sum(0)
-            wrench = -np.concatenate([slope[:, 3], torque])
-            found.append(offset_gradient(wrench, volume.posed.offset))
-        return np.array(found).reshape(-1, 6)
 
     def check_attached(self) -> None:
         """Raise InputError where images have no derivative by the state."""

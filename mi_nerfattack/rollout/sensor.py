@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from mi_nerfattack.fields.grid import GridField
+from mi_nerfattack.render.posed import PosedField
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class AbstractSensor(ABC):
 class AbstractDifferentiableSensor(AbstractSensor):
     """Sensor whose image can be differentiated by its parameters and by the state.
 
-    Parameters are the texture of each object and, for sensors that have them, the
-    objects' poses.
+    Parameters have keys, as those of a Mitsuba scene. The colours of objects, which are
+    attacked, are told as their textures, too.
     """
 
     @abstractmethod
@@ -74,26 +73,67 @@ class AbstractDifferentiableSensor(AbstractSensor):
             (3, n) derivative by px, py and theta; None when not `attached`.
         """
 
+    @property
     @abstractmethod
-    def start_gradient(self, poses: bool = False) -> None:
-        """Set all accumulated gradients to zero.
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the parameters that are differentiated."""
 
-        Args:
-            poses: whether to accumulate those of the objects' poses, too.
+    @abstractmethod
+    def select(self, keys: Sequence[str]) -> None:
+        """Differentiate by other parameters.
+
+        Raises:
+            InputError: there is no such parameter, or it has no derivative here.
         """
 
+    @abstractmethod
+    def set_parameters(self, values: Mapping[str, Any]) -> None:
+        """Replace parameters by detached values.
+
+        Args:
+            values: by key. A value that the sensor has already is left as it is, with
+                its derivatives.
+
+        Raises:
+            InputError: there is no such parameter, or its value is not allowed.
+        """
+
+    @abstractmethod
+    def start_gradient(self, more: Sequence[str] = ()) -> None:
+        """Let the gradients of the selected parameters be zero.
+
+        Args:
+            more: keys of parameters to differentiate by, too.
+
+        Raises:
+            InputError: a parameter has no derivative; the message names what works.
+        """
+
+    @abstractmethod
     def gradients(self) -> dict[str, Any]:
-        """Return what has been accumulated by key of a scene's parameters, if any."""
-        return {}
+        """Return what has been accumulated, by key, each of its parameter's shape."""
 
     def stop_gradient(self) -> None:
         """Leave no parameter attached, when the gradients have been read."""
         return
 
+    # Objects
+
     @property
     @abstractmethod
-    def fields(self) -> Sequence[GridField]:
-        """The fields whose textures are attacked."""
+    def objects(self) -> Sequence[PosedField]:
+        """The objects whose colours are attacked, where they are."""
+
+    @property
+    def fields(self) -> list[GridField]:
+        """Their fields."""
+        fields = (posed.field for posed in self.objects)
+        return [field for field in fields if isinstance(field, GridField)]
+
+    @property
+    def pose_keys(self) -> tuple[str, ...]:
+        """Keys of the objects' poses, in their order."""
+        return ()
 
     @abstractmethod
     def texture_gradients(self) -> list[Any]:
@@ -106,39 +146,6 @@ class AbstractDifferentiableSensor(AbstractSensor):
     @abstractmethod
     def set_textures(self, textures: list[Any]) -> None:
         """Replace the textures: one array (n_vertices, 3) an object, raw colours."""
-
-    def offsets(self) -> np.ndarray | None:
-        """Return the objects' offsets, as :meth:`set_offsets` takes them.
-
-        None where objects cannot be moved.
-        """
-        return None
-
-    def set_offsets(self, offsets: np.ndarray) -> None:
-        """Move the objects from where they were put.
-
-        Args:
-            offsets: (k, 6), a row an object: shift (metres, world axes), then rotation
-                vector (radians, world axes) about the object's origin.
-
-        Raises:
-            TypeError: the sensor's objects cannot be moved.
-        """
-        raise TypeError(
-            f"{type(self).__name__}: objects cannot be moved; leave offsets out, or "
-            "attack textures alone"
-        )
-
-    def offset_gradients(self) -> np.ndarray:
-        """Return the accumulated derivatives by the offsets, (k, 6).
-
-        Raises:
-            TypeError: the sensor's objects cannot be moved.
-        """
-        raise TypeError(
-            f"{type(self).__name__}: has no derivative by object pose; attack textures "
-            "alone"
-        )
 
     def keep(self, observation: Observation) -> Any:
         """Return what a backward pass must have kept to call :meth:`restore`."""

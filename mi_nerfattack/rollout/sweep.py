@@ -41,15 +41,13 @@ class Gradient:
 
     Attributes:
         textures: one tensor (n_vertices, 3) an object.
-        offsets: (k, 6) by the objects' offsets, NumPy; None where not asked for.
         initial: (m, n) by the initial states.
         costates: (T, n, m) NumPy: ``l_t``, minus the derivative by ``x_t``.
         attribution: per control period; None where not asked for.
-        parameters: by key, of a `SceneSensor`; empty of others.
+        parameters: by key of the sensor's.
     """
 
     textures: list[Any]
-    offsets: np.ndarray | None
     initial: Any
     costates: np.ndarray
     attribution: Attribution | None
@@ -104,13 +102,13 @@ class Options:
     Attributes:
         attached: keep the derivative of the image by the state (A.12 stops it). Only
             attached gradients are those of the whole loop.
-        offsets: differentiate by the objects' offsets, too.
+        more: keys of parameters to differentiate by, besides those of the sensor.
         recorder: takes the gradient apart by control periods.
         on_step: called after each control period with its index.
     """
 
     attached: bool = False
-    offsets: bool = False
+    more: Sequence[str] = ()
     recorder: StepRecorder | None = None
     on_step: OnStep | None = None
 
@@ -267,7 +265,7 @@ def backward(
     sweep = Sweep(loop, drive, options.attached, together)
     d_before, costates = to_state(np.zeros_like(d_states[0])), []
     try:
-        sensor.start_gradient(options.offsets)
+        sensor.start_gradient(options.more)
         for step in visits:
             # A.9, resolved: minus l_t is dJ/dx_t and the derivative through x_{t+1}
             d_after = d_before + to_state(d_states[step.index])
@@ -281,13 +279,12 @@ def backward(
         sweep.finish()
         sweep.finish_still()
         textures, parameters = sensor.texture_gradients(), sensor.gradients()
-        offsets = sensor.offset_gradients() if options.offsets else None
         dr.eval(textures)
     finally:
         sensor.stop_gradient()
     attribution = options.recorder.result() if options.recorder else None
     costates = np.stack(costates[::-1])
-    return Gradient(textures, offsets, d_before, costates, attribution, parameters)
+    return Gradient(textures, d_before, costates, attribution, parameters)
 
 
 def backward_to_images(

@@ -139,12 +139,15 @@ class World:
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
         textures = [grid.texture.numpy().copy() for grid in self.fields]
-        return Appearance(textures, self.optimised.offsets())
+        offsets = [posed.offset for posed in self.surrogate.objects]
+        return Appearance(textures, np.array(offsets).reshape(-1, 6))
 
     def show(self, appearance: Appearance) -> None:
         """Give the objects their textures and places."""
         self.set_textures(appearance.textures)
-        self.surrogate.set_offsets(appearance.offsets)
+        pairs = zip(self.surrogate.objects, appearance.offsets, strict=True)
+        for posed, offset in pairs:
+            posed.move(offset)
 
     @property
     def renders(self) -> int:

@@ -137,5 +137,5 @@ def test_what_has_no_gradient_is_told(loop):
         again = GradientAttack(rollout, toy.ROUTE, initial, freedom)
         again.load_tensors(attack.tensors())
         grid.set_parameter("texture", texture)
-        closed.sensor.set_offsets(np.zeros((1, 6)))
+        attack.move(np.zeros((1, 6)))
         assert attack.without_gradient == again.without_gradient == expected

@@ -96,12 +96,12 @@ def test_gradients_that_end_leave_what_was_set_meanwhile():
     dark = image(sensor)
     items[0].field.set_parameter("texture", black[0])
     np.testing.assert_array_equal(dark, image(sensor))
-    offset = np.array([[0.2, 0.1, 0, 0, 0, 0.3]])
-    sensor.start_gradient(poses=True)
-    sensor.set_offsets(offset)
-    sensor.start_gradient(poses=True)
+    offset = np.array([0.2, 0.1, 0, 0, 0, 0.3])
+    sensor.start_gradient(sensor.pose_keys)
+    sensor.objects[0].move(offset)
+    sensor.start_gradient(sensor.pose_keys)
     sensor.stop_gradient()
-    np.testing.assert_array_equal(sensor.offsets(), offset)
+    np.testing.assert_array_equal(sensor.objects[0].offset, offset)
     assert (image(sensor) != dark).any()
 
 

@@ -273,7 +273,7 @@ def test_the_bundled_demo_and_mistakes_in_it():
         ((-1.75, -20.0, 0.0), ["on the lane: 36"]),
     ):
         shift = np.subtract(at, hydrant.pose.translation)
-        world.surrogate.set_offsets(np.pad(shift, (0, 3))[None])
+        hydrant.move(np.pad(shift, (0, 3)))
         found = [*view_findings(world, nominal), *place_findings(world)]
         assert len(found) == len(words)
         assert all(word in line for word, line in zip(words, found, strict=True))

@@ -64,20 +64,22 @@ class AnalyticSensor(AbstractDifferentiableSensor):
 
     The phase q of a pixel is affine in px, py and theta and, for object o of several,
     b_o in its offsets. A shift of q that depends on the control period stands for
-    random numbers.
+    random numbers. Its parameters are ``texture0``, ``texture1``, ... and ``offsets``,
+    by which it is always differentiated.
     """
 
-    fields = ()
+    objects = ()
+    keys: Any = ("offsets",)
 
     def __init__(self, textures: list[np.ndarray]) -> None:
         self._textures = [tensor(texture) for texture in textures]
-        self._offsets = np.zeros((len(textures), 6))
+        self.offsets = tensor(np.zeros((len(textures), 6)))
         self.renders = 0
         self.start_gradient()
 
     def observe(self, state: Any, step: int) -> AnalyticObservation:
         shift = dr.opaque(row_type(), period_shift(step))
-        image = self._image(dr.detach(state), shift, self._textures, None)
+        image = self._image(dr.detach(state), shift, self._textures, self.offsets)
         dr.eval(image)
         self.renders += dr.width(state)
         return AnalyticObservation(image, shift=shift)
@@ -86,20 +88,34 @@ class AnalyticSensor(AbstractDifferentiableSensor):
         with dr.resume_grad():
             leaf = state_type()(*[row_type()(dr.detach(state[i])) for i in range(3)])
             textures = [type(t)(dr.detach(t)) for t in self._textures]
-            offsets = tensor(self._offsets)
+            offsets = type(self.offsets)(dr.detach(self.offsets))
             dr.enable_grad(leaf, textures, offsets)
             image = self._image(leaf, observation.shift, textures, offsets)
             dr.backward_from(dr.sum(image.array * dr.detach(d_image.array)))
             for i, texture in enumerate(textures):
                 self._gradients[i] += dr.grad(texture)
-            self._by_offsets += dr.grad(offsets).numpy()
+            self._by_offsets += dr.grad(offsets)
             result = dr.grad(leaf)
-        dr.eval(result, self._gradients)
+        dr.eval(result, self._gradients, self._by_offsets)
         return result if attached else None
 
-    def start_gradient(self, poses: bool = False) -> None:
+    def select(self, keys: Any) -> None:
+        self.keys = tuple(keys)
+
+    def set_parameters(self, values: Any) -> None:
+        for key, value in values.items():
+            if key == "offsets":
+                self.offsets = tensor(dr.detach(value))
+            else:
+                self._textures[int(key[7:])] = tensor(dr.detach(value))
+
+    def gradients(self) -> dict[str, Any]:
+        named = {f"texture{i}": value for i, value in enumerate(self._gradients)}
+        return {key: (named | {"offsets": self._by_offsets})[key] for key in self.keys}
+
+    def start_gradient(self, more: Any = ()) -> None:
         self._gradients = [dr.zeros(tensor_type(), t.shape) for t in self._textures]
-        self._by_offsets = np.zeros_like(self._offsets)
+        self._by_offsets = dr.zeros(tensor_type(), self.offsets.shape)
 
     def texture_gradients(self) -> list[Any]:
         return list(self._gradients)
@@ -109,15 +125,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
 
     def set_textures(self, textures: list[Any]) -> None:
         self._textures = [tensor(dr.detach(texture)) for texture in textures]
-
-    def offsets(self) -> np.ndarray:
-        return self._offsets.copy()
-
-    def set_offsets(self, offsets: np.ndarray) -> None:
-        self._offsets = np.array(offsets, np.float64)
-
-    def offset_gradients(self) -> np.ndarray:
-        return self._by_offsets.copy()
 
     def _image(self, state: Any, shift: Any, textures: list[Any], offsets: Any) -> Any:
         """Evaluate the formula, (n, HEIGHT, WIDTH, 3), for rows px, py, theta."""
@@ -129,8 +136,6 @@ class AnalyticSensor(AbstractDifferentiableSensor):
         for axis in range(3):
             pose = dr.gather(row, row(state[axis]), vehicle)
             phase += pose * dr.gather(row, row(BY_POSE[axis]), pixel)
-        if offsets is None:
-            offsets = tensor(self._offsets)
         total = dr.cos(phase)
         for number, texture in enumerate(textures):
             own = (number + 1) * phase

@@ -84,7 +84,7 @@ def expected_gradient(loop, twin, initial, horizon, attached, reduce=torch.mean)
         for texture in loop.sensor.textures()
     ]
     start = torch.tensor(initial, requires_grad=True)
-    offsets = torch.tensor(loop.sensor.offsets(), requires_grad=True)
+    offsets = torch.tensor(loop.sensor.offsets.numpy(), requires_grad=True)
     states, _ = twin.drive(start, textures, horizon, attached, offsets)
     value = reduce(wave_in_torch(states, twin.dt))
     value.backward()
@@ -95,7 +95,8 @@ def expected_gradient(loop, twin, initial, horizon, attached, reduce=torch.mean)
 def flat(gradient):
     """Lay a gradient out as `expected_gradient` does."""
     textures = [texture.numpy() for texture in gradient.textures]
-    return [*textures, np.array(gradient.initial).T, gradient.offsets]
+    by_offsets = gradient.parameters["offsets"].numpy()
+    return [*textures, np.array(gradient.initial).T, by_offsets]
 
 
 def assert_close(found, expected, tolerance=1e-8):

@@ -105,7 +105,7 @@ def test_gradients_go_through_the_memory(name, attached, adjoint):
     rollout = Rollout(loop, Wave(), HORIZON, adjoint=adjoint, attached=attached)
     evaluation = rollout.run(to_state(initial))
     assert evaluation.value == pytest.approx(value, rel=1e-12)
-    assert_close(flat(rollout.gradient(evaluation, offsets=True)), expected, 1e-9)
+    assert_close(flat(rollout.gradient(evaluation)), expected, 1e-9)
 
 
 def test_black_boxes_drive_and_are_refused():

@@ -124,11 +124,11 @@ def test_adjoints_are_autograd(
     vehicle, integrator, substeps, delay, horizon, attached, name
 ):
     loop, twin = analytic.make_pair(vehicle, integrator, substeps, delay, 2)
-    loop.sensor.set_offsets(OFFSETS)
+    loop.sensor.set_parameters({"offsets": OFFSETS})
     initial = loop.dynamics.extend(analytic.random_poses(3))
     rollout = Rollout(loop, Wave(), horizon, adjoint=ADJOINTS[name], attached=attached)
     evaluation = rollout.run(to_state(initial))
-    found = rollout.gradient(evaluation, offsets=True)
+    found = rollout.gradient(evaluation)
     value, expected = expected_gradient(loop, twin, initial, horizon, attached)
     assert evaluation.value == pytest.approx(value, rel=1e-12)
     assert_close(flat(found), expected)
@@ -153,7 +153,7 @@ def test_images_of_eight_bits_are_differentiated_straight_through(name):
     initial = loop.dynamics.extend(analytic.random_poses(3))
     rollout = Rollout(loop, Wave(), 7, adjoint=ADJOINTS[name], attached=True)
     evaluation = rollout.run(to_state(initial))
-    found = rollout.gradient(evaluation, offsets=True)
+    found = rollout.gradient(evaluation)
     value, expected = expected_gradient(loop, twin, initial, 7, True)
     assert evaluation.value == pytest.approx(value, rel=1e-12)
     assert_close(flat(found), expected)
@@ -193,7 +193,7 @@ def test_a_hundred_periods():
     loop, twin = analytic.make_pair("ackermann", "rk4", 1, 2)
     initial = analytic.random_poses(2)
     rollout = Rollout(loop, Wave(), 100, attached=True)
-    found = rollout.gradient(rollout.run(to_state(initial)), offsets=True)
+    found = rollout.gradient(rollout.run(to_state(initial)))
     _, expected = expected_gradient(loop, twin, initial, 100, True)
     assert_close(flat(found), expected, 1e-7)
 
@@ -215,7 +215,7 @@ def test_the_worst_drive_alone_is_differentiated():
     initial = analytic.random_poses(4)
     rollout = Rollout(loop, Wave(), 5, reduction=Worst())
     evaluation = rollout.run(to_state(initial))
-    found = flat(rollout.gradient(evaluation, offsets=True))
+    found = flat(rollout.gradient(evaluation))
     value, expected = expected_gradient(loop, twin, initial, 5, False, torch.max)
     assert evaluation.value == pytest.approx(value, rel=1e-12)
     assert evaluation.costs.shape == (4,)
@@ -228,11 +228,11 @@ def test_dr_backward_differentiates_the_function(rng):
     _, expected = expected_gradient(loop, twin, initial, 4, True)
     rollout = Rollout(loop, Wave(), 4, attached=True)
     textures, start = loop.sensor.textures(), to_state(initial)
-    offsets = analytic.tensor(loop.sensor.offsets())
+    offsets = analytic.tensor(loop.sensor.offsets.numpy())
     dr.enable_grad(textures, start, offsets)
-    value = rollout(textures, start, offsets)
+    value = rollout(named(textures, offsets), start)
     loop.sensor.set_textures([0 * t for t in dr.detach(textures)])  # another's use
-    loop.sensor.set_offsets(OFFSETS)
+    loop.sensor.set_parameters({"offsets": OFFSETS})
     dr.backward(3 * value)
     found = [dr.grad(texture).numpy() for texture in textures]
     found += [np.array(dr.grad(start)).T, dr.grad(offsets).numpy()]
@@ -243,29 +243,34 @@ def from_torch(rollout):
     """The function of textures, initial states (n, 3) and offsets, for torch."""
 
     @dr.wrap(source="torch", target="drjit")
-    def function(textures, initial, *offsets):
-        return rollout(textures, state_type()(initial), *offsets)
+    def function(textures, initial, offsets):
+        return rollout(named(textures, offsets), state_type()(initial))
 
-    return lambda textures, initial, *offsets: function(textures, initial.T, *offsets)
+    return lambda textures, initial, offsets: function(textures, initial.T, offsets)
+
+
+def named(textures, offsets):
+    """Name the parameters of the sensor."""
+    return {f"texture{i}": t for i, t in enumerate(textures)} | {"offsets": offsets}
 
 
 def test_the_function_remembers_where_the_objects_stood():
     loop, twin = analytic.make_pair(objects=2)
-    loop.sensor.set_offsets(OFFSETS)
+    loop.sensor.set_parameters({"offsets": OFFSETS})
     initial = analytic.random_poses(2)
     _, expected = expected_gradient(loop, twin, initial, 4, True)
     rollout = Rollout(loop, Wave(), 4, attached=True)
     leaves = [
         torch.tensor(t.numpy(), requires_grad=True) for t in loop.sensor.textures()
     ]
-    in_torch = from_torch(rollout)(leaves, torch.tensor(initial))
+    in_torch = from_torch(rollout)(leaves, torch.tensor(initial), torch.tensor(OFFSETS))
     textures = loop.sensor.textures()
     dr.enable_grad(textures)
-    value = rollout(textures, to_state(initial))
-    loop.sensor.set_offsets(0 * OFFSETS)  # another's use
+    value = rollout(named(textures, analytic.tensor(OFFSETS)), to_state(initial))
+    loop.sensor.set_parameters({"offsets": 0 * OFFSETS})  # another's use
     dr.backward(value)
     assert_close([dr.grad(texture).numpy() for texture in textures], expected[:2])
-    loop.sensor.set_offsets(0 * OFFSETS)
+    loop.sensor.set_parameters({"offsets": 0 * OFFSETS})
     in_torch.backward()
     assert_close([leaf.grad.numpy() for leaf in leaves], expected[:2])
 
@@ -279,7 +284,7 @@ def test_torch_differentiates_the_function():
         for value in (
             loop.sensor.textures()[0].numpy(),
             initial,
-            loop.sensor.offsets(),
+            loop.sensor.offsets.numpy(),
         )
     )
     rollout = Rollout(loop, Wave(), 4, attached=True)

@@ -24,6 +24,7 @@ from helpers.rollouts import (
     unit,
 )
 
+from mi_nerfattack.attack.freedom import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor, showing
 from mi_nerfattack.render import composite
 from mi_nerfattack.render.camera.disturbance import Disturbance
@@ -96,14 +97,15 @@ def test_attached_gradient_by_the_initial_state():
 def test_gradient_by_the_pose_of_an_object():
     loop, _ = toy.make_loop()
     rollout = make_rollout(loop, 4, attached=True)
-    loop.sensor.set_offsets(OFFSET)
-    found = gradient(rollout, offsets=True).offsets
+    (item,) = loop.sensor.objects
+    item.move(OFFSET[0])
+    found = offset_gradients(loop.sensor, gradient(rollout, more=loop.sensor.pose_keys))
     for axis in range(6):
 
         def value(s, axis=axis):
             moved = OFFSET.copy()
             moved[0, axis] += s
-            loop.sensor.set_offsets(moved)
+            item.move(moved[0])
             return objective(rollout)
 
         # samples that cross the faces of cells, kinks of the field, cost accuracy, as
@@ -116,10 +118,11 @@ def test_gradient_by_the_pose_of_an_object():
 def test_gradient_by_the_pose_through_the_interleaved_composite():
     loop, _ = toy.make_loop(composite="interleaved")
     rollout = make_rollout(loop, 3, attached=True)
-    found = gradient(rollout, offsets=True).offsets[0, 2]
+    by_pose = gradient(rollout, more=loop.sensor.pose_keys)
+    found = offset_gradients(loop.sensor, by_pose)[0, 2]
 
     def value(s):
-        loop.sensor.set_offsets(s * np.eye(6)[2:3])
+        loop.sensor.objects[0].move(s * np.eye(6)[2])
         return objective(rollout)
 
     assert central_difference(value, 1e-3) == pytest.approx(found, rel=2e-2)
@@ -235,11 +238,8 @@ def test_horizon_below_one_and_bad_states_are_refused():
         objective(make_rollout(loop, 0))
     with pytest.raises(ValueError, match="states"):
         to_state(np.array([[0.0, np.nan, 0.0]]))
-    with pytest.raises(ValueError, match=r"offsets: shape \(2, 6\)"):
-        loop.sensor.set_offsets(np.zeros((2, 6)))
-    with pytest.raises(ValueError, match="textures: 2 given for 1 objects"):
-        rollout = make_rollout(loop, 1)
-        rollout.install(2 * loop.sensor.textures(), None)
+    with pytest.raises(ValueError, match="offset: .*; expected 6 finite numbers"):
+        loop.sensor.objects[0].move(np.full(6, np.nan))
 
 
 def test_objects_that_share_a_field_are_refused():

@@ -309,7 +309,7 @@ def test_nothing_is_left_of_a_gradient_that_failed_or_of_images(folder) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        drive.gradient(evaluation, offsets=True, on_step=interrupt)
+        drive.gradient(evaluation, sensor.pose_keys, on_step=interrupt)
     assert not dr.grad_enabled(params["fields.near.to_world"].matrix)
     found = gradient()
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())

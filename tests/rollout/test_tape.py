@@ -11,10 +11,12 @@ from helpers.rollouts import OFFSET
 from helpers.small_fields import empty_border
 from helpers.tape import leaf, taped_image, tensor64
 
+from mi_nerfattack.attack.freedom import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import GridLayout
 from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.rollout.sweep import Gradient
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -31,7 +33,8 @@ def test_products_of_the_sensor_are_those_of_the_tape(rng):
     view = old.intrinsics, old.mount
     sensor = field_sensor(old.layers[0], objects, *view, stop=0.0)
     offsets = np.concatenate([OFFSET, -0.5 * OFFSET])
-    sensor.set_offsets(offsets)
+    for posed, offset in zip(sensor.objects, offsets, strict=True):
+        posed.move(offset)
     seen = sensor.observe(state, 0)
     layers = seen.kept.seen.layers
     both = (layers[1].opacity > 0.1) & (layers[2].opacity > 0.1)
@@ -39,10 +42,12 @@ def test_products_of_the_sensor_are_those_of_the_tape(rng):
     d_image = mi.TensorXf(rng.normal(size=seen.image.shape).astype(np.float32))
     found = []
     for attached, poses in ((True, True), (False, True), (False, False)):
-        sensor.start_gradient(poses)
+        sensor.start_gradient(sensor.pose_keys if poses else ())
         by_state = sensor.vjp(seen, state, d_image, attached)
         found += enumerate(np.array(x) for x in sensor.texture_gradients())
-        found += [(2, sensor.offset_gradients())] if poses else []
+        if poses:
+            by_pose = Gradient([], None, np.empty(0), None, sensor.gradients())
+            found.append((2, offset_gradients(sensor, by_pose)))
         found += [(3, np.array(by_state))] if attached else []
         assert attached or by_state is None
 

@@ -39,7 +39,7 @@ class PoseError:
 
         Args:
             offsets: (k, 6), shift in metres and rotation vector of each object, world
-                axes, as `SceneSensor.set_offsets` takes them.
+                axes, as `Pose.moved` takes them.
             seed: of the drive.
 
         Returns:

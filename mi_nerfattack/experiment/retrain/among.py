@@ -17,7 +17,6 @@ from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.fields import load_grid
 from mi_nerfattack.io.resumable import differences, flatten, refuse
 from mi_nerfattack.render.posed import PosedField
-from mi_nerfattack.rollout.offset import offset_pose
 from mi_nerfattack.scenario.policy import PilotNetSection
 from mi_nerfattack.scenario.scenario import is_within
 from mi_nerfattack.scenario.world import place_of
@@ -95,7 +94,7 @@ def attacked_objects(found: FoundAttack) -> list[PosedField]:
         field = load_grid(object_path(found.folder, item.id))
         field.refine(item.step_m or field.step_m)
         result.append(PosedField(field, item.pose))
-        result[-1].move(*offset_pose(item.pose, offset))
+        result[-1].move(offset)
     return result
 
 

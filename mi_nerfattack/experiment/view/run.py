@@ -118,7 +118,7 @@ def offset_of(pose: Pose, position: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
         wxyz: (4,), unit quaternion, its frame to the world.
 
     Returns:
-        shift in metres and rotation vector in radians, as of `offset_pose`.
+        shift in metres and rotation vector in radians, as of `Pose.moved`.
     """
     turned = Rotation.from_quat(wxyz, scalar_first=True).as_matrix() @ pose.rotation.T
     vector = Rotation.from_matrix(turned).as_rotvec()

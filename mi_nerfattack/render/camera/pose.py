@@ -83,10 +83,55 @@ class Pose:
         )
         return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in parts)
 
+    def moved(self, offset: np.ndarray) -> Pose:
+        """Return the pose moved by an offset.
+
+        Args:
+            offset: (6,), shift in metres, then rotation vector in radians about the
+                field's origin, both along the world's axes.
+        """
+        from scipy.spatial.transform import Rotation  # slow to import
+
+        turn = Rotation.from_rotvec(offset[3:]).as_matrix()
+        return Pose(turn @ self.rotation, self.translation + offset[:3], self.scale)
+
     @property
     def yaw(self) -> float:
         """Angle about the world's z axis from its x axis to the field's, radians."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+
+def offset_gradient(
+    matrix: np.ndarray, by_matrix: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """Turn a derivative by a moved pose's matrix into that by the offset.
+
+    Args:
+        matrix: (4, 4), field to world.
+        by_matrix: (4, 4), derivative by it.
+        offset: (6,), by which :meth:`Pose.moved` made it.
+
+    Returns:
+        (6,), per metre and per radian.
+
+    Source: Chirikjian 2012, "Stochastic Models, Information Theory, and Lie Groups",
+    vol. 2, section 10.6 (the left Jacobian of the rotation vector).
+    """
+    torque = np.cross(matrix[:3, :3].T, by_matrix[:3, :3].T).sum(0)
+    by_turn = left_jacobian(offset[3:]).T @ torque
+    return np.concatenate([by_matrix[:3, 3], by_turn])
+
+
+def left_jacobian(vector: np.ndarray) -> np.ndarray:
+    """Return (3, 3) J with ``d exp([w]) = [J dw] exp([w])`` for a rotation vector."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-4:
+        return np.eye(3) + cross / 2 + cross @ cross / 6
+    first = (1 - np.cos(angle)) / angle**2
+    second = (angle - np.sin(angle)) / angle**3
+    return np.eye(3) + first * cross + second * cross @ cross
 
 
 def check_rigid(matrix: np.ndarray, where: str) -> None:

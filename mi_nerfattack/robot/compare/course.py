@@ -13,10 +13,8 @@ from mi_nerfattack.experiment.run_folder import DRIVES, object_path
 from mi_nerfattack.experiment.transfer.found import FoundAttack, read_found
 from mi_nerfattack.fields.io import load_grid
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount
-from mi_nerfattack.render.camera.pose import Pose
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.rollout.drive import CASES, Drive, Lane
-from mi_nerfattack.rollout.offset import offset_pose
 from mi_nerfattack.scenario.world import build_surrogate, object_footprints
 from mi_nerfattack.vehicle.route.route import Route
 
@@ -147,6 +145,5 @@ def footprints(found: FoundAttack) -> list[np.ndarray]:
     placed = []
     for item, offset in zip(scenario.objects, found.offsets, strict=True):
         field = load_grid(object_path(found.folder, item.id))
-        pose = Pose(*offset_pose(item.pose, offset), item.pose.scale)
-        placed.append(PosedField(field, pose))
+        placed.append(PosedField(field, item.pose.moved(offset)))
     return object_footprints(placed)

@@ -146,7 +146,7 @@ def test_no_kernel_is_compiled_after_the_first_frame():
     with nothing_compiled():
         texture = posed.field.texture.numpy() - 1.0
         posed.field.set_parameter("texture", texture)
-        posed.move(np.eye(3), np.array([0.3, 0.1, 0.0]))
+        posed.move(np.array([0.3, 0.1, 0.0, 0, 0, 0]))
         second = paster.paste(frame_at(look_at((-5, 1, 0.5), (0, 0, 0)), np.inf))
     assert second.image[6, 8].max() < first.image[6, 8].min() - 20
 

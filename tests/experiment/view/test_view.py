@@ -35,7 +35,6 @@ from mi_nerfattack.experiment.view.viewer import Viewer, following
 from mi_nerfattack.render.camera.intrinsics import CameraMount, from_fov, mount_matrix
 from mi_nerfattack.render.camera.outside import seen_at
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.rollout.offset import offset_pose
 from mi_nerfattack.system.extras import install_hint
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -67,9 +66,9 @@ def test_offset_puts_an_object_where_the_handle_is():
         start = Pose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3), 1.7)
         turned = Rotation.random(rng=rng).as_matrix()
         position = rng.normal(size=3)
-        found = offset_pose(start, offset_of(start, position, to_wxyz(turned)))
-        np.testing.assert_allclose(found[0], turned, atol=1e-9)
-        np.testing.assert_allclose(found[1], position, atol=1e-9)
+        found = start.moved(offset_of(start, position, to_wxyz(turned)))
+        np.testing.assert_allclose(found.rotation, turned, atol=1e-9)
+        np.testing.assert_allclose(found.translation, position, atol=1e-9)
 
 
 def test_points_lie_behind_their_pixels():
