@@ -95,9 +95,9 @@ class GridFieldVolume(AbstractFieldVolume):
     ``colour`` represents the texture of all levels: a step of an optimiser is a change
     of colour by that step. Keep it within 0 and 1, for instance by ``dr.clip``. Where
     the file calls space empty, the density is 0 whatever ``density`` says: see
-    ``fields.window``. A new ``to_world`` moves the field, except in media. Derivatives
-    by it are in backward mode alone, and need an empty cell: else the density ends at
-    the faces of the field's box at once.
+    ``fields.occupancy``. A new ``to_world`` moves the field, except in media.
+    Derivatives by it are in backward mode alone, and need an empty cell: else the
+    density ends at the faces of the field's box at once.
     """
 
     kind = "grid_field"

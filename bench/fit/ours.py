@@ -16,7 +16,7 @@ from mi_nerfattack.capture.inputs import find_bounds, read_depth
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.capture.transforms import read_images
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.fields.cpu.matrices import Networks
+from mi_nerfattack.fields.cpu.networks import Networks
 from mi_nerfattack.fields.ngp import NGPField, NGPLayout
 from mi_nerfattack.fit.options import FitOptions
 from mi_nerfattack.fit.training import Training

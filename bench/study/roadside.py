@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.render.camera.pose import Pose

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 
 class TorchWindow:
-    """See `mi_nerfattack.fields.window.Window`; a byte for each vertex of half cells.
+    """See `mi_nerfattack.fields.occupancy.Window`; a byte a vertex of half cells.
 
     Args:
         cells: boolean (rx, ry, rz), the occupancy.

@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.fields.occupancy import Occupancy
-from mi_nerfattack.fields.window import Window
+from mi_nerfattack.fields.occupancy import Occupancy, Window
 
 
 class AbstractField(ABC):

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from drjit.hashgrid import HashGridEncoding
 
-from mi_nerfattack.backend.upload import upload
+from mi_nerfattack.backend.arrays import upload
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
 from mi_nerfattack.fields.levels import (

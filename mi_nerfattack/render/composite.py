@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_nerfattack.backend.concat import concat
+from mi_nerfattack.backend.arrays import concat
 from mi_nerfattack.render.backdrop import AbstractBackdrop, Layer, fields_by_rays
 from mi_nerfattack.render.march import RayGradient, march, march_derivative
 from mi_nerfattack.render.posed import PosedField

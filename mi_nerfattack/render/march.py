@@ -9,7 +9,7 @@ to the distance ``step / cone`` and grows exponentially after it. A sample stand
 ``[t(i), t(i + 1)]``, and takes density and radiance as constant on it; of a field that
 has no empty cell, for the part inside the bounding box. Lattice intervals whose sample
 lies in an empty cell of the occupancy are skipped: the density there is 0, and rises
-from it continuously (`fields.window`), so that no sample comes or goes at once when a
+from it continuously (`Window`), so that no sample comes or goes at once when a
 ray moves. Where octants of cells are skipped, too, one of a small opacity does
 (`fit.pruning`). Beyond ``2**23`` steps in a box a ray sees nothing.
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.concat import put
+from mi_nerfattack.backend.arrays import put
 
 
 @dataclass

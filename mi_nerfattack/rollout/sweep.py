@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerfattack.backend.concat import concat, split
+from mi_nerfattack.backend.arrays import concat, split
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.rollout.loop import ClosedLoop, OnStep, Step, Trajectory
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor

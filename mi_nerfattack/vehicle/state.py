@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 
 
 def state_type(size: int = 3) -> Any:

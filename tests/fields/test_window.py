@@ -11,7 +11,7 @@ from helpers.small_fields import ONES, homogeneous, small_ngp
 
 from mi_nerfattack.fields import Occupancy, load_field
 from mi_nerfattack.fields.cpu.ngp import PackedNGP
-from mi_nerfattack.fields.window import Window
+from mi_nerfattack.fields.occupancy import Window
 from mi_nerfattack.render.camera.intrinsics import (
     from_fov,
     generate_rays,

@@ -13,8 +13,7 @@ from helpers.small_fields import homogeneous, small_ngp
 
 from mi_nerfattack.backend.colour import linear_to_srgb_numpy
 from mi_nerfattack.fields import NGPField, NGPLayout, Occupancy, load_field
-from mi_nerfattack.fields.cpu.grid import PackedGrid
-from mi_nerfattack.fields.cpu.words import LongWords, ShortWords
+from mi_nerfattack.fields.cpu.grid import LongWords, PackedGrid, ShortWords
 from mi_nerfattack.render.camera.intrinsics import (
     CameraMount,
     from_fov,

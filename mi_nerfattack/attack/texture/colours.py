@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import convolve1d
 
 from mi_nerfattack.attack.texture.constraints import Allowed, Constraints, vertex_points
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
 from mi_nerfattack.fields.levels import GridLevel

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.deploy.roadside.footprint import Stands, points_along
 from mi_nerfattack.deploy.views.rays import vertical_reach
 from mi_nerfattack.render.camera.intrinsics import Camera, CameraMount, mount_matrix

@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.backend.freeze import freeze_method
-from mi_nerfattack.backend.upload import upload_rows
 from mi_nerfattack.render.camera.intrinsics import Camera, generate_rays, pose_arrays
 from mi_nerfattack.render.rays import Rays
 

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.deploy.environment import CameraFrame
 from mi_nerfattack.deploy.views.rays import PixelRays, vertical_reach
 from mi_nerfattack.render.camera.intrinsics import Camera

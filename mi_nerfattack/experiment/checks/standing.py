@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_nerfattack.attack.freedom import Freedom
-from mi_nerfattack.backend.upload import upload_rows
+from mi_nerfattack.backend.arrays import upload_rows
 from mi_nerfattack.render.posed import PosedField
 from mi_nerfattack.vehicle.route.route import Route
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_nerfattack.fields.cpu.grid import PackedGrid
-from mi_nerfattack.fields.cpu.rows import networks
+from mi_nerfattack.fields.cpu.networks import networks
 from mi_nerfattack.fields.ngp import NGPField
 
 #: More would take a compiler too long.

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mi_nerfattack.backend.differentiate import vjp
 from mi_nerfattack.backend.freeze import freeze_method
-from mi_nerfattack.fields.cpu.rows import (
+from mi_nerfattack.fields.cpu.networks import (
     SharedRows,
     add_gradients,
     columns,

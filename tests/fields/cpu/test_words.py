@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_nerfattack.fields.cpu.words import LongWords, ShortWords, pack_words
+from mi_nerfattack.fields.cpu.grid import LongWords, ShortWords, pack_words
 
 pytestmark = pytest.mark.usefixtures("variant")
 

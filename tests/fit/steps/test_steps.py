@@ -14,7 +14,7 @@ from helpers.sphere_views import BOX, sphere_views
 
 from mi_nerfattack.capture.posed_images import PosedImages
 from mi_nerfattack.fields import GridField, GridLayout, NGPField, NGPLayout, Occupancy
-from mi_nerfattack.fields.cpu.matrices import MLP, Networks
+from mi_nerfattack.fields.cpu.networks import MLP, Networks
 from mi_nerfattack.fit.batch import BatchSource
 from mi_nerfattack.fit.cameras import EXPOSURE, POSES, CameraCorrections
 from mi_nerfattack.fit.loss import LossWeights
@@ -137,7 +137,7 @@ def test_gradient_by_the_poses_equals_that_of_the_march(rng):
 
 @pytest.mark.parametrize("block", [1 << 12, 4])
 def test_networks_against_central_differences(rng, monkeypatch, block):
-    monkeypatch.setattr("mi_nerfattack.fields.cpu.matrices.BLOCK", block)
+    monkeypatch.setattr("mi_nerfattack.fields.cpu.networks.BLOCK", block)
 
     def layers(*sizes: int) -> MLP:
         pairs = zip(sizes[1:], sizes[:-1], strict=True)

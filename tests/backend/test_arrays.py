@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.kernels import nothing_compiled
 
-from mi_nerfattack.backend.concat import concat, split
+from mi_nerfattack.backend.arrays import concat, split
 from mi_nerfattack.render.rays import Rays
 
 pytestmark = pytest.mark.usefixtures("variant")
