@@ -25,6 +25,10 @@ class InputError(NerfAttackError, ValueError):
     """Report a file, key, value, unit or shape that cannot be used."""
 
 
+class RefusedError(InputError):
+    """Report work that was looked at and refused, and would be each time."""
+
+
 class SetupError(NerfAttackError, RuntimeError):
     """Report a machine or an installation that cannot do what is asked."""
 

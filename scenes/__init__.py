@@ -39,8 +39,13 @@ def resolve(name: str, folder: str | Path = "") -> Path:
         folder: that relative paths start from.
 
     Raises:
-        InputError: nothing of this name is bundled.
+        InputError: nothing of this name is bundled, or it begins with the home of a
+            user that there is not.
     """
     if name.startswith(BUNDLED):
         return bundled(name[len(BUNDLED) :])
-    return Path(folder) / Path(name).expanduser()
+    try:
+        return Path(folder) / Path(name).expanduser()
+    except RuntimeError as err:
+        home = name.split("/")[0]
+        raise InputError(f"{name}: {home} is no home here; give the path") from err

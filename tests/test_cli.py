@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -342,3 +343,13 @@ def test_doctor_compares_bundled_files(tmp_path):
     (tmp_path / "a").write_bytes(b"abd")
     assert not doctor._matches(tmp_path, "a", {"sha256": known})
     assert not doctor._matches(tmp_path, "b", {"sha256": known})
+
+
+def test_flags_say_what_they_do_when_they_are_given(capsys):
+    """A flag that is on by default would be told by what its absence does."""
+    found = 0
+    for name, command in COMMANDS.items():
+        for item in dataclasses.fields(command):
+            assert item.default is not True, f"{name}: {item.name}"
+            found += item.default is False
+    assert found > 20

@@ -35,13 +35,13 @@ class Attack:
     leaves its lane by itself, an object is not in view, stands on the lane, in a wall,
     in the air or in another, or the route is too short. metrics.json keeps what was
     found as flags."""
-    pictures: bool = True
-    """Write frames, plots, attribution and page beside the numbers, which takes about
-    as long as five drives in each environment."""
-    frames: Literal["all", "worst"] | int = 3
+    no_pictures: bool = False
+    """Leave out frames, plots, attribution and page, which take about as long as five
+    drives in each environment."""
+    frames: Literal["all", "worst"] | int | None = None
     """Frames of each case that are written: all (with videos), worst (of the second
     that ends where the drive is farthest from the lane's centre), or so many, equally
-    spaced."""
+    spaced; 3 by default."""
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
@@ -54,7 +54,7 @@ class Attack:
             raise InputError("--force: says how to resume; give it with --resume")
         if isinstance(self.frames, int) and self.frames < 1:
             raise InputError(f"--frames: {self.frames}; all, worst, or at least 1")
-        if not self.pictures and self.frames != Attack.frames:
+        if self.no_pictures and self.frames is not None:
             raise InputError(
                 "--frames: --no-pictures leaves them out; give one of both"
             )
@@ -64,5 +64,5 @@ class Attack:
             self.resume,
             force=self.force,
             anyway=self.anyway,
-            frames=self.frames if self.pictures else None,
+            frames=None if self.no_pictures else self.frames or 3,
         )

@@ -24,16 +24,14 @@ class Check:
     """Scenario file (TOML)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Picture to write (.png); SCENARIO-check.png in this folder by default."""
-    drives: bool = True
-    """Drive once from each start, unattacked, and time the attack; without, only what
-    needs no drive is told."""
+    no_drives: bool = False
+    """Tell only what needs no drive; by default, check drives once from each start,
+    unattacked, and times the attack."""
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
     def run(self) -> Result:
         """Check, draw and tell."""
-        import shlex
-
         from mi_nerfattack import variant
         from mi_nerfattack.backend.determinism import one_thread
         from mi_nerfattack.commands.shared.progress import StageBars
@@ -56,13 +54,13 @@ class Check:
 
             world = build_world(scenario, scenario.build_policy())
             check = checks.Check(world, show)
-            check.run(self.drives)
+            check.run(not self.no_drives)
             show("drawing", 0, 1, "")
             drawn = picture if check.picture(picture) else None
             show("drawing", 1, 1, "")
             check.price()
         document = {**check.document(), "picture": drawn and str(drawn)}
-        told = checks.sentences(check, shlex.quote(str(self.scenario)), drawn)
+        told = checks.sentences(check, str(self.scenario), drawn)
         return Result(
             document, lambda: print(*told, sep="\n"), int(bool(check.refused))
         )

@@ -19,6 +19,7 @@ from mi_nerfattack.commands.shared.evaluate_options import (
 )
 from mi_nerfattack.commands.shared.policy_file import PolicyFile
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -93,8 +94,6 @@ class Evaluate:
 
     def run(self) -> Result:
         """Drive, summarise, print and write."""
-        from rich.console import Console
-
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.evaluation.work import run_evaluation
@@ -120,7 +119,7 @@ class Evaluate:
             files.write_json(self.output, found.card)
         if self.page is not None:
             self._write_page(self.page, work, record, found, time.monotonic() - start)
-        return Result(found.card, lambda: Console().print(card_table(found.card)))
+        return Result(found.card, lambda: console().print(card_table(found.card)))
 
     def _write_page(
         self,
@@ -170,7 +169,7 @@ class Evaluate:
         """Say how to drive at a place: the scenario's own, or one of the options."""
         from mi_nerfattack.training.presets import EVALUATIONS, evaluation_for
 
-        settings = EVALUATIONS[self.where.place]
+        settings = EVALUATIONS[self.where.bundled]
         if is_own:
             settings = evaluation_for(place.car.width)
         scales = parse_scales(self.scale, len(place.objects))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -85,8 +86,6 @@ class Retrain:
 
     def run(self) -> Result:
         """Check, collect, train, drive and write."""
-        from rich.console import Console
-
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.retrain.among import AmongFound, attacked_policy
@@ -135,7 +134,7 @@ class Retrain:
         files.write_json(about, document)
 
         def show() -> None:
-            Console().print(card_table(result.card), retrain_table(document))
+            console().print(card_table(result.card), retrain_table(document))
             print(f"{self.output}: written; program, record and table are beside it")
 
         return Result({**document, "environments": result.card}, show)

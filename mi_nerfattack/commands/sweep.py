@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.sweep.cell import Cell
@@ -36,9 +37,9 @@ class Sweep:
     check: bool = False
     """Do nothing yet: tell how many cells and frames there are, what time and disk they
     would take, and what would be refused."""
-    drives: bool = True
-    """With --check: drive once from each start at each place, unattacked, and time the
-    attacks; without, only what needs no drive is told."""
+    no_drives: bool = False
+    """With --check: tell only what needs no drive; by default, it drives once from each
+    start at each place, unattacked, and times the attacks."""
     workers: int | None = None
     """Cells that are done at a time, each by a process or job of its own; by default as
     many as there are cores for, and 256 jobs. Of a Ray cluster of several machines, its
@@ -113,15 +114,13 @@ class Sweep:
                 bars.show(stage, done, total, f"{done}/{total} {remark}")
 
             forecast = Forecast(cells, self.output.resolve(), show)
-            forecast.run(self.drives)
+            forecast.run(not self.no_drives)
         document = forecast.document()
         told = sentences(document, self._count())
         code = int(any(document["refused"].values()))
         return Result(document, lambda: print(*told, sep="\n"), code)
 
     def _run(self, cells: list[Cell], workers: AbstractWorkers, taken: Taken) -> Result:
-        from rich.console import Console
-
         from mi_nerfattack.commands.shared.cells import do_cells
         from mi_nerfattack.experiment.sweep.summary import write_summary
         from mi_nerfattack.report.table import sweep_table
@@ -138,11 +137,11 @@ class Sweep:
         }
 
         def show() -> None:
-            console = Console()
+            out = console()
             for flag in document["flags"]:
                 line = f"flag: {flag}"
-                console.print(line, style="bold", highlight=False, markup=False)
-            console.print(sweep_table(document))
+                out.print(line, style="bold", highlight=False)
+            out.print(sweep_table(document))
             print(f"{len(sweep.complete)} of {len(cells)} cells: {sweep.table}")
             for cell, error in failed.items():
                 print(f"failed: {cell}: {error.splitlines()[-1]}")

@@ -10,6 +10,7 @@ import tyro
 
 from mi_nerfattack.commands.shared.evaluate_options import parse_scales
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 from mi_nerfattack.commands.shared.words import command_line
 from mi_nerfattack.errors import InputError
 
@@ -104,8 +105,6 @@ class Train:
 
     def run(self) -> Result:
         """Collect, train, validate and write."""
-        from rich.console import Console
-
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.fit_report import check_output
         from mi_nerfattack.commands.shared.progress import StageBars
@@ -145,7 +144,7 @@ class Train:
         self._draw(picture, place, routes)
 
         def show() -> None:
-            Console().print(card_table(result.card))
+            console().print(card_table(result.card))
             print(f"{self.output}: written; program and validation are beside it")
             print(f"{picture}: where it was trained, from above")
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.transfer.work import TransferWork
@@ -77,8 +78,6 @@ class Transfer:
 
     def run(self) -> Result:
         """Drive, summarise, print and write."""
-        from rich.console import Console
-
         from mi_nerfattack import variant
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.experiment.transfer.run import check_output, run_transfer
@@ -102,12 +101,12 @@ class Transfer:
             document = run_transfer(work, self.output, workers, progress)
 
         def show() -> None:
-            console = Console()
-            console.print(transfer_table(document))
+            out = console()
+            out.print(transfer_table(document))
             if document["surrogates"]:
                 condition = quality_condition(document)
-                console.print(quality_table(document, condition))
-            console.print(f"Written: {self.output.resolve()}", soft_wrap=True)
+                out.print(quality_table(document, condition))
+            out.print(f"Written: {self.output.resolve()}", soft_wrap=True)
 
         return Result(document, show)
 

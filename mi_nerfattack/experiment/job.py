@@ -16,7 +16,7 @@ from mi_nerfattack.backend import variant
 from mi_nerfattack.backend.determinism import deterministic, one_thread
 from mi_nerfattack.backend.interrupts import held_interrupts
 from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, RefusedError
 from mi_nerfattack.experiment.baseline import Baseline
 from mi_nerfattack.experiment.checks.before_attack import (
     first_findings,
@@ -109,8 +109,9 @@ class Job:
             the document that ``metrics.json`` holds.
 
         Raises:
-            InputError: a file is missing or wrong, an attack would prove nothing, or
-                the run in the folder is damaged, or of another scenario or versions.
+            InputError: a file is missing or wrong, or the run in the folder is damaged,
+                or of another scenario or versions.
+            RefusedError: the attack would prove nothing.
             SetupError: the scenario is deterministic and the variant cannot be.
         """
         identity = {**versions(), **self.scenario.identity()}
@@ -187,7 +188,7 @@ class Job:
             flags += check(world, stages.one)
             if flags and not anyway:
                 listed = "\n".join(f"  {line}" for line in flags)
-                raise InputError(
+                raise RefusedError(
                     f"an attack would prove nothing:\n{listed}\nmend the scenario, or "
                     "attack all the same (--anyway)"
                 )

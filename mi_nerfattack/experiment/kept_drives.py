@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +23,40 @@ from mi_nerfattack.io.digest import array_digest
 from mi_nerfattack.io.resumable import Record, Unit, misfits_told
 from mi_nerfattack.rollout.drive import Drive
 from mi_nerfattack.scenario.deployment import SURROGATE
-from mi_nerfattack.scenario.scenario import is_within
+from mi_nerfattack.scenario.named_file import NamedFile
+from mi_nerfattack.scenario.scenario import Scenario, is_within
 from mi_nerfattack.scenario.world import Appearance, World
 
 FORMAT = "mi_nerfattack attack drive 4"
 SHARED_FORMAT = "mi_nerfattack shared drive 1"
 #: Parts of a scenario that say how it is searched, not how it is driven.
 OF_SEARCH = ("name", "attack", "baseline", "objective", "scene.bricks", "drive.runs")
+
+
+#: Parts that only drives in the surrogate depend on.
+_OF_SURROGATE = ("field", "composite", "step_m", "stop", "to_world")
+
+
+def decisive(
+    scenario: Scenario, identity: Mapping[str, str], in_surrogate: bool
+) -> dict[str, str]:
+    """Return what of a scenario decides about drives in an environment.
+
+    Not what objects show, where a drive starts, and its seed.
+
+    Args:
+        scenario: of the drives.
+        identity: its :meth:`Scenario.identity`.
+        in_surrogate: whether they are in the surrogate, not in a deployment.
+    """
+    inert, named = [*OF_SEARCH, "seed"], {}
+    if in_surrogate:
+        inert.append("scene.deployment")
+        own, seed = scenario.attack, scenario.seed
+        named = {"jitter": f"{own.jitter and seed}", "attached": f"{own.attached}"}
+    else:
+        inert += [f"scene.{name}" for name in _OF_SURROGATE]
+    return named | {k: v for k, v in identity.items() if not is_within(k, inert)}
 
 
 class DriveRecord(Record):
@@ -185,6 +212,15 @@ class SharedDrives:
     """
 
     folder: Path
+    _contents: dict[NamedFile, dict[str, str]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def _content(self, named: NamedFile) -> dict[str, str]:
+        """Read a file once, however many drives depend on it."""
+        if named not in self._contents:
+            self._contents[named] = named.content()
+        return self._contents[named]
 
     def unit(
         self, world: World, label: str, look: Appearance | None, run: int
@@ -197,19 +233,14 @@ class SharedDrives:
             look: of all objects; None without.
             run: index of the drive.
         """
-        scenario = world.scenario
-        named = scenario.identity()
-        decisive = {k: v for k, v in named.items() if not is_within(k, OF_SEARCH)}
-        if label == SURROGATE:
-            own, needed = scenario.attack, {}
-            decisive |= {"jitter": f"{own.jitter}", "attached": f"{own.attached}"}
-        else:
+        scenario, needed, here = world.scenario, {}, label == SURROGATE
+        if not here:
             needed = environment_versions(world.deployments[label].environment)
         start = world.initial[run % len(world.initial)]
         identity = {
             "format": SHARED_FORMAT,
             **{f"version.{k}": v for k, v in (versions() | needed).items()},
-            **decisive,
+            **decisive(scenario, scenario.identity(self._content), here),
             "environment": label,
             "look": "none"
             if look is None

@@ -75,7 +75,7 @@ class Run:
 
         from mi_nerfattack.report.table import metrics_table
 
-        console = Console(record=True, file=io.StringIO(), width=_WIDTH)
+        console = Console(record=True, file=io.StringIO(), width=_WIDTH, markup=False)
         console.print(metrics_table(self.metrics))
         layout = '<pre style="line-height: 1.2">{code}</pre>'
         table = console.export_html(inline_styles=True, code_format=layout)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -90,7 +89,7 @@ class NamedFile:
         digest = hashlib.sha256(raw)
         digest.update(self.function.encode())
         if self.path.suffix.lower() == ".xml":
-            for inner in _files_in(raw, self.path.parent, {self.path}):
+            for inner in _files_of(self.path):
                 digest.update(hashlib.sha256(_read(inner)).digest())
         shown = ":".join(filter(None, (self.path.name, self.function)))
         return {"file": shown, "sha256": digest.hexdigest()}
@@ -128,16 +127,13 @@ def _any_code(value: Any, info: ValidationInfo) -> NamedFile:
     return NamedFile(str(value), None)
 
 
-def _files_in(xml: bytes, folder: Path, seen: set[Path]) -> Iterator[Path]:
-    """Yield the files that an XML text names, and those that included ones name."""
-    text = xml.decode("utf-8", "replace")
-    for name in sorted(set(re.findall(r'="([^"\n]+)"', text))):
-        inner = resolve(name) if name.startswith(BUNDLED) else folder / name
-        if inner not in seen and os.path.isfile(inner):
-            seen.add(inner)
-            yield inner
-            if inner.suffix.lower() == ".xml":
-                yield from _files_in(_read(inner), folder, seen)
+def _files_of(scene: Path) -> list[Path]:
+    """Return the files that a Mitsuba scene names, in the order of their names."""
+    from mi_nerfattack.backend import variant
+    from mi_nerfattack.render.pathtrace.load import named_files  # slow to import
+
+    variant.ensure()
+    return [path for _, path in sorted(named_files(scene).items())]
 
 
 def _folder_digest(folder: Path) -> str:

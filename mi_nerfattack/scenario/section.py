@@ -111,8 +111,7 @@ class Section(BaseModel):
 class Kinds:
     """Mark a union of sections that differ in the value of a key.
 
-    Without the key it is the first. Keys of the others are refused, unless their value
-    is the default, which says nothing.
+    Without the key it is the first. Keys of the others are refused.
 
     Args:
         key: that tells them apart.
@@ -146,11 +145,10 @@ class Kinds:
         here, without = f'{self.key} = "{value}"', f"without {self.key}"
         for key in [key for key in data if key in others and key not in own]:
             having = [member for member in members if key in member.defaults()]
-            if data[key] != others[key]:
-                wrong[key] = (
-                    f"has no meaning {f'with {here}' if value else without}; leave it "
-                    f"out, or set {self.key} to {_either(self._values(*having))}"
-                )
+            wrong[key] = (
+                f"has no meaning {f'with {here}' if value else without}; leave it "
+                f"out, or set {self.key} to {_either(self._values(*having))}"
+            )
         for key, field in member.model_fields.items():
             if field.is_required() and key not in data:
                 wrong[key] = f"is missing; {here} needs it"

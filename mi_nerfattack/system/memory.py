@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import resource
 import sys
 
 from mi_nerfattack.io import files
@@ -17,5 +16,7 @@ def peak_memory_mb() -> float:
     if sys.platform == "linux":
         status = files.read_text("/proc/self/status")
         return float(re.findall(r"VmHWM:\s*(\d+) kB", status)[0]) * 1024 / 1e6
+    import resource  # not on Windows
+
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

@@ -17,7 +17,12 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
+from mi_nerfattack.errors import (
+    InputError,
+    NerfAttackError,
+    RefusedError,
+    is_interrupt,
+)
 from mi_nerfattack.system.cores import cores
 from mi_nerfattack.system.processes import blocked_interrupts, safe_path
 
@@ -29,8 +34,8 @@ OnUnits = Callable[[int], None]
 OnEnd = Callable[[int, Exception | None], None]
 
 
-#: What became of a piece, as one process tells another: "done"; "error" and a message;
-#: or "bug" and a traceback.
+#: What became of a piece, as one process tells another: "done"; "error" or "refused"
+#: and a message; or "bug" and a traceback.
 Told = tuple[str, str]
 
 
@@ -80,8 +85,8 @@ def do_alone(work: AbstractWork, index: int) -> Told:
 def failure(piece: int, told: Told) -> Exception | None:
     """Return what another process told of a piece as an error; None if it is done."""
     kind, text = told
-    if kind == "error":
-        return InputError(text)
+    if kind in ("error", "refused"):
+        return (InputError if kind == "error" else RefusedError)(text)
     return RuntimeError(f"piece {piece} failed:\n{text}") if kind == "bug" else None
 
 
@@ -289,7 +294,7 @@ def _use_one_thread() -> None:
 
 def _failed(error: Exception) -> Told:
     if isinstance(error, NerfAttackError):
-        return "error", str(error)
+        return "refused" if isinstance(error, RefusedError) else "error", str(error)
     if isinstance(error, MemoryError):
         why = f": {error}" * bool(str(error))
         return "error", (

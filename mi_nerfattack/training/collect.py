@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.deploy.environment import AbstractEnvironment
 from mi_nerfattack.deploy.sites import AbstractSite, expert_of, probe_expert
 from mi_nerfattack.errors import InputError
@@ -75,6 +76,7 @@ def collect(
     experts = {route.name: probe_expert(site, route) for route in routes}
     identity = {
         "format": FORMAT,
+        **flatten("version", versions()),
         **flatten("settings", asdict(settings)),
         **flatten("site", site.describe()),
         **flatten("source", source.describe()),

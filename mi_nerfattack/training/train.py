@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mi_nerfattack.backend.versions import versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io.resumable import Record, Unit, flatten
 from mi_nerfattack.policy.pilotnet import PilotNet
@@ -269,6 +270,7 @@ class _Run:
     def _identity(self) -> dict[str, str]:
         """Describe all on which a continued run must agree."""
         about = {
+            "version": versions(),
             "settings": asdict(self.settings),
             "validation": self.validation.describe(),
             "rows": self.part.describe(),

@@ -105,10 +105,19 @@ def test_seconds_are_those_of_the_steps():
     assert figures["wheel_out_s"] == pytest.approx(0.5)
 
 
-def test_mean_is_over_steps_when_runs_differ_in_length():
+def test_a_drive_counts_once_whatever_its_length():
     runs = [make_drive([0.0] * 9, run=0), make_drive([1.0], run=1)]
     figures = metrics.summarise(runs, LANES)["straight"]["surrogate"]["random"]
-    assert figures["cross_track_mean_m"] == pytest.approx(0.1)
+    assert figures["cross_track_mean_m"] == pytest.approx(0.5)
+
+
+def test_the_mean_lies_in_its_interval():
+    """Long drives near the centre, and short ones that leave it."""
+    runs = [make_drive([0.1] * 1000, run=run) for run in range(15)]
+    runs += [make_drive([1.0] * 20, run=run) for run in range(15, 20)]
+    card = metrics.card_figures(runs, 0.5)
+    low, high = card["cross_track_mean_ci95_m"]
+    assert low < card["cross_track_mean_m"] < high
 
 
 def test_interval_of_two_runs_is_their_range():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from types import SimpleNamespace
 from typing import Any
 
@@ -31,6 +32,25 @@ def check(folder, capsys, *change, options=()):
     path.write_text((folder / "scenario.toml").read_text().replace(*change))
     code = cli.main(["check", str(path), "-o", str(picture), *options])
     return code, capsys.readouterr(), picture
+
+
+def test_the_next_command_can_be_given_as_it_is_told(scenario_folder, capsys):
+    options = ["--no-drives"]
+    (scenario_folder / "my scene.toml").write_text(
+        (scenario_folder / "scenario.toml").read_text()
+    )
+    path = str(scenario_folder / "my scene.toml")
+    picture = str(scenario_folder / "seen.png")
+    assert cli.main(["check", path, "-o", picture, *options]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    words = ["mi-nerfattack", "attack", path, "-o", "runs/my scene"]
+    assert shlex.split(last.removeprefix("next: ")) == words
+
+
+def test_a_home_of_nobody_is_one_message(scenario_folder, capsys):
+    change = '"object.safetensors"', '"~nosuchuser/object.safetensors"'
+    code, told, _ = check(scenario_folder, capsys, *change)
+    assert code == 2 and "~nosuchuser is no home here; give the path" in told.err
 
 
 def test_a_sound_scenario(scenario_folder, capsys):

@@ -86,7 +86,10 @@ def test_keys_and_xml_describe_the_same_sensor(load):
 
 def test_files_of_the_scene_are_part_of_the_identity(load, tmp_path):
     scenario = load(more='<include filename="wall.xml"/>')
-    (tmp_path / "wall.xml").write_text('<scene><string value="brick"/></scene>')
+    (tmp_path / "wall.xml").write_text(
+        '<scene version="3.0.0"><texture type="bitmap" id="wall">'
+        '<string name="filename" value="brick"/></texture></scene>'
+    )
     (tmp_path / "brick").write_text("red")
     before = scenario.identity()
     for name in ("object.safetensors", "surrogate.xml", "brick"):

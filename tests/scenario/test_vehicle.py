@@ -162,6 +162,7 @@ def load(folder, text):
     [
         ('"custom"', '"dubins"', r":15: vehicle.function: has no meaning with model"),
         ('function = "car.py:car"\n', "", r"vehicle.function: is missing; model"),
+        ("= 1.5", "= 1.5\nmax_steer_rate_deg_s = 40.0", r":17: .*has no meaning with"),
         ("control_limit = 1.5\n", "", r"vehicle.control_limit: is missing"),
         (
             "car.py:car",

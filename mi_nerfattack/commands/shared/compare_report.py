@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 from mi_nerfattack.errors import InputError
 
 if TYPE_CHECKING:
@@ -123,12 +124,10 @@ def compare_folder(output: Path) -> Path:
 
 def print_comparison(comparison: Comparison, output: Path) -> None:
     """Print a table of the routes, and what it comes to."""
-    from rich.console import Console
-
     from mi_nerfattack.report.pages.compare import routes_table, settings_line, verdict
 
-    console = Console()
-    console.print(routes_table(comparison))
+    out = console()
+    out.print(routes_table(comparison))
     page = compare_folder(output) / "report.html"
     for line in (settings_line(comparison), verdict(comparison), f"Wrote {page}."):
-        console.print(line, soft_wrap=True, highlight=False)
+        out.print(line, soft_wrap=True, highlight=False)

@@ -22,8 +22,9 @@ BUNDLED_POLICY = "bundled:policy/pilotnet.safetensors"
 class PlaceOptions:
     """Where a policy drives."""
 
-    place: str = "intersection"
-    """Bundled place: intersection, or room (a small car that takes steering angles)."""
+    place: str | None = None
+    """Bundled place: intersection, or room (a small car that takes steering angles).
+    That of a scenario is its own, and otherwise intersection."""
     scene: Path | None = None
     """Mitsuba XML of a scene of your own; needs --routes-file."""
     field: Path | None = None
@@ -35,6 +36,11 @@ class PlaceOptions:
     by default."""
     server: str | None = None
     """Server of carla, and the town of --routes-file: HOST:PORT/TOWN."""
+
+    @property
+    def bundled(self) -> str:
+        """Name of the bundled place."""
+        return self.place or "intersection"
 
     def check(self, environments: tuple[str, ...]) -> None:
         """Check that what CARLA needs is given, and only for CARLA.
@@ -71,7 +77,7 @@ class PlaceOptions:
         """Return the place; camera and car are those of the bundled one."""
         from mi_nerfattack.deploy.place import bundled_place
 
-        place = bundled_place(self.place)
+        place = bundled_place(self.bundled)
         if self.scene is not None:
             if self.routes_file is None:
                 raise InputError(f"--scene: {self.scene}; it needs its --routes-file")
@@ -102,8 +108,8 @@ class PolicyOptions:
     """How the goal is passed: integer, one_hot or none."""
     goals: int | None = None
     """Number of goals."""
-    control_scale: float = 1.0
-    """Factor to the car's unit, rad/s or rad, positive to the left."""
+    control_scale: float | None = None
+    """Factor to the car's unit, rad/s or rad, positive to the left; 1 by default."""
     column: int | None = None
     """Column of the control, where the network gives several numbers."""
 

@@ -7,10 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from mi_nerfattack.commands.shared.progress import StageBars
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,9 +107,9 @@ def finish(
     more = {} if comparison is None else {"compare": document(comparison)}
 
     def show() -> None:
-        console = Console()
-        console.print(scores_table(result))
-        console.print(
+        out = console()
+        out.print(scores_table(result))
+        out.print(
             f"{verdict(judge_fit(result))}\n{result.steps} steps in "
             f"{result.wall_s:.0f} s. Wrote {output} and {page}.",
             soft_wrap=True,

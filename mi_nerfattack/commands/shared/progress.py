@@ -13,8 +13,9 @@ from importlib import import_module
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, overload
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from mi_nerfattack.commands.shared.terminal import console
 
 if TYPE_CHECKING:
     from mi_nerfattack.fit.options import FitProgress
@@ -33,11 +34,11 @@ class StageBars:
     """
 
     def __init__(self, started: float | None = None) -> None:
-        self._console = Console(stderr=True)
+        self._console = console(stderr=True)
         self._bars = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
-            TextColumn("{task.fields[state]}"),
+            TextColumn("{task.fields[state]}", markup=False),
             TimeRemainingColumn(),
             console=self._console,
             speed_estimate_period=_SPEED_OVER_S,
@@ -61,7 +62,7 @@ class StageBars:
 
     def say(self, text: str) -> None:
         """Write a line above the bars."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(text, highlight=False, soft_wrap=True)
 
     def counter(self, stage: str, unit: str = "") -> Callable[[int, int], None]:
         """Return a function of units done and all units that shows a stage."""
@@ -211,8 +212,8 @@ class ProgressBar:
 
     def __init__(self, total: int | None, stage: str) -> None:
         self._total, self._stage = total, stage
-        console = Console(stderr=True)
-        kinds = {console.is_jupyter: _Notebook, console.is_terminal: _Terminal}
+        out = console(stderr=True)
+        kinds = {out.is_jupyter: _Notebook, out.is_terminal: _Terminal}
         self._display: _Display = kinds.get(True, _Log)()
         self._current: str | None = None
         self._steps = 0

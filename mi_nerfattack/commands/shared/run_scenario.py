@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_nerfattack.commands.shared.result import Result
+from mi_nerfattack.commands.shared.terminal import console
 
 if TYPE_CHECKING:
     from mi_nerfattack.experiment.finished import Frames
@@ -64,28 +65,26 @@ def run_scenario(
 
 
 def _show(document: dict[str, Any], output: Path, frames: Frames | None) -> None:
-    from rich.console import Console
-
     from mi_nerfattack.report.table import metrics_table
 
-    console = Console()
+    out = console()
     for flag in document["flags"]:
-        console.print(f"flag: {flag}", style="bold", highlight=False, markup=False)
+        out.print(f"flag: {flag}", style="bold", highlight=False)
     for sentence in document["verdict"]:
-        console.print(sentence, highlight=False)
-    console.print(metrics_table(document))
-    _print_files(console, output, document, frames)
+        out.print(sentence, highlight=False)
+    out.print(metrics_table(document))
+    _print_files(out, output, document, frames)
 
 
 def _print_files(
-    console: Any, output: Path, document: dict[str, Any], frames: Frames | None
+    out: Any, output: Path, document: dict[str, Any], frames: Frames | None
 ) -> None:
     cost = document["cost"]
-    console.print(
+    out.print(
         f"{cost['wall_s']:.0f} s by the clock, {cost['renders']} frames, "
         f"{cost['peak_memory_mb']:.0f} MB at most"
     )
-    console.print(f"Run folder: {output.resolve()}", soft_wrap=True)
+    out.print(f"Run folder: {output.resolve()}", soft_wrap=True)
     shown = {
         "report.html": "everything on one page",
         "overhead.png": "all drives from above",
@@ -100,4 +99,4 @@ def _print_files(
         "objects/": "the fields, as the attack leaves them",
     }
     for name, meaning in ({**shown, **numbers} if frames else numbers).items():
-        console.print(f"  {name:24s} {meaning}")
+        out.print(f"  {name:24s} {meaning}")

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from mi_nerfattack.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def console(stderr: bool = False) -> Console:
+    """Return the terminal, for text and tables in which brackets mean themselves."""
+    from rich.console import Console  # slow to import
+
+    return Console(stderr=stderr, markup=False)
 
 
 def say(text: str) -> None:

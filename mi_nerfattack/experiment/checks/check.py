@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -267,7 +268,8 @@ def sentences(check: Check, scenario_path: str, picture: Path | None) -> list[st
     lines += [f"look at: {line}" for line in check.doubts]
     if picture is not None:
         lines.append(f"picture: {picture}")
-    command = f"mi-nerfattack attack {scenario_path} -o runs/{Path(scenario_path).stem}"
+    words = "attack", scenario_path, "-o", f"runs/{Path(scenario_path).stem}"
+    command = shlex.join(("mi-nerfattack", *words))
     if check.refused:
         lines.append(
             "next: mend the scenario and check again; to attack all the same: "

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 
 from mi_nerfattack import variant
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, RefusedError
 from mi_nerfattack.experiment.sweep.cell import (
     CELLS,
     Cell,
@@ -94,6 +94,7 @@ class Sweep:
     kept: int = 0
     errors: dict[int, str] = field(default_factory=dict)
     _rows: dict[int, list[Row]] = field(default_factory=dict)
+    _refused: set[int] = field(default_factory=set)
 
     @property
     def table(self) -> Path:
@@ -104,7 +105,8 @@ class Sweep:
         """Do all cells that are not complete.
 
         A cell that fails, or whose process dies, is tried `ATTEMPTS` times; each goes
-        on from the cell's last checkpoint. The table is written after each cell.
+        on from the cell's last checkpoint. One whose attack would prove nothing is
+        refused once. The table is written after each cell.
 
         Args:
             workers: who does them.
@@ -130,7 +132,8 @@ class Sweep:
             self.kept = len(self.complete)
             self._write()
             for _ in range(ATTEMPTS):
-                left = [i for i in range(len(work.cells)) if i not in self.complete]
+                ended = self.complete | self._refused
+                left = [i for i in range(len(work.cells)) if i not in ended]
                 workers.run(work, left, self._count, self._end)
 
     def _count(self, steps: int) -> None:
@@ -149,6 +152,8 @@ class Sweep:
             path.unlink(missing_ok=True)
             self._take(index)
         else:
+            if isinstance(error, RefusedError):
+                self._refused.add(index)
             files.write_text(path, str(error))
             self._fail(index, str(error))
         self._write()

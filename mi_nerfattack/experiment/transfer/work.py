@@ -19,7 +19,7 @@ from mi_nerfattack.deploy.registry import environment_versions
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.identity import short_digest
 from mi_nerfattack.evaluation.work import DriveRecord
-from mi_nerfattack.experiment.kept_drives import OF_SEARCH
+from mi_nerfattack.experiment.kept_drives import decisive
 from mi_nerfattack.experiment.transfer.columns import Column
 from mi_nerfattack.experiment.transfer.found import FoundAttack
 from mi_nerfattack.io import files
@@ -41,10 +41,6 @@ FORMAT = "mi_nerfattack transfer drive 1"
 #: What objects can show, in the order of documents.
 CASES = (NO_OBJECT, OWN, BEST_RANDOM, ATTACK)
 _REMEDY = "choose another folder with -o, or remove this file"
-#: Parts of a scenario that no drive depends on.
-_INERT = (*OF_SEARCH, "seed", "deployment")
-#: Parts that only drives in the surrogate depend on.
-_OF_SURROGATE = ("field", "composite", "step_m", "stop", "to_world")
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,13 +251,7 @@ class Opened:
 
 def _decisive(found: FoundAttack, column: Column, case: str) -> dict[str, str]:
     """Return what of a scenario, and of what was found, decides about drives."""
-    inert, named = [*_INERT], {}
-    if column.environment == SURROGATE:
-        inert.append("scene.deployment")
-        if found.scenario.attack.jitter:
-            named["jitter"] = f"{found.scenario.seed}"
-    else:
-        inert += [f"scene.{name}" for name in _OF_SURROGATE]
+    inert, named = ["deployment"], {}
     if case == NO_OBJECT:
         inert.append("objects")
     if case in (ATTACK, BEST_RANDOM):
@@ -270,5 +260,6 @@ def _decisive(found: FoundAttack, column: Column, case: str) -> dict[str, str]:
         scenario = found.scenario
         look = scenario.seed, scenario.baseline.kind, found.best_random
         named["look"] = json.dumps(look)
-    identity = found.identity.items()
-    return named | {k: value for k, value in identity if not is_within(k, inert)}
+    in_surrogate = column.environment == SURROGATE
+    driven = decisive(found.scenario, found.identity, in_surrogate).items()
+    return named | {k: value for k, value in driven if not is_within(k, inert)}

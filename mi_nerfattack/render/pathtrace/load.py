@@ -13,10 +13,15 @@ import mitsuba as mi
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import files
+from mi_nerfattack.scenes import BUNDLED, resolve
 
 _CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 _VALUE = re.compile(r"""=\s*["']([^"'$\n]+)["']""")
-_FILENAME = re.compile(r"""filename\s*=\s*["']([^"'$]+)["']""")
+_FILENAME = re.compile(r"""filename\s*=\s*["']([^"']+)["']""")
+_DEFAULT = re.compile(
+    r"""<default\s+name\s*=\s*["']([^"']+)["']\s+value\s*=\s*["']([^"']*)["']"""
+)
+_PARAMETER = re.compile(r"\$(\w+)")
 
 
 def load_scene(
@@ -80,24 +85,60 @@ def scene_files(path: str | Path) -> list[Path]:
     Raises:
         InputError: the XML cannot be read.
     """
+    return list(dict.fromkeys([Path(path).resolve(), *named_files(path).values()]))
+
+
+def named_files(path: str | Path) -> dict[str, Path]:
+    """Find all files that a scene's file names, as far as they exist.
+
+    Names are those that Mitsuba reads: with the values of the ``$NAME`` that have a
+    `<default>`, and looked for in the folders of `<path>`, too.
+
+    Args:
+        path: XML file; included ones are followed.
+
+    Returns:
+        by name: of included files relative to the folder of `path`, of others as they
+        are written.
+
+    Raises:
+        InputError: the XML cannot be read.
+    """
     with _resolved_from(path):
         try:
             state = mi.parser.parse_file(_config(), str(path))
         except RuntimeError as error:
             raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
-        texts = [Path(str(name)) for name in state.files]
+        texts = [Path(str(name)).resolve() for name in state.files]
         names = [
-            str(node.props[key])
+            node.props[key]
             for node in state.nodes
             for key in node.props
-            if "file" in key
+            if isinstance(node.props[key], str)
         ]
         for text in texts:  # the parser replaces a spectrum's file by its numbers
-            names += _FILENAME.findall(files.read_text(text))
+            names += _spectra(files.read_text(text))
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]
-        found = [Path(str(resolver.resolve(name))) for name in names if name]
-    there = [item.resolve() for item in (*texts, *found) if os.path.isfile(item)]
-    return list(dict.fromkeys(there))
+        found = {
+            name: resolve(name)
+            if name.startswith(BUNDLED)
+            else Path(str(resolver.resolve(name)))
+            for name in names
+            if name
+        }
+    folder = Path(path).resolve().parent
+    included = {os.path.relpath(text, folder): text for text in texts[1:]}
+    there = {k: file.resolve() for k, file in found.items() if os.path.isfile(file)}
+    return included | there
+
+
+def _spectra(text: str) -> list[str]:
+    """Return the file names of spectra in an XML text."""
+    values = dict(_DEFAULT.findall(text))
+    return [
+        _PARAMETER.sub(lambda match: values.get(match[1], match[0]), name)
+        for name in _FILENAME.findall(text)
+    ]
 
 
 def _config() -> Any:

@@ -1,1 +1,1 @@
-"""Plots: matplotlib is imported here alone."""
+"""Plots by matplotlib, which is slow to import."""

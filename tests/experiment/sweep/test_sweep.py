@@ -6,12 +6,12 @@ import json
 
 import pytest
 
-from mi_nerfattack.errors import InputError
+from mi_nerfattack.errors import InputError, RefusedError
 from mi_nerfattack.experiment.sweep.cell import folder_of, is_complete, run_cell
 from mi_nerfattack.experiment.sweep.sweep import Cells, Sweep
 from mi_nerfattack.experiment.sweep.table import SCHEMA, read_table
 from mi_nerfattack.io import files
-from mi_nerfattack.system.workers import InThisProcess
+from mi_nerfattack.system.workers import InThisProcess, _failed, failure
 from tests.experiment.sweep.conftest import finish
 
 parquet = pytest.importorskip(
@@ -121,6 +121,26 @@ def test_failed_cells_are_tried_twice_more_and_stay_as_rows(cells, tmp_path):
     assert last.done == [2]
     assert [row["status"] for row in table(tmp_path)] == ["complete"] * 4
     assert not list((tmp_path / "failed").iterdir())
+
+
+def test_a_cell_that_would_prove_nothing_is_refused_once(cells, tmp_path):
+    done = []
+
+    def task(cell, folder, on_step):
+        done.append(cell.seed)
+        if cell.seed == 1:
+            raise RefusedError("an attack would prove nothing")
+        finish(cell, folder)
+
+    found = sweep(cells, tmp_path, task)
+    assert done == [0, 1, 2, 3] and list(found.errors) == [1]
+    assert table(tmp_path)[1]["error"] == "an attack would prove nothing"
+
+
+def test_a_refusal_stays_one_from_process_to_process():
+    told = _failed(RefusedError("no"))
+    assert isinstance(failure(0, told), RefusedError)
+    assert not isinstance(failure(0, _failed(InputError("no"))), RefusedError)
 
 
 def test_complete_cells_outlive_an_interruption(cells, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -180,6 +181,25 @@ def test_drives_without_what_was_found_are_shared(found_run, tmp_path):
         }
         assert attack["cross_track_mean_m"] == 0.5
         assert column["ratio_to_surrogate"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("key", ["attached", "jitter"])
+def test_what_decides_about_drives_in_the_surrogate(found_run, tmp_path, key):
+    """Attached attacks see thin parts of fields; nothing of it is in other worlds."""
+    columns = make_columns(("surrogate", "mitsuba"), ("day",), 1)
+    (found,) = read_found([found_run])
+    attack = found.scenario.attack.model_copy(update={key: True})
+    scenario = found.scenario.model_copy(update={"attack": attack})
+    one, other = (
+        TransferWork([each], columns, CASES, 2, 1, tmp_path).batches
+        for each in (found, replace(found, scenario=scenario))
+    )
+    changed = {
+        a.column.environment
+        for a, b in zip(one, other, strict=True)
+        if a.digest != b.digest
+    }
+    assert changed == {"surrogate"}
 
 
 def test_without_objects_it_does_not_matter_how_they_stand(found_run, tmp_path):
