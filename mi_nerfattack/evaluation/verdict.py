@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from mi_nerfattack.evaluation.flags import SATURATED
+from mi_nerfattack.evaluation.pairs import compare, outcomes
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM, NO_OBJECT, OWN, RANDOM
 
 #: An attack beats random looks from this multiple of their mean error on.
@@ -28,7 +30,8 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
         limit = document["departure_limits_m"][route]
         found.append(_policy(environments, limit))
         for name in sorted(environments, key=lambda name: name != surrogate):
-            found += _attack(name, environments[name], name == surrogate)
+            over = _over_starts(document, name, environments[name])
+            found += _attack(name, environments[name], name == surrogate, over)
     for name, replayed in document.get("replay", {}).items():
         found += _replayed(name, replayed)
     found += _search(document)
@@ -56,12 +59,33 @@ def _policy(environments: Figures, limit: float) -> str:
     )
 
 
-def _attack(name: str, cases: Figures, is_surrogate: bool) -> Iterator[str]:
+def _over_starts(document: Figures, name: str, cases: Figures) -> str:
+    """Say within what the ratio to random looks lies, by drives of equal starts."""
+    if ATTACK not in cases or RANDOM not in cases:
+        return ""
+    attack, random = (
+        [
+            replace(drive, scenario=f"start {drive.start}")
+            for drive in outcomes(document, name, case)
+        ]
+        for case in (ATTACK, RANDOM)
+    )
+    effect = compare(attack, random, "cross_track_mean_m", document["seed"])
+    if effect.ratio_ci95 is None:
+        return ""
+    low, high = effect.ratio_ci95
+    return f" (95 % interval over {effect.attacks} starts: {low:.1f} to {high:.1f})"
+
+
+def _attack(
+    name: str, cases: Figures, is_surrogate: bool, over_starts: str
+) -> Iterator[str]:
     if ATTACK not in cases or RANDOM not in cases:
         return
     attack, mean = cases[ATTACK], cases[ATTACK]["cross_track_mean_m"]
     ratio = _ratio(mean, cases[RANDOM]["cross_track_mean_m"])
     text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of random looks"
+    text += over_starts
     if BEST_RANDOM in cases:
         best = _ratio(mean, cases[BEST_RANDOM]["cross_track_mean_m"])
         text += f" and {best:.1f} times that of the best of them"
