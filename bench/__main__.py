@@ -64,7 +64,7 @@ COMMANDS = {
 
 def main(argv: list[str] | None = None) -> int:
     """Run one benchmark and return the exit code."""
-    return cli.main(argv, COMMANDS, "python -m bench")
+    return cli.main(argv, {"": COMMANDS}, "python -m bench")
 
 
 if __name__ == "__main__":

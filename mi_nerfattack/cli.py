@@ -9,16 +9,19 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
+import inspect
 import os
 import sys
+import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Union
 
 import tyro
 
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
-from mi_nerfattack.commands import COMMANDS, Command
+from mi_nerfattack.commands import THEMES, Command, Commands, Group, each
 from mi_nerfattack.commands.shared.result import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 
@@ -28,22 +31,23 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-_DESCRIPTION = (
-    "Find, measure and repair failures of image-based driving policies.\n\n"
+_ABOUT = "Find, measure and repair failures of image-based driving policies."
+_HINT = (
     "--debug, anywhere, shows the traceback of an error; --version prints the version."
 )
+_STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
 
 
 def main(
     argv: Sequence[str] | None = None,
-    commands: Mapping[str, type[Command]] = COMMANDS,
+    themes: Mapping[str, Commands] = THEMES,
     prog: str = PROG,
 ) -> int:
     """Run one sub-command and return the exit code.
 
     Args:
         argv: the arguments without the program's name; None takes the process's.
-        commands: what can be run, by name.
+        themes: what can be run, by name, by theme.
         prog: the program's name, for its help.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -51,7 +55,7 @@ def main(
     arguments = [item for item in arguments if item != "--debug"]
     try:
         with raised_interrupts(_end):
-            code = _run(arguments, commands, prog)
+            code = _run(arguments, themes, prog)
             if sys.stdout is not None:  # closed before we started
                 sys.stdout.flush()
             return code
@@ -87,19 +91,21 @@ def main(
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
 
 
-def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str) -> int:
+def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int:
     if arguments == ["--version"]:
         print(f"{prog} {mi_nerfattack.__version__}")
         return 0
+    commands = {name: one for theme in themes.values() for name, one in theme.items()}
     _check_name(arguments, commands)
+    about, level, rest = _ABOUT, prog, arguments
+    if arguments and isinstance(group := commands.get(arguments[0]), Group):
+        about, level = group.about, f"{prog} {arguments[0]}"
+        themes, rest = {"": group.commands}, arguments[1:]
+    if rest in ([], ["-h"], ["--help"]):
+        print(_overview(themes, about, level), file=sys.stdout if rest else sys.stderr)
+        return 0 if rest else EXIT_INPUT
     try:
-        command = tyro.extras.subcommand_cli_from_dict(
-            dict(commands),
-            prog=prog,
-            description=_DESCRIPTION,
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
-        )
+        command = tyro.cli(_one_of(commands), prog=prog, args=arguments, config=_STYLE)
     except SystemExit as stop:  # help printed, or wrong usage reported
         code = stop.code or 0
         return code if isinstance(code, int) else EXIT_INPUT
@@ -111,6 +117,38 @@ def _run(arguments: list[str], commands: Mapping[str, type[Command]], prog: str)
         raise stop.__context__ from None  # rich ends the process by itself
 
 
+def _one_of(commands: Commands) -> Any:
+    """Return a type of which tyro makes one command, as the arguments say."""
+    members = [
+        Annotated[
+            Any,
+            tyro.conf.subcommand(
+                name,
+                constructor=_one_of(item.commands) if isinstance(item, Group) else item,
+                description=item.about if isinstance(item, Group) else None,
+            ),
+        ]
+        for name, item in commands.items()
+    ]
+    members.append(Annotated[None, tyro.conf.Suppress])  # a union has two at least
+    return Union[tuple(members)]  # noqa: UP007  # of a list
+
+
+def _overview(themes: Mapping[str, Commands], about: str, prog: str) -> str:
+    """Return the first help, also of a group: a sentence a command, by theme."""
+    lines = [f"usage: {prog} COMMAND ...", "", about]
+    for theme, commands in themes.items():
+        lines += ["", *([theme] if len(commands) > 1 and theme else [])]
+        for name, item in commands.items():
+            text = item.about if isinstance(item, Group) else inspect.getdoc(item) or ""
+            first = text.split("\n\n")[0].replace("\n", " ")
+            lines += textwrap.wrap(
+                first, 80, initial_indent=f"  {name:10}", subsequent_indent=" " * 12
+            )
+    lines += ["", f"{prog} COMMAND --help tells the options of a command.", _HINT]
+    return "\n".join(lines)
+
+
 def _tell(command: Command) -> int:
     """Run a command, print the figures that it returns, and return the exit code."""
     as_json = getattr(command, "json", False)
@@ -119,14 +157,21 @@ def _tell(command: Command) -> int:
     return result if isinstance(result, int) else result.tell(as_json)
 
 
-def _check_name(arguments: list[str], commands: Mapping[str, type[Command]]) -> None:
+def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -> None:
     """Raise InputError of a word that is no command, with those that resemble it."""
-    if not arguments or arguments[0].startswith("-") or arguments[0] in commands:
+    if not arguments or arguments[0].startswith("-"):
         return
-    near = difflib.get_close_matches(arguments[0], commands)
+    name, *more = arguments
+    if name in commands:
+        if isinstance(item := commands[name], Group):
+            _check_name(more, item.commands, f"{name} ")
+        return
+    near = difflib.get_close_matches(name, commands)
+    words = [name for name, _ in each(commands) if name[-1] == arguments[0]]
+    near = [f"{group}{one}" for one in near] or [" ".join(one) for one in words]
     one_of = f"one of {', '.join(commands)}"
     meant = f"did you mean {' or '.join(map(repr, near))}?" if near else one_of
-    raise InputError(f"{arguments[0]!r}: is no command; {meant}")
+    raise InputError(f"{group + name!r}: is no command; {meant}")
 
 
 def _drop_output() -> None:

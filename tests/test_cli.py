@@ -19,7 +19,7 @@ from helpers.variants import later
 import mi_nerfattack
 from mi_nerfattack import cli
 from mi_nerfattack.backend import llvm
-from mi_nerfattack.commands import COMMANDS
+from mi_nerfattack.commands import COMMANDS, THEMES, each
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.system import doctor
 
@@ -65,7 +65,7 @@ class Try:
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run the command line with the command 'try' added."""
-    monkeypatch.setitem(COMMANDS, "try", Try)
+    monkeypatch.setitem(THEMES["start"], "try", Try)
 
     def call(*arguments: str) -> tuple[int, str, str]:
         code = cli.main(arguments)
@@ -143,6 +143,7 @@ def test_the_citation_is_of_this_version():
     [
         ("atack", "'atack': is no command; did you mean 'attack'?"),
         ("retarin", "'retarin': is no command; did you mean 'retrain'"),
+        ("drive", "'drive': is no command; did you mean 'car drive'?"),
         ("nonsense", "'nonsense': is no command; one of doctor, demo, "),
     ],
 )
@@ -151,9 +152,9 @@ def test_a_word_that_is_no_command_is_told_with_what_resembles_it(run, word, mes
     assert (code, out) == (2, "") and err.startswith(f"mi-nerfattack: error: {message}")
 
 
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_help_names_kinds_of_values_and_groups_of_options(run, name):
-    code, out, _ = run(name, "--help")
+@pytest.mark.parametrize("words", [words for words, _ in each(COMMANDS)])
+def test_help_names_kinds_of_values_and_groups_of_options(run, words):
+    code, out, _ = run(*words, "--help")
     assert code == 0 and "None}" not in out
     titles = re.findall(r"(?m)^[ ╭─│]*([a-z]+) options", out)
     assert not {"where", "options", "against"} & set(titles)
@@ -181,19 +182,21 @@ def test_version(run):
 def test_help_is_complete_and_loads_nothing_heavy():
     code = (
         "import contextlib, io, sys\n"
-        "from mi_nerfattack.cli import COMMANDS, main\n"
+        "from mi_nerfattack.cli import main\n"
+        "from mi_nerfattack.commands import COMMANDS, each\n"
         "assert main(['--help']) == 0\n"
-        "for name in COMMANDS:\n"
+        "for words, _ in each(COMMANDS):\n"
         "    with contextlib.redirect_stdout(io.StringIO()) as out:\n"
-        "        assert main([name, '--help']) == 0\n"
-        "    assert 'usage: mi-nerfattack ' + name in out.getvalue()\n"
+        "        assert main([*words, '--help']) == 0\n"
+        "    assert ' '.join(['usage: mi-nerfattack', *words]) in out.getvalue()\n"
         "print(*sys.modules, file=sys.stderr)"
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "usage: mi-nerfattack" in done.stdout
-    assert all(name in done.stdout for name in COMMANDS)
+    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+    assert done.stdout.count("\n") <= 50
     assert not HEAVY & set(done.stderr.split())
 
 
@@ -240,7 +243,7 @@ def start(body: str) -> subprocess.Popen:
         "    def run(self):\n"
         "        print('ready', flush=True)\n"
         f"        {body}\n"
-        "commands.COMMANDS['wait'] = Wait\n"
+        "commands.THEMES['start']['wait'] = Wait\n"
         "sys.exit(cli.main(['wait']))"
     )
     pipe = subprocess.PIPE
@@ -348,8 +351,8 @@ def test_doctor_compares_bundled_files(tmp_path):
 def test_flags_say_what_they_do_when_they_are_given(capsys):
     """A flag that is on by default would be told by what its absence does."""
     found = 0
-    for name, command in COMMANDS.items():
+    for words, command in each(COMMANDS):
         for item in dataclasses.fields(command):
-            assert item.default is not True, f"{name}: {item.name}"
+            assert item.default is not True, f"{words}: {item.name}"
             found += item.default is False
     assert found > 20

@@ -163,5 +163,7 @@ class BenchMatrix:
             rows = [f"{path.name}:surrogate:attack:0" for path in left]
             workers = [] if self.workers is None else ["--workers", str(self.workers)]
             if any(not (found[path] / METRICS).exists() for path in left):
-                run_command(["replay", str(sweep), *rows, "-o", str(remade), *workers])
+                run_command(
+                    ["reproduce", str(sweep), *rows, "-o", str(remade), *workers]
+                )
         return list(found.values())

@@ -23,7 +23,7 @@ class BenchSteering:
     folder: tyro.conf.Positional[Path] = Path("docs/table2")
     """Of a finished sweep, or a copy of its table."""
     cells: Path | None = None
-    """Folder of the sweep, or of a `mi-nerfattack replay -o` of some of its rows."""
+    """Folder of the sweep, or of a `mi-nerfattack reproduce -o` of some of its rows."""
     json: bool = False
     """Print a line of JSON for each place in place of the table."""
 
@@ -42,7 +42,7 @@ class BenchSteering:
         from mi_nerfattack import variant
         from mi_nerfattack.errors import InputError
         from mi_nerfattack.experiment.sweep.cell import folder_of
-        from mi_nerfattack.experiment.sweep.replay import read_replay
+        from mi_nerfattack.experiment.sweep.reproduce import read_replay
         from mi_nerfattack.experiment.sweep.table import RESULTS, read_table
         from mi_nerfattack.scenario.world import build_world
 

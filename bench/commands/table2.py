@@ -14,7 +14,7 @@ class BenchTable2:
     """Write the page of a sweep of scenes/table2.toml beside the paper's Table 2.
 
     OUTPUT gets README.md, and copies of results.parquet and summary.json, of which
-    `mi-nerfattack replay` repeats any row.
+    `mi-nerfattack reproduce` repeats any row.
     """
 
     folder: tyro.conf.Positional[Path]

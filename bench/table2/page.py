@@ -54,7 +54,7 @@ _RETRAIN = (
 _WHY = (
     "Why some of it is missed: [what the policy does](../bench.md#why-aims-are-missed)."
 )
-_REPLAY = "mi-nerfattack replay docs/table2 --rows 10  # any row comes back"
+_REPLAY = "mi-nerfattack reproduce docs/table2 --rows 10  # any row comes back"
 _BUDGETS = """\
 The same places and unseen starts, [budgets](../../scenes/budgets.toml) of four times as
 much: `gradient` as above, 24 iterations from one start; 96 from one; 24 from four each.

@@ -8,6 +8,8 @@ imported for ``--help``; import anything slow (torch, our own parts) inside run(
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from mi_nerfattack.commands.asset import Asset
@@ -27,8 +29,8 @@ from mi_nerfattack.commands.monitor import Monitor
 from mi_nerfattack.commands.overlay import OverlayCommand
 from mi_nerfattack.commands.refine import Refine
 from mi_nerfattack.commands.render import Render
-from mi_nerfattack.commands.replay import Replay
 from mi_nerfattack.commands.report import Report
+from mi_nerfattack.commands.reproduce import Reproduce
 from mi_nerfattack.commands.retrain import Retrain
 from mi_nerfattack.commands.serve_policy import ServePolicy
 from mi_nerfattack.commands.shared.result import Result
@@ -46,32 +48,61 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, type[Command]] = {
-    "doctor": Doctor,
-    "demo": Demo,
-    "render": Render,
-    "capture": Capture,
-    "fit": Fit,
-    "bake": Bake,
-    "asset": Asset,
-    "export": Export,
-    "train": Train,
-    "evaluate": Evaluate,
-    "check": Check,
-    "attack": Attack,
-    "sweep": Sweep,
-    "replay": Replay,
-    "transfer": Transfer,
-    "refine": Refine,
-    "retrain": Retrain,
-    "overlay": OverlayCommand,
-    "monitor": Monitor,
-    "drive": DriveCommand,
-    "serve-policy": ServePolicy,
-    "compare-drives": CompareDrives,
-    "calibrate": Calibrate,
-    "report": Report,
-    "view": View,
+@dataclass(frozen=True)
+class Group:
+    """Commands that belong together, called ``GROUP COMMAND``.
+
+    Attributes:
+        about: a sentence for the help.
+        commands: by name.
+    """
+
+    about: str
+    commands: Mapping[str, type[Command]]
+
+
+Commands = Mapping[str, "type[Command] | Group"]
+
+_CAR = Group(
+    "A small real car, or one in the simulated room, and an attacked box beside it.",
+    {
+        "calibrate": Calibrate,
+        "drive": DriveCommand,
+        "serve": ServePolicy,
+        "overlay": OverlayCommand,
+        "monitor": Monitor,
+        "compare": CompareDrives,
+    },
+)
+#: What can be called, by theme.
+THEMES: dict[str, Commands] = {
+    "start": {"doctor": Doctor, "demo": Demo},
+    "place": {"capture": Capture, "fit": Fit, "bake": Bake, "render": Render},
+    "object": {"asset": Asset, "export": Export},
+    "policy": {"train": Train, "evaluate": Evaluate, "retrain": Retrain},
+    "attack": {
+        "check": Check,
+        "attack": Attack,
+        "sweep": Sweep,
+        "transfer": Transfer,
+        "reproduce": Reproduce,
+        "refine": Refine,
+    },
+    "look": {"report": Report, "view": View},
+    "car": {"car": _CAR},
+}
+COMMANDS: dict[str, type[Command] | Group] = {
+    name: command for theme in THEMES.values() for name, command in theme.items()
 }
 
-__all__ = ["COMMANDS", "Command"]
+
+def each(commands: Commands) -> Iterator[tuple[tuple[str, ...], type[Command]]]:
+    """Yield each command, those of groups among them, with the words that call it."""
+    for name, item in commands.items():
+        if isinstance(item, Group):
+            yield from (((name, *words), one) for words, one in each(item.commands))
+        else:
+            yield (name,), item
+
+
+__all__ = ["COMMANDS", "THEMES", "Command", "Commands", "Group", "each"]

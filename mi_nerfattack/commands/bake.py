@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bake:
-    """Bake a scenario's field along its routes, for faster attacks and drives.
+    """Bake a field along its routes, for faster attacks and drives.
 
     The field is that of [scene], at its to_world, as the scenario's camera sees it from
     all routes of its file. The bricks stand in the scenario as scene.bricks, or in the

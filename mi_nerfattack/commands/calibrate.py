@@ -1,4 +1,4 @@
-"""``mi-nerfattack calibrate``: speed and steering of a car, by drives on the floor."""
+"""``mi-nerfattack car calibrate``: speed and steering of a car, measured on a floor."""
 
 from __future__ import annotations
 

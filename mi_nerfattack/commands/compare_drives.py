@@ -1,4 +1,4 @@
-"""``mi-nerfattack compare-drives``: real drives beside those of a run, and a test."""
+"""``mi-nerfattack car compare``: real drives beside those of a run, and a test."""
 
 from __future__ import annotations
 

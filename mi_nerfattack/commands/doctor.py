@@ -9,7 +9,7 @@ from mi_nerfattack.commands.shared.result import Result
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check the installation, and say what to do about each thing that is missing.
+    """Check the installation, and say what to do about what is missing.
 
     The exit code is 0 where the main job can run, else 1.
     """

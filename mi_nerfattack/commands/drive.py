@@ -1,4 +1,4 @@
-"""``mi-nerfattack drive``: a real car, or one in the simulated room."""
+"""``mi-nerfattack car drive``: a real car, or one in the simulated room."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class DriveCommand:
     """What is said below, as a file; its paths start from its folder."""
     policy: str | None = None
     """File as for evaluate, expert (by the tracked pose), or remote:HOST:PORT of
-    serve-policy. A TOML file with [policy] may also have the [camera] of training."""
+    car serve. A TOML file with [policy] may also have the [camera] of training."""
     control_unit: str | None = None
     """Of the policy: rad, a steering angle (default), or rad/s."""
     key: str | None = None

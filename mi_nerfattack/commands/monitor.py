@@ -1,4 +1,4 @@
-"""``mi-nerfattack monitor``: an attacked box on a monitor that follows a tracker."""
+"""``mi-nerfattack car monitor``: an attacked box on a monitor that has a tracker."""
 
 from __future__ import annotations
 

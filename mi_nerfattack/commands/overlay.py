@@ -1,4 +1,4 @@
-"""``mi-nerfattack overlay``: an attacked box in what a real camera recorded."""
+"""``mi-nerfattack car overlay``: an attacked box in what a real camera recorded."""
 
 from __future__ import annotations
 

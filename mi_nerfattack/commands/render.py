@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a Mitsuba scene with its own integrator: one frame, or a camera path.
+    """Render a Mitsuba scene: one frame, or a camera path.
 
     The suffix of --output says what is written: .exr (all channels, linear) or .png
     (colour, sRGB) for one frame; .mp4, or a folder of frame_0000.exr ... (a name

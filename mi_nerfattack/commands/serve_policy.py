@@ -1,4 +1,4 @@
-"""``mi-nerfattack serve-policy``: a policy for a car on another computer."""
+"""``mi-nerfattack car serve``: a policy for a car on another computer."""
 
 from __future__ import annotations
 

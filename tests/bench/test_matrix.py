@@ -81,7 +81,7 @@ class Commands:
 
     def __call__(self, words):
         self.given.append(words)
-        if words[0] == "replay":
+        if words[0] == "reproduce":
             for name in words[2 : words.index("-o")]:
                 path = self.remade / name.partition(":")[0]
                 files.make_folder(path)
@@ -130,7 +130,7 @@ def test_the_command_chooses_drives_and_writes(tmp_path, given):
     assert run(tmp_path) == 0
     again, first, *others = given.given
     assert again[:4] == [
-        "replay",
+        "reproduce",
         str(tmp_path / "sweep"),
         *(f"c{k}:{ROW}" for k in (8, 7)),
     ]

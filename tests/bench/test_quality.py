@@ -11,7 +11,7 @@ from bench.__main__ import main
 from bench.commands import quality
 from mi_nerfattack import cli
 from mi_nerfattack.experiment.sweep.grid import load_cells
-from mi_nerfattack.experiment.sweep.replay import read_replay
+from mi_nerfattack.experiment.sweep.reproduce import read_replay
 from mi_nerfattack.io import files
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -19,7 +19,7 @@ from mi_nerfattack.deploy.driving import policy_image
 from mi_nerfattack.deploy.registry import kinematic_vehicle
 from mi_nerfattack.deploy.surrogate.environment import SurrogateEnvironment
 from mi_nerfattack.errors import InputError
-from mi_nerfattack.experiment.sweep.replay import read_replay
+from mi_nerfattack.experiment.sweep.reproduce import read_replay
 from mi_nerfattack.experiment.sweep.table import RESULTS, read_table, write_table
 from mi_nerfattack.scenario.world import build_world
 from mi_nerfattack.vehicle.route.route import Route

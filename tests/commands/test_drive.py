@@ -1,4 +1,4 @@
-"""``mi-nerfattack drive`` in the simulated room."""
+"""``mi-nerfattack car drive`` in the simulated room."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mi_nerfattack.robot.drive.loop import Devices
 from mi_nerfattack.robot.drive.rig import Rig
 from mi_nerfattack.robot.drive.safety.judge import Cause
 
-SIMULATED = ["drive", "--policy", "expert", "--simulated", "--spp", "1"]
+SIMULATED = ["car", "drive", "--policy", "expert", "--simulated", "--spp", "1"]
 
 
 def test_a_drive_is_stated_driven_and_summed_up(tmp_path, variant, capsys):
@@ -78,7 +78,15 @@ def test_an_attacked_box_stands_in_what_the_policy_sees(
 @pytest.mark.slow
 def test_the_rooms_policy_stays_in_its_lane(tmp_path, variant, capsys):
     log = str(tmp_path / "drive.mcap")
-    words = ["drive", "--policy", "bundled:room.toml", "--simulated", "--spp", "1"]
+    words = [
+        "car",
+        "drive",
+        "--policy",
+        "bundled:room.toml",
+        "--simulated",
+        "--spp",
+        "1",
+    ]
     assert main([*words, "--duration-s", "24", "--log", log, "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["laps"] > 2 and figures["largest_error_m"] < 0.152
@@ -121,7 +129,7 @@ def test_a_drive_as_json(tmp_path, variant, capsys):
     ],
 )
 def test_what_cannot_be_driven(options, message, variant, capsys):
-    assert main(["drive", *options]) == 2
+    assert main(["car", "drive", *options]) == 2
     assert message in capsys.readouterr().err
 
 

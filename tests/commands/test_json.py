@@ -16,18 +16,19 @@ import pytest
 
 from bench import __main__ as bench
 from mi_nerfattack import cli
-from mi_nerfattack.commands import COMMANDS, Command
+from mi_nerfattack.commands import COMMANDS, Command, each
 from mi_nerfattack.commands.shared.result import Result
 
 WITHOUT_FIGURES = {
-    "monitor": "serves a page until Ctrl-C, and tells its address",
+    "car monitor": "serves a page until Ctrl-C, and tells its address",
     "view": "serves a page until Ctrl-C, or writes it; tells its address, or its path",
     "bench quality": "runs other commands, and shows what they print",
     "bench matrix": "runs another command, writes a page from it, and tells its path",
     "bench table2": "writes a page from a sweep's table, and tells its path",
     "bench methods": "writes a page from a sweep's table, and tells its path",
 }
-ALL = COMMANDS | {f"bench {name}": one for name, one in bench.COMMANDS.items()}
+ALL = {" ".join(words): one for words, one in each(COMMANDS)}
+ALL |= {f"bench {name}": one for name, one in bench.COMMANDS.items()}
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -69,7 +70,7 @@ def call(monkeypatch, capfd) -> Callable[..., tuple[int, str, str]]:
                 return Result({"share": share}, lambda: print("a half"), 1)
 
         commands: dict[str, type[Command]] = {"tell": Tell, "doctor": Tell}
-        code = cli.main(["tell", *words], commands)
+        code = cli.main(["tell", *words], {"": commands})
         sys.stdout.flush()
         return code, *capfd.readouterr()
 

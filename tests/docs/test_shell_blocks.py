@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 import tyro
 
-from mi_nerfattack.commands import COMMANDS
+from mi_nerfattack import cli
+from mi_nerfattack.commands import COMMANDS, each
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -85,9 +86,13 @@ CALLS = [
 
 @pytest.mark.parametrize("words", CALLS)
 def test_commands_parse(words):
-    name, *args = words
-    flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
-    assert tyro.cli(COMMANDS[name], args=args, config=flags) is not None
+    found = [(len(name), one) for name, one in each(COMMANDS) if begins(words, name)]
+    ((length, command),) = found
+    assert tyro.cli(command, args=words[length:], config=cli._STYLE) is not None
+
+
+def begins(words, name):
+    return tuple(words[: len(name)]) == name
 
 
 def test_every_block_is_run_or_has_a_reason():

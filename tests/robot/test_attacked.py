@@ -126,7 +126,7 @@ def test_a_monitor_follows_recorded_poses(run, tmp_path, capsys):
     told = ["--tracker", f"replay:{poses}", "--listen"]
 
     def monitor(*arguments) -> tuple[int, str, str]:
-        code = cli.main(["monitor", str(run), *map(str, arguments)])
+        code = cli.main(["car", "monitor", str(run), *map(str, arguments)])
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 
@@ -160,10 +160,10 @@ def test_overlay_of_recordings(run, tmp_path, capsys):
     write_video(tmp_path / "drive.mp4", green, 10)
     shutil.copy(tmp_path / "drive" / "transforms.json", tmp_path / "drive.json")
     for source, output in (("drive", "out"), ("drive.mp4", "out.mp4")):
-        words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
+        words = ["car", "overlay", tmp_path / source, run, "-o", tmp_path / output]
         assert cli.main([str(word) for word in words]) == 0, capsys.readouterr().err
         assert "3 frames with ball" in capsys.readouterr().out
-    words = ["overlay", tmp_path / "drive", run, "-o", tmp_path / "as", "--json"]
+    words = ["car", "overlay", tmp_path / "drive", run, "-o", tmp_path / "as", "--json"]
     assert cli.main([str(word) for word in words]) == 0
     told = {"output": str(tmp_path / "as"), "frames": 3, "object": "ball"}
     assert json.loads(capsys.readouterr().out) == told
@@ -190,7 +190,7 @@ def test_overlay_of_recordings(run, tmp_path, capsys):
         ("drive", "drive.mp4/b", "drive.mp4"),
     ):
         before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-        words = ["overlay", tmp_path / source, run, "-o", tmp_path / output]
+        words = ["car", "overlay", tmp_path / source, run, "-o", tmp_path / output]
         assert cli.main([str(word) for word in words]) == 2
         error = capsys.readouterr().err
         assert message in error and "Traceback" not in error, error
@@ -206,7 +206,7 @@ def test_an_interrupted_overlay_leaves_whole_frames_and_no_video(
     poses = np.stack([look_at(np.array([0.0, 0, 1]), np.array([9.0, 0, 1]))] * 4)
     frames = np.zeros((4, 32, 48, 3), np.uint8)
     write_transforms(tmp_path / "drive", frames, from_fov(48, 32, 60.0), poses, {})
-    words = ["overlay", tmp_path / "drive", run, "-o", tmp_path / output]
+    words = ["car", "overlay", tmp_path / "drive", run, "-o", tmp_path / output]
     number = signal.SIGINT if output == "out" else signal.SIGTERM
     with signalled("overlaying", number, at=2):
         assert cli.main([str(word) for word in words]) == 130
@@ -229,7 +229,7 @@ def test_a_signal_ends_a_monitor_at_work(run, tmp_path, capsys, monkeypatch, num
 
     monkeypatch.setattr(FollowServer, "_tell", send)
     address = f"127.0.0.1:{free_port()}"
-    words = ["monitor", run, "--tracker", f"replay:{poses}", "--listen", address]
+    words = ["car", "monitor", run, "--tracker", f"replay:{poses}", "--listen", address]
     assert cli.main([*map(str, words), "--face", "left"]) == 0
     out, err = capsys.readouterr()
     assert out.endswith("Ended\n") and "Traceback" not in err
@@ -249,7 +249,9 @@ def test_folders_without_times_have_the_runs_period(
     camera = from_fov(48, 32, 60.0)
     write_transforms(tmp_path / "drive", frames, camera, np.stack([pose] * 3), {})
     out = tmp_path / "a.mp4"
-    code = cli.main(["overlay", str(tmp_path / "drive"), str(run), "-o", str(out)])
+    code = cli.main(
+        ["car", "overlay", str(tmp_path / "drive"), str(run), "-o", str(out)]
+    )
     if period < 1e-3:
         assert code == 2 and "fps: " in capsys.readouterr().err
         assert not out.exists()

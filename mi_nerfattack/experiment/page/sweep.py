@@ -94,7 +94,7 @@ def _attacks(
                     np.mean([row["wheel_out_s"] for row in by_case[ATTACK]] or [0.0])
                 ),
                 "section": sections.get(cell),
-                "repeat": f"mi-nerfattack replay {shlex.quote(str(folder))} {name}",
+                "repeat": f"mi-nerfattack reproduce {shlex.quote(str(folder))} {name}",
             }
         )
     return found

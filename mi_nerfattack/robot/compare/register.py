@@ -37,7 +37,7 @@ def read_register(folder: Path) -> dict[str, Any] | None:
     document = files.read_json(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(
-            f"-o: {path}; is not of compare-drives (format {FORMAT!r}); choose another "
+            f"-o: {path}; is not of car compare (format {FORMAT!r}); choose another "
             "folder"
         )
     return document

@@ -1,4 +1,4 @@
-"""What ``mi-nerfattack drive`` is told, on the command line or by a TOML file."""
+"""What ``mi-nerfattack car drive`` is told, on the command line or by a TOML file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DriveConfig(Section):
 
     Attributes:
         policy: file, as for `evaluate`; "expert", which follows the route by the
-            tracked pose; or "remote:HOST:PORT", a policy that `serve-policy` serves.
+            tracked pose; or "remote:HOST:PORT", a policy that `car serve` serves.
         control_unit: of the policy: "rad" of a steering angle, or "rad/s".
         key: file of the key that both computers share.
         jpeg_quality: of frames to a remote policy; None sends them as they are.

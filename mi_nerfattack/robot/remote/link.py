@@ -69,7 +69,7 @@ class ZenohLink:
                     "another address of this computer or port"
                 ) from error
             raise DeviceLostError(
-                f"policy at {endpoint}: {reason}; start 'mi-nerfattack serve-policy' "
+                f"policy at {endpoint}: {reason}; start 'mi-nerfattack car serve' "
                 "there, and look to address, port and firewall"
             ) from error
 

@@ -52,7 +52,7 @@ class Delays:
 
 
 class RemotePilot(AbstractPilot):
-    """A policy behind ``mi-nerfattack serve-policy``.
+    """A policy behind ``mi-nerfattack car serve``.
 
     One frame is on its way at a time: the newest waits for the decision of the last,
     so that none grows old in the network.
@@ -148,7 +148,7 @@ class RemotePilot(AbstractPilot):
                 if self._clock() > until:
                     raise DeviceLostError(
                         f"policy at {self._endpoint}: no answer within {connect_s:g} "
-                        "s; what listens there is no 'mi-nerfattack serve-policy', or "
+                        "s; what listens there is no 'mi-nerfattack car serve', or "
                         "has another key"
                     )
                 if welcome:
@@ -201,7 +201,7 @@ class RemotePilot(AbstractPilot):
         if silent > self._lost_s:
             self._failure = (
                 f"policy at {self._endpoint}: silent for {silent:.2f} s; look to the "
-                "network, and whether 'mi-nerfattack serve-policy' runs there"
+                "network, and whether 'mi-nerfattack car serve' runs there"
             )
             raise DeviceLostError(self._failure)
 

@@ -64,7 +64,7 @@ def criteria(tmp_path):
 
 
 def call(capsys, *arguments) -> tuple[int, str, str]:
-    code = cli.main(["compare-drives", *map(str, arguments)])
+    code = cli.main(["car", "compare", *map(str, arguments)])
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 
@@ -187,7 +187,7 @@ def test_refused(run, criteria, tmp_path, capsys):
         (("--attack", paths["gap"]), "its pose moves by 2.4"),
         (("--attack", tmp_path / "none.mcap"), "does not exist"),
         (("--attack", good, "-o", old), "holds notes.txt, and no comparison"),
-        (("--attack", good, "-o", run), "is not of compare-drives"),
+        (("--attack", good, "-o", run), "is not of car compare"),
     ):
         where = () if "-o" in given else ("-o", out)
         code, told, err = call(capsys, run, criteria, *where, *given)

@@ -60,7 +60,14 @@ def test_it_arms_drives_and_brakes(tmp_path, number):
     files.write_text(tmp_path / "camera.toml", CAMERA)
     pad, port = Pad(tmp_path / "js0"), free_port()
     with StandIn(tmp_path / "car.jsonl") as vesc, tracked_car(port):
-        command = [sys.executable, "-m", "mi_nerfattack.cli", "drive", "--policy"]
+        command = [
+            sys.executable,
+            "-m",
+            "mi_nerfattack.cli",
+            "car",
+            "drive",
+            "--policy",
+        ]
         command += ["expert", "--speed-ms", "0.5", "--port", vesc.port]
         command += ["--tracker", f"vicon:127.0.0.1:{port}", "--enable", "js0"]
         command += ["--camera", "video:seen.mp4", "--camera-file", "camera.toml"]

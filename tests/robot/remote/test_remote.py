@@ -230,7 +230,7 @@ def test_a_policy_that_fails_is_told():
 
 def test_a_link_that_is_lost():
     endpoint = free_endpoint()
-    with pytest.raises(DeviceLostError, match="serve-policy' there, and look to"):
+    with pytest.raises(DeviceLostError, match="car serve' there, and look to"):
         connected(endpoint, connect_s=0.2)
     with serving(endpoint):
         with pytest.raises(InputError, match=f"--listen {endpoint}: .*in use"):

@@ -35,7 +35,7 @@ def test_a_server_of_its_own(tmp_path):
     key.write_text("0123456789abcdef" * 2)
     key.chmod(0o600)
     listen = f"127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "mi_nerfattack.cli", "serve-policy"]
+    command = [sys.executable, "-m", "mi_nerfattack.cli", "car", "serve"]
     command += [f"{code}:steer", "--kind", "callable", "--trust-code"]
     command += ["--listen", listen, "--key", str(key), "--route-goal", "2"]
     process = subprocess.Popen(
@@ -89,6 +89,6 @@ def test_refused(tmp_path, capsys):
         (("--size", 0, 4), "--size: (0, 4); width and height, 1 or more"),
         (("none.safetensors",), "none.safetensors"),
     ):
-        code = cli.main(["serve-policy", *map(str, given)])
+        code = cli.main(["car", "serve", *map(str, given)])
         out, err = capsys.readouterr()
         assert (code, out) == (2, "") and message in err, err

@@ -98,7 +98,15 @@ def test_an_arc_is_asked_for_until_it_is_right(monkeypatch, capsys):
 def test_what_was_measured_is_kept_until_it_is_fitted(tmp_path, capsys):
     output, kept = tmp_path / "car.toml", tmp_path / "car.toml.arcs.json"
     arcs = dict(zip(DRIVES, made_arcs(CENTRE, 0.7, 0.25), strict=True))
-    command = ["calibrate", "/dev/none", "-o", str(output), "--enable", "/dev/none"]
+    command = [
+        "car",
+        "calibrate",
+        "/dev/none",
+        "-o",
+        str(output),
+        "--enable",
+        "/dev/none",
+    ]
     command += ["--wheelbase-m", str(WHEELBASE_M)]
     assert read_arcs(kept) == {}
     write_arcs(kept, {"straight": arcs["straight"]})
@@ -188,7 +196,7 @@ def test_a_calibration_from_beginning_to_end(tmp_path, monkeypatch, capsys):
         person = Person(car)
         monkeypatch.setattr("builtins.input", person)
         monkeypatch.setattr(enable, "JoystickEnable", lambda *_: person)
-        arguments = ["calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
+        arguments = ["car", "calibrate", car.port, "-o", str(output), "--speed-ms", "1"]
         arguments += ["--calibration", str(begin), "--wheelbase-m", str(WHEELBASE_M)]
         assert cli.main([*arguments, "--json"]) == 0
     found = read_calibration(output)
@@ -213,7 +221,14 @@ def test_ctrl_c_brakes(tmp_path):
         StandIn(tmp_path / "log") as car,
         closing(Pad(tmp_path / "js0")) as pad,
     ):
-        command = [sys.executable, "-m", "mi_nerfattack.cli", "calibrate", car.port]
+        command = [
+            sys.executable,
+            "-m",
+            "mi_nerfattack.cli",
+            "car",
+            "calibrate",
+            car.port,
+        ]
         command += ["-o", str(output), "--enable", str(tmp_path / "js0")]
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
             assert process.stdin is not None and process.stdout is not None
@@ -245,16 +260,24 @@ def test_nothing_moves_before_somebody_answers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("builtins.input", answer)
     pad = str(tmp_path / "js0")
     with StandIn(tmp_path / "log") as car, closing(Pad(tmp_path / "js0")):
-        command = ["calibrate", car.port, "-o", str(output), "--enable"]
+        command = ["car", "calibrate", car.port, "-o", str(output), "--enable"]
         assert cli.main([*command, f"{pad}7"]) == 2
         assert "js07: does not exist" in capsys.readouterr().err
         assert cli.main([*command, pad]) == 2
         assert "run it in a terminal" in capsys.readouterr().err
         assert "command 8" not in {line["event"] for line in car.log()}
         output.write_text("")
-        assert cli.main(["calibrate", car.port, "-o", str(output)]) == 2
+        assert cli.main(["car", "calibrate", car.port, "-o", str(output)]) == 2
         assert "exists; choose another" in capsys.readouterr().err
-        wrong = ["calibrate", car.port, "-o", str(tmp_path / "b"), "--speed-ms", "0"]
+        wrong = [
+            "car",
+            "calibrate",
+            car.port,
+            "-o",
+            str(tmp_path / "b"),
+            "--speed-ms",
+            "0",
+        ]
         assert cli.main(wrong) == 2
         assert "--speed-ms: 0.0; more than 0.195, at" in capsys.readouterr().err
         wrong[-2:] = ["--distance-m", "50"]

@@ -12,13 +12,13 @@ from helpers.faults import signalled
 from helpers.page_reader import PageReader
 
 from mi_nerfattack import cli
-from mi_nerfattack.commands.replay import Replay
+from mi_nerfattack.commands.reproduce import Reproduce
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment.page import sweep as page_sweep
 from mi_nerfattack.experiment.page.folders import read_folders
 from mi_nerfattack.experiment.sweep.cell import folder_of
 from mi_nerfattack.experiment.sweep.grid import load_cells
-from mi_nerfattack.experiment.sweep.replay import (
+from mi_nerfattack.experiment.sweep.reproduce import (
     compare_rows,
     read_replay,
     sentences,
@@ -70,7 +70,7 @@ def command(monkeypatch, capsys):
     monkeypatch.setattr(workers, "Processes", lambda *_, **__: InThisProcess())
 
     def run(*words):
-        code = cli.main(["replay", *map(str, words)])
+        code = cli.main(["reproduce", *map(str, words)])
         return code, capsys.readouterr().out
 
     return run
@@ -155,7 +155,7 @@ def test_the_sweep_on_one_page(swept, tmp_path):
     assert "First drives of all attacks: line, gradient, n = 1" in shown
     assert any("as the attack left it" in alt for alt in shown)
     name = f"{cell.id}:surrogate:attack:0"
-    assert f"mi-nerfattack replay {folder} {name}" in reader.text
+    assert f"mi-nerfattack reproduce {folder} {name}" in reader.text
     assert "failed: no room" in reader.text
     assert f"2 of 2 cells have no folder in {copy / 'cells'}" in reader.text
 
@@ -206,7 +206,7 @@ def test_rows_that_cannot_be_repeated(swept, command, scenario_folder, tmp_path)
     assert command(copy)[0] == 2
     assert command(folder, 0, "-o", folder)[0] == 2
     with pytest.raises(InputError, match="rows of other cells, such as other"):
-        Replay(folder, ("0",), output=copy).run()
+        Reproduce(folder, ("0",), output=copy).run()
     assert command(copy, 0, "--drives-only", "-o", tmp_path / "out")[0] == 2
     route = scenario_folder / "routes.json"
     text = route.read_text()

@@ -1,4 +1,4 @@
-"""``mi-nerfattack replay``: rows of a sweep's table, repeated."""
+"""``mi-nerfattack reproduce``: rows of a sweep's table, repeated."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mi_nerfattack.commands.shared.result import Result
 
 
 @dataclass(frozen=True)
-class Replay:
+class Reproduce:
     """Repeat rows of a sweep's table, and say by how much they differ.
 
     The whole cell of each row is done anew, the attack first, as the sweep did it; the
@@ -55,7 +55,7 @@ class Replay:
         )
         from mi_nerfattack.commands.shared.options import check_positive
         from mi_nerfattack.errors import InputError
-        from mi_nerfattack.experiment.sweep.replay import (
+        from mi_nerfattack.experiment.sweep.reproduce import (
             compare_rows,
             read_replay,
             sentences,
@@ -66,7 +66,7 @@ class Replay:
         from mi_nerfattack.system.workers import Processes
 
         if self.rows < 0 or not (self.row or self.rows):
-            raise InputError("replay: no row; give ROW, or --rows 1 or more")
+            raise InputError("reproduce: no row; give ROW, or --rows 1 or more")
         check_positive(self, "cores")
         if self.output is not None:
             files.check_folder(self.output)
