@@ -28,7 +28,7 @@ from mi_nerfattack.commands.fit import Fit
 from mi_nerfattack.commands.monitor import Monitor
 from mi_nerfattack.commands.overlay import OverlayCommand
 from mi_nerfattack.commands.refine import Refine
-from mi_nerfattack.commands.render import Render
+from mi_nerfattack.commands.render import RenderFrame, RenderPath
 from mi_nerfattack.commands.report import Report
 from mi_nerfattack.commands.reproduce import Reproduce
 from mi_nerfattack.commands.retrain import Retrain
@@ -74,10 +74,14 @@ _CAR = Group(
         "compare": CompareDrives,
     },
 )
+_RENDER = Group(
+    "Render a Mitsuba scene: one frame, or a camera path.",
+    {"frame": RenderFrame, "path": RenderPath},
+)
 #: What can be called, by theme.
 THEMES: dict[str, Commands] = {
     "start": {"doctor": Doctor, "demo": Demo},
-    "place": {"capture": Capture, "fit": Fit, "bake": Bake, "render": Render},
+    "place": {"capture": Capture, "fit": Fit, "bake": Bake, "render": _RENDER},
     "object": {"asset": Asset, "export": Export},
     "policy": {"train": Train, "evaluate": Evaluate, "retrain": Retrain},
     "attack": {

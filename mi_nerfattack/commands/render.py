@@ -19,18 +19,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Render:
-    """Render a Mitsuba scene: one frame, or a camera path.
-
-    The suffix of --output says what is written: .exr (all channels, linear) or .png
-    (colour, sRGB) for one frame; .mp4, or a folder of frame_0000.exr ... (a name
-    without suffix), for a path.
-    """
+class _Render:
+    """What frames and paths have in common."""
 
     scene: tyro.conf.Positional[str]
     """Scene file (.xml), or bundled:FILE."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """.exr, .png, .mp4 or a folder."""
+    """What is written."""
     sensor: int = 0
     """Which of the scene's sensors, from 0."""
     spp: int | None = None
@@ -45,73 +40,16 @@ class Render:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")
     ] = ()
     """NAME=VALUE for a <default> of the scene; may be repeated."""
-    path: Path | None = None
-    """Camera path: transforms.json (OpenGL camera to world, images not needed)."""
-    route: str | None = None
-    """Camera path: drive this route of --routes at its speed."""
-    routes: str | None = None
-    """Routes file (.json), or bundled:FILE."""
-    mount: tuple[float, float, float] = (1.4, 0.5, 6.0)
-    """With --route: camera's height and place ahead (metres), pitch down (degrees)."""
-    fps: float = 25.0
-    """Frames per second of .mp4 and of --route."""
-    skip_existing: bool = False
-    """Continue: keep the frames that are there, after checking what they show."""
     json: bool = False
     """End with one line of JSON in place of the sentences."""
 
-    def run(self) -> Result:
-        """Render and write."""
-        from mi_nerfattack import variant
+    def _renderer(self) -> FrameRenderer:
         from mi_nerfattack.render.pathtrace.frames import FrameRenderer
-        from mi_nerfattack.render.pathtrace.sequence import Shot
         from mi_nerfattack.scenes import resolve
 
-        is_path = self.path is not None or self.route is not None
-        self._check_output(is_path)
-        variant.ensure()
-        poses = self._poses() if is_path else None
-        renderer = FrameRenderer(
-            resolve(self.scene),
-            self.sensor,
-            self.spp,
-            self._parameters(),
-            self.size,
+        return FrameRenderer(
+            resolve(self.scene), self.sensor, self.spp, self._parameters(), self.size
         )
-        if poses is None:
-            return self._run_frame(renderer)
-        shot = Shot(renderer, poses, self.seed, self.precision, self.skip_existing)
-        return self._run_path(shot)
-
-    def _check_output(self, is_path: bool) -> None:
-        from mi_nerfattack.errors import InputError
-        from mi_nerfattack.io import files
-
-        suffix = self.output.suffix.lower()
-        if self.path is not None and self.route is not None:
-            raise InputError("--path, --route: both given; give one camera path")
-        if (self.route is None) != (self.routes is None):
-            raise InputError("--route, --routes: one without the other; give both")
-        if is_path and suffix in (".exr", ".png"):
-            raise InputError(
-                f"{self.output}: one image cannot hold a camera path; give .mp4, or "
-                "the name of a folder"
-            )
-        if is_path:
-            if suffix not in ("", ".mp4") and not self.output.is_dir():
-                raise InputError(
-                    f"{self.output}: unknown suffix {suffix!r}; give .mp4, or the name "
-                    "of a folder"
-                )
-            return
-        if suffix not in (".exr", ".png"):
-            raise InputError(
-                f"{self.output}: one frame is written as .exr or .png; for .mp4 or a "
-                "folder of frames give --path or --route"
-            )
-        if self.skip_existing:
-            raise InputError("--skip-existing: there is one frame; leave it out")
-        files.check_writable(self.output)
 
     def _parameters(self) -> dict[str, str]:
         from mi_nerfattack.errors import InputError
@@ -124,19 +62,27 @@ class Render:
             result[name] = value
         return result
 
-    def _poses(self) -> np.ndarray:
-        from mi_nerfattack.capture.camera_path import read_path, route_path
-        from mi_nerfattack.render.camera.intrinsics import CameraMount
-        from mi_nerfattack.scenes import resolve
-        from mi_nerfattack.vehicle.route.route import Route
 
-        if self.path is not None:
-            return read_path(self.path)
-        assert self.route is not None and self.routes is not None
-        route = Route.from_file(resolve(self.routes), self.route)
-        return route_path(route, CameraMount(*self.mount), self.fps)
+@dataclass(frozen=True)
+class RenderFrame(_Render):
+    """Render one frame: .exr (all channels, linear) or .png (colour, sRGB)."""
 
-    def _run_frame(self, renderer: FrameRenderer) -> Result:
+    def run(self) -> Result:
+        """Render and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io import files
+
+        if self.output.suffix.lower() not in (".exr", ".png"):
+            raise InputError(
+                f"{self.output}: one frame is written as .exr or .png; for .mp4 or a "
+                "folder of frames use 'mi-nerfattack render path'"
+            )
+        files.check_writable(self.output)
+        variant.ensure()
+        return self._write(self._renderer())
+
+    def _write(self, renderer: FrameRenderer) -> Result:
         from mi_nerfattack.render.pathtrace.frames import write_frame
 
         start = time.monotonic()
@@ -163,7 +109,74 @@ class Render:
 
         return Result(document, show)
 
-    def _run_path(self, shot: Shot) -> Result:
+
+@dataclass(frozen=True)
+class RenderPath(_Render):
+    """Render a camera path: a video (.mp4), or a folder of frame_0000.exr and so on.
+
+    The same command continues where it was stopped.
+    """
+
+    path: Path | None = None
+    """Camera path: transforms.json (OpenGL camera to world, images not needed)."""
+    route: str | None = None
+    """Camera path: drive this route of --routes at its speed."""
+    routes: str | None = None
+    """Routes file (.json), or bundled:FILE."""
+    mount: tuple[float, float, float] = (1.4, 0.5, 6.0)
+    """With --route: camera's height and place ahead (metres), pitch down (degrees)."""
+    fps: float = 25.0
+    """Frames per second of .mp4 and of --route."""
+    force: bool = False
+    """Render frames that are there again, whatever they show."""
+
+    def run(self) -> Result:
+        """Render and write."""
+        from mi_nerfattack import variant
+        from mi_nerfattack.render.pathtrace.sequence import Shot
+
+        self._check()
+        variant.ensure()
+        poses = self._poses()
+        renderer = self._renderer()
+        shot = Shot(renderer, poses, self.seed, self.precision, self.force)
+        return self._write(shot)
+
+    def _check(self) -> None:
+        from mi_nerfattack.errors import InputError
+        from mi_nerfattack.io import files
+
+        suffix = self.output.suffix.lower()
+        if (self.path is None) == (self.route is None):
+            raise InputError("--path, --route: give one of both, a camera path")
+        if (self.route is None) != (self.routes is None):
+            raise InputError("--route, --routes: one without the other; give both")
+        if suffix in (".exr", ".png"):
+            raise InputError(
+                f"{self.output}: one image cannot hold a camera path; give .mp4, or "
+                "the name of a folder"
+            )
+        if suffix not in ("", ".mp4") and not self.output.is_dir():
+            raise InputError(
+                f"{self.output}: unknown suffix {suffix!r}; give .mp4, or the name "
+                "of a folder"
+            )
+        check = files.check_writable if suffix == ".mp4" else files.check_folder
+        check(self.output)
+
+    def _poses(self) -> np.ndarray:
+        from mi_nerfattack.capture.camera_path import read_path, route_path
+        from mi_nerfattack.render.camera.intrinsics import CameraMount
+        from mi_nerfattack.scenes import resolve
+        from mi_nerfattack.vehicle.route.route import Route
+
+        if self.path is not None:
+            return read_path(self.path)
+        assert self.route is not None and self.routes is not None
+        route = Route.from_file(resolve(self.routes), self.route)
+        return route_path(route, CameraMount(*self.mount), self.fps)
+
+    def _write(self, shot: Shot) -> Result:
         from mi_nerfattack.commands.shared.progress import StageBars
         from mi_nerfattack.render.pathtrace.sequence import (
             render_folder,
@@ -191,7 +204,7 @@ class Render:
                 if written:
                     bars.say(
                         f"{written} of {count} frames are in {folder}; the same "
-                        "command with --skip-existing continues"
+                        "command continues"
                     )
                 raise
         width, height = shot.renderer.size_px

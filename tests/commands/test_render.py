@@ -33,7 +33,9 @@ def run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def call(line: str) -> tuple[int, str, str]:
-        code = cli.main(["render", *shlex.split(line)])
+        words = shlex.split(line)
+        mode = "path" if {"--path", "--route"} & {*words} else "frame"
+        code = cli.main(["render", mode, *words])
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 
@@ -172,12 +174,12 @@ def test_interrupted_path_is_continued(run, interrupted, output, folder):
     line = f"scene.xml --path path.json -o {output}"
     code, _, err = run(line)
     assert code == cli.EXIT_INTERRUPTED
-    assert f"2 of 3 frames are in {folder}" in err and "--skip-existing" in err
+    assert f"2 of 3 frames are in {folder}" in err
     kept = sorted(Path(folder).iterdir())
     assert [path.name for path in kept] == ["frame_0000.exr", "frame_0001.exr"]
     assert not Path("a.mp4").exists()
     before = [path.read_bytes() for path in kept] if output == "out" else []
-    assert run(f"{line} --skip-existing")[0] == 0
+    assert run(line)[0] == 0
     assert interrupted == [0, 1, 2, 2]  # the seeds: two frames were kept
     if output == "out":
         assert [path.read_bytes() for path in kept] == before
@@ -204,18 +206,20 @@ def test_files_beside_the_frames_of_a_video_stay(run):
 )
 def test_frames_of_something_else_are_not_continued(run, change, key):
     assert run("scene.xml --path path.json -o out")[0] == 0
-    code, _, err = run(f"scene.xml --path path.json -o out --skip-existing {change}")
+    code, _, err = run(f"scene.xml --path path.json -o out {change}")
     assert code == 2 and "out/frame_0000.exr: belongs to" in err
     assert f"\n  {key}: " in err
 
 
 def test_changed_scene_and_damaged_frame_are_not_continued(run):
-    line = "scene.xml --path path.json -o out --skip-existing"
+    line = "scene.xml --path path.json -o out"
     assert run(line)[0] == 0
     text = Path("scene.xml").read_text()
     Path("scene.xml").write_text(text.replace("0.25", "0.26"))
     assert "  digests: " in run(line)[2]
+    assert run(f"{line} --force")[0] == 0
     Path("scene.xml").write_text(text)
+    assert run(f"{line} --force")[0] == 0
     Path("out/frame_0002.exr").write_bytes(b"half")
     assert "out/frame_0002.exr: not an EXR file" in run(line)[2]
 
@@ -237,9 +241,9 @@ def test_changed_scene_and_damaged_frame_are_not_continued(run):
         ("scene.xml -o a.exr --set spp=x", r"could not parse integer"),
         ("scene.xml -o none/a.exr", r"none/a.exr: does not exist"),
         ("scene.xml -o .", r": one frame is written as .exr or .png"),
-        ("scene.xml -o a.mp4", r"a.mp4: one frame is .*--path or --route"),
+        ("scene.xml -o a.mp4", r"a.mp4: one frame is .*'mi-nerfattack render path'"),
         ("scene.xml -o a.jpg", r"a.jpg: one frame is written as .exr or .png"),
-        ("scene.xml -o a.exr --skip-existing", r"--skip-existing: there is one"),
+        ("scene.xml -o a --route u --path path.json", r"--path, --route: give one"),
         ("scene.xml -o a.exr --path path.json", r"a.exr: one image cannot hold"),
         ("scene.xml -o a.avi --path path.json", r"a.avi: unknown suffix '.avi'"),
         ("scene.xml -o out --path none.json", r"none.json: does not exist"),
@@ -302,7 +306,7 @@ def test_full_disk_keeps_whole_frames(run, monkeypatch, output):
     monkeypatch.setattr(files.os, "write", full)
     code, _, err = run(f"scene.xml --path path.json -o {output}")
     assert code == 2 and "no space left on the disk; free some" in err
-    assert "2 of 3 frames are in" in err and "--skip-existing" in err
+    assert "2 of 3 frames are in" in err
     names = {path.name for path in Path().rglob("*") if path.is_file()}
     names -= {"scene.xml", "path.json", "routes.json"}
     assert names == {"frame_0000.exr", "frame_0001.exr"}
@@ -328,13 +332,13 @@ def test_a_second_process_is_refused(run, output):
 
 def test_a_killed_path_is_continued(run, tmp_path):
     """Its whole frames stay, and what it left of another one is removed."""
-    words = "render scene.xml --path path.json -o out".split()
+    words = "render path scene.xml --path path.json -o out".split()
     kill(words, tmp_path, "frame_0001")
     names = [path.name for path in Path("out").iterdir()]
     assert len(names) == 2 and "frame_0000.exr" in names
     first = Path("out/frame_0000.exr")
     written = first.stat().st_mtime_ns
-    assert run(f"{' '.join(words[1:])} --skip-existing")[0] == 0
+    assert run(" ".join(words[2:]))[0] == 0
     assert first.stat().st_mtime_ns == written
     names = sorted(path.name for path in Path("out").iterdir())
     assert names == [f"frame_000{i}.exr" for i in range(3)]

@@ -22,10 +22,10 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TUTORIALS = sorted((ROOT / "docs/tutorials").glob("*.md"))
 RUN = {
-    "mi-nerfattack render scenes/intersection/field.xml -o hydrant.exr",
-    "mi-nerfattack render scenes/intersection/field.xml -o hydrant.png \\",
-    "mi-nerfattack render scenes/intersection/field.xml -o by_depth.exr \\",
-    "mi-nerfattack render scenes/intersection/field.xml -o lit.png --sensor 1 "
+    "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.exr",
+    "mi-nerfattack render frame scenes/intersection/field.xml -o hydrant.png \\",
+    "mi-nerfattack render frame scenes/intersection/field.xml -o by_depth.exr \\",
+    "mi-nerfattack render frame scenes/intersection/field.xml -o lit.png --sensor 1 "
     "--set relit=true",
 }
 # Why the other blocks of a page are not run.

@@ -21,7 +21,7 @@ from mi_nerfattack.render.camera.conventions import (
     mitsuba_to_opencv,
     opencv_to_mitsuba,
 )
-from mi_nerfattack.render.pathtrace.load import load_scene
+from mi_nerfattack.render.pathtrace.load import load_scene, named_files
 from mi_nerfattack.render.pathtrace.metadata import describe_lens, frame_metadata
 
 SUFFIXES = (".exr", ".png")
@@ -111,6 +111,8 @@ class FrameRenderer:
         self._names: list[str] | None = None
         self._lens = _describe_camera(self.sensor)
         self._digests = {"scene": files.sha256(self.path)}
+        for name, file in named_files(self.path).items():
+            self._digests[name] = files.sha256(file)
         self._origin = {
             "scene": self.path.name,
             "scene_parameters": dict(sorted((parameters or {}).items())),

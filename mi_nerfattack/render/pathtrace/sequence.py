@@ -40,15 +40,16 @@ class Shot:
         camera_to_world: (n, 4, 4), OpenCV axes.
         seed: of the first pose; frame i has `seed + i`, modulo 2^32.
         precision: of colour and opacity in the files.
-        skip_existing: keep frames that are there, if they were rendered from the same
-            scene, pose, camera, samples, seed and variant.
+        anew: render frames that are there again; by default they are kept, and must
+            have been rendered from the same files, pose, camera, samples, seed and
+            variant.
     """
 
     renderer: FrameRenderer
     camera_to_world: np.ndarray
     seed: int = 0
     precision: Precision = "half"
-    skip_existing: bool = False
+    anew: bool = False
 
 
 def frame_path(folder: str | Path, index: int) -> Path:
@@ -67,8 +68,7 @@ def render_folder(
 
     Args:
         shot: what to render.
-        folder: made if needed; frames that are there are replaced, or kept as
-            `Shot.skip_existing` says.
+        folder: made if needed; frames that are there are kept, see `Shot.anew`.
         progress: called with (frames done, all frames, whether the last one was kept).
 
     Returns:
@@ -135,7 +135,7 @@ def _render(
     files.check_writable(paths[0])
     for i, (path, pose) in enumerate(zip(paths, shot.camera_to_world, strict=True)):
         seed = (shot.seed + i) % 2**32
-        kept = shot.skip_existing and path.is_file()
+        kept = path.is_file() and not shot.anew
         if kept:
             check_same(path, shot.renderer.metadata(pose, seed))
         else:
@@ -150,7 +150,7 @@ def check_same(path: str | Path, expected: dict[str, str]) -> None:
     present = exr.read_metadata(path)
     kept = {key: present[key] for key in _COMPARED if key in present}
     found = differences(kept, {key: expected[key] for key in _COMPARED})
-    refuse(path, found, "render without --skip-existing, or to another folder")
+    refuse(path, found, "render all anew (--force), or to another folder")
 
 
 def _read_srgb(paths: list[Path]) -> Iterator[np.ndarray]:

@@ -158,7 +158,9 @@ def test_metadata_tell_camera_pose_and_origin(tmp_path):
     assert {values.dtype for values in pixels.values()} == {np.dtype(np.float32)}
     assert header["scene"] == "scene.xml"
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert json.loads(header["digests"]) == {"scene": digest}
+    shown = hashlib.sha256((tmp_path / "box.safetensors").read_bytes()).hexdigest()
+    digests = {"scene": digest, "box.safetensors": shown}
+    assert json.loads(header["digests"]) == digests
     assert json.loads(header["scene_parameters"]) == {"spp": "2"}
     assert (header["spp"], header["seed"]) == ("5", "3")
     assert header["variant"] == "llvm_ad_rgb"
