@@ -41,7 +41,7 @@ def thinned(
     if not output.is_file():
         own = files.make_folder(work / f"every-{every}")
         _write(folder, own, every)
-        words = ["fit", str(own), "-o", str(output), "--network", "small", "--resume"]
+        words = ["fit", str(own), "-o", str(output), "--network", "small"]
         run_command([*words, "--steps", str(steps), "--long-edge", str(long_edge)])
     fitted = np.zeros(len(whole), bool)
     fitted[np.delete(kept, held_out(len(kept)))] = True

@@ -183,7 +183,7 @@ def compare_fits(work: Path, steps: int, long_edge: int) -> dict[str, float]:
             names = [f"../../posed/{image}" for image in found.names]
             write_poses(folder / "transforms.json", names, cameras, poses[side], extra)
             words = ["fit", str(folder), "-o", str(output), "--network", "small"]
-            words += ["--long-edge", str(long_edge), "--steps", str(steps), "--resume"]
+            words += ["--long-edge", str(long_edge), "--steps", str(steps)]
             run_command(words)
         scores = files.read_json(output.with_suffix(".report") / "metrics.json")
         result[f"{name}_psnr_db"] = scores["psnr_heldout_db"]

@@ -11,6 +11,7 @@ import difflib
 import errno
 import inspect
 import os
+import shlex
 import sys
 import textwrap
 import traceback
@@ -61,8 +62,9 @@ def main(
             return code
     except NerfAttackError as err:
         return _fail(f"error: {err}", EXIT_INPUT, debug)
-    except KeyboardInterrupt:
-        return _fail("interrupted", EXIT_INTERRUPTED, debug)
+    except KeyboardInterrupt as err:
+        told = f"interrupted{err if isinstance(err, _Interrupted) else ''}"
+        return _fail(told, EXIT_INTERRUPTED, debug)
     except MemoryError as err:
         advice = "give fewer or smaller images, cells or views"
         return _fail(f"error: not enough memory: {err}; {advice}", EXIT_INPUT, debug)
@@ -91,6 +93,10 @@ def main(
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
 
 
+class _Interrupted(KeyboardInterrupt):
+    """What ended a command that goes on when it is given again, and how to."""
+
+
 def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int:
     if arguments == ["--version"]:
         print(f"{prog} {mi_nerfattack.__version__}")
@@ -115,6 +121,11 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
         if not isinstance(stop.__context__, BrokenPipeError):
             raise
         raise stop.__context__ from None  # rich ends the process by itself
+    except BaseException as err:
+        if not (is_interrupt(err) and getattr(command, "continues", False)):
+            raise
+        again = f"{prog} {shlex.join(arguments)}"
+        raise _Interrupted(f"; to go on, give it again:\n{again}") from err
 
 
 def _one_of(commands: Commands) -> Any:

@@ -108,6 +108,15 @@ def test_interruption_is_code_130(run, what):
     assert run("try", "--what", what) == (130, "", "mi-nerfattack: interrupted\n")
 
 
+def test_the_last_line_of_an_interruption_is_the_command_that_goes_on(run, monkeypatch):
+    monkeypatch.setattr(Try, "continues", True, raising=False)
+    code, _, err = run("try", "--what", "interrupt")
+    *_, first, last = err.splitlines()
+    assert code == 130
+    assert first == "mi-nerfattack: interrupted; to go on, give it again:"
+    assert last == "mi-nerfattack try --what interrupt"
+
+
 def test_sigterm_is_an_interruption_and_the_handler_is_put_back(run):
     before = signal.getsignal(signal.SIGTERM)
     code, _, err = run("try", "--what", "terminate")

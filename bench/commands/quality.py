@@ -80,7 +80,7 @@ class BenchQuality:
             words[1] = str(views)
             words[words.index("-o") + 1] = str(output)
             words[words.index("--steps") + 1] = str(steps)
-            found.append((output, [*words, "--resume"]))
+            found.append((output, words))
         return found
 
     def _grid(self, folder: Path) -> str:

@@ -126,5 +126,5 @@ def run_job(folder: Path, output: Path, writer: int) -> None:
     scenario, text = load_scenario(folder / "scenario.toml")
     policy = TorchPolicy(PilotNet.load(folder / "policy.safetensors"))
     with one_thread():
-        Job(scenario, text, policy, output, tell).run(resume=True)
+        Job(scenario, text, policy, output, tell).run()
     json.loads(files.read_text(output / "metrics.json"))

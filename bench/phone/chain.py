@@ -72,7 +72,7 @@ def fit(folder: Path, steps: int) -> dict[str, Any]:
     output = folder / f"field-{steps}.safetensors"
     if not output.is_file():
         words = ["fit", str(folder / "posed"), "-o", str(output), "--network", "small"]
-        words += ["--steps", str(steps), "--exposure", "--no-sky", "--resume"]
+        words += ["--steps", str(steps), "--exposure", "--no-sky"]
         run_command(words)
     scores = files.read_json(output.with_suffix(".report") / "metrics.json")
     images, renderer = read_images(folder / "posed"), FieldRenderer(load_field(output))

@@ -41,7 +41,10 @@ from mi_nerfattack.commands.view import View
 
 
 class Command(Protocol):
-    """What the command line calls after it has parsed the arguments."""
+    """What the command line calls after it has parsed the arguments.
+
+    One that goes on where it was interrupted also has `continues`, which is true.
+    """
 
     def run(self) -> int | Result:
         """Do the work and return the exit code, or the figures with it."""

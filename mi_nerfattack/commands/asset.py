@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -26,8 +26,10 @@ class Asset:
     The views are rendered from a mesh or a cube, or read from a folder, as Blender's
     synthetic scenes have them. The object is centred in x and y and stands on z = 0,
     unless --bounds is given. Every 8th view is held out and scored. An interrupted fit
-    leaves a checkpoint; the same command with --resume goes on from there.
+    leaves a checkpoint; the same command goes on from there.
     """
+
+    continues: ClassVar[bool] = True
 
     source: tyro.conf.Positional[str]
     """glTF (.glb, .gltf), OBJ or PLY; a folder with RGBA images and poses, as fit reads
@@ -65,8 +67,8 @@ class Asset:
     """Steps of the optimiser; 600, or 1000 for a folder, which has no depth."""
     budget_minutes: float | None = None
     """End the fit after this time."""
-    resume: bool = False
-    """Continue an interrupted fit from its checkpoint, beside the output."""
+    force: bool = False
+    """Start again, whatever an interrupted fit left beside the output."""
     min_weight: float = 0.02
     """Cells that give no ray of the views this share of its colour are emptied: more of
     them make a smaller file, and leave out what is seen through."""
@@ -81,7 +83,7 @@ class Asset:
         """Render or read the views, fit, score and write."""
         from mi_nerfattack.commands.shared.fit_report import begun_fit
 
-        with begun_fit(self.output, self.resume) as checkpoint:
+        with begun_fit(self.output, self.force) as checkpoint:
             return self._fit(checkpoint)
 
     def _fit(self, checkpoint: Path) -> Result:
@@ -99,7 +101,6 @@ class Asset:
                 self._options(found.depth is not None),
                 partial(show_fit, bars),
                 checkpoint,
-                self.resume,
             )
         provenance = {
             "source": Path(self.source).name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -21,15 +21,14 @@ class Attack:
     everything to a run folder.
     """
 
+    continues: ClassVar[bool] = True
+
     scenario: tyro.conf.Positional[Path]
     """Scenario file (TOML)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Run folder, new or empty."""
-    resume: bool = False
-    """Continue an interrupted attack from what it left in the run folder; start one
-    if it left nothing."""
+    """Run folder: new, or of the same attack, which then goes on."""
     force: bool = False
-    """With --resume: continue although scenario, files or versions have changed."""
+    """Go on although scenario, files or versions have changed."""
     anyway: bool = False
     """Attack although the checks before find that it would prove nothing: the policy
     leaves its lane by itself, an object is not in view, stands on the lane, in a wall,
@@ -50,8 +49,6 @@ class Attack:
         from mi_nerfattack.commands.shared.run_scenario import run_scenario
         from mi_nerfattack.errors import InputError
 
-        if self.force and not self.resume:
-            raise InputError("--force: says how to resume; give it with --resume")
         if isinstance(self.frames, int) and self.frames < 1:
             raise InputError(f"--frames: {self.frames}; all, worst, or at least 1")
         if self.no_pictures and self.frames is not None:
@@ -61,7 +58,6 @@ class Attack:
         return run_scenario(
             self.scenario,
             self.output,
-            self.resume,
             force=self.force,
             anyway=self.anyway,
             frames=None if self.no_pictures else self.frames or 3,

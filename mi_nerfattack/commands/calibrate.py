@@ -7,7 +7,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -32,6 +32,8 @@ class Calibrate:
     is held; letting it go brakes, as Ctrl-C does. What was measured is kept beside the
     output until that is written: the same command goes on there.
     """
+
+    continues: ClassVar[bool] = True
 
     port: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PORT")]
     """Serial port of the VESC, such as /dev/ttyACM0."""

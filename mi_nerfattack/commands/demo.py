@@ -21,7 +21,7 @@ class Demo:
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Run folder, new or empty; runs/demo-DATE-TIME by default."""
+    """Run folder, new or of an interrupted demo; runs/demo-DATE-TIME by default."""
     object: Path | None = None
     """Attack this object in place of the bundled hydrant: a mesh (glTF, OBJ, PLY),
     which is fitted first, or a grid field file made by asset."""
@@ -34,6 +34,11 @@ class Demo:
     json: bool = False
     """End with one line of JSON, the content of metrics.json, in place of the table."""
 
+    @property
+    def continues(self) -> bool:
+        """Whether the same command finds what this one left."""
+        return self.output is not None
+
     def run(self) -> Result:
         """Run the bundled scenario."""
         from mi_nerfattack.commands.shared.run_scenario import run_scenario
@@ -44,7 +49,6 @@ class Demo:
         return run_scenario(
             bundled("demo.toml"),
             output,
-            False,
             lambda: self._object_field(output),
             anyway=self.anyway,
         )
@@ -59,6 +63,5 @@ class Demo:
             field,
             height_m=self.height_m,
             resolution=self.resolution,
-            resume=True,  # of a demo that was interrupted
         ).run().show()
         return field

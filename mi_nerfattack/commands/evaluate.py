@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -43,6 +43,8 @@ class Evaluate:
     Finished drives are kept: the same command continues after Ctrl-C, and more runs or
     numbers of objects add to them.
     """
+
+    continues: ClassVar[bool] = True
 
     policy: tyro.conf.Positional[str | None] = None
     """Policy: .safetensors of train, .pt2, .pt, .onnx, FILE.py:NAME, a URL, or a TOML

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 class Fit:
     """Fit a neural field to posed images, and score it on every 8th image.
 
-    Interrupted, by Ctrl-C or otherwise, it leaves a checkpoint; the same command with
-    --resume goes on from there.
+    Interrupted, by Ctrl-C or otherwise, it leaves a checkpoint; the same command goes
+    on from there.
 
     Without --bounds the field's box is that of all depths that the folder holds or,
     without depth, of its cameras and sparse points or, without these too, a cube around
     the point nearest to all optical axes, four times as wide as the farthest camera is
     away from it.
     """
+
+    continues: ClassVar[bool] = True
 
     folder: tyro.conf.Positional[Path]
     """Folder with images and transforms.json or a COLMAP model, or the JSON file; or
@@ -47,8 +49,8 @@ class Fit:
     """End the fit after this time; the learning rate decays to fit."""
     patience: int | None = None
     """End the fit when this many steps lower the loss by less than 1 %."""
-    resume: bool = False
-    """Continue an interrupted fit from its checkpoint, beside the output."""
+    force: bool = False
+    """Start again, whatever an interrupted fit left beside the output."""
     batch_rays: int = 16384
     """Rays a step, at most."""
     network: Literal["instant-ngp", "small"] = "instant-ngp"
@@ -137,7 +139,7 @@ class Fit:
             return compare_file(self.folder, self.against)
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
-        with begun_fit(self.output, self.resume) as checkpoint:
+        with begun_fit(self.output, self.force) as checkpoint:
             return self._fit(self.output, checkpoint)
 
     def _fit(self, output: Path, checkpoint: Path) -> Result:
@@ -163,7 +165,6 @@ class Fit:
                 step_m=self.step_m,
                 progress=partial(show_fit, bars),
                 checkpoint=checkpoint,
-                resume=self.resume,
             )
         provenance = self._provenance(images)
         return finish(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -27,6 +27,8 @@ class Refine:
     drives there gains. The folder gets refine.json, objects and drives; the same
     command continues after Ctrl-C, and more --drives go on.
     """
+
+    continues: ClassVar[bool] = True
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Folder of a finished run of attack."""

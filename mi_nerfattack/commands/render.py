@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -116,6 +116,8 @@ class RenderPath(_Render):
 
     The same command continues where it was stopped.
     """
+
+    continues: ClassVar[bool] = True
 
     path: Path | None = None
     """Camera path: transforms.json (OpenGL camera to world, images not needed)."""

@@ -46,6 +46,11 @@ class Reproduce:
     json: bool = False
     """Print JSON in place of sentences."""
 
+    @property
+    def continues(self) -> bool:
+        """Whether the same command finds what this one left."""
+        return self.output is not None
+
     def run(self) -> Result:
         """Read, repeat, compare and tell."""
         from mi_nerfattack import variant

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
@@ -39,6 +39,8 @@ class Retrain:
     policy come its program, its record as 'train' writes it, and NAME-retrain.json: the
     runs, and errors before and after.
     """
+
+    continues: ClassVar[bool] = True
 
     run_folders: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")

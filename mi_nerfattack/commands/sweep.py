@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -26,6 +26,8 @@ class Sweep:
     command continues; complete cells are never done again, failed ones are. Ends with
     0, or with 1 if cells failed (with --check, if some would be refused).
     """
+
+    continues: ClassVar[bool] = True
 
     grid: tyro.conf.Positional[Path]
     """Grid file (TOML)."""

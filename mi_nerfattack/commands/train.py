@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -39,6 +39,8 @@ class Train:
     The validation is written beside the policy, as JSON, and so is the policy as a
     program of torch.export.
     """
+
+    continues: ClassVar[bool] = True
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Policy file to write (.safetensors)."""

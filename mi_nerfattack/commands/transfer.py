@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -25,6 +25,8 @@ class Transfer:
     time, and a picture. Finished drives are kept: the same command continues after
     Ctrl-C, and more runs, environments, conditions or starts add to them.
     """
+
+    continues: ClassVar[bool] = True
 
     run_folders: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN...")

@@ -20,7 +20,7 @@ from mi_nerfattack.io.resumable import (
 
 FORMAT = "mi_nerfattack attack checkpoint 8"
 REMEDY = (
-    "resume with the scenario.toml of the run folder and the same files and versions, "
+    "go on with the scenario.toml of the run folder and the same files and versions, "
     "start a new run folder, or ignore this (--force)"
 )
 
@@ -149,6 +149,6 @@ class CheckpointFile:
             else "there is no checkpoint yet"
         )
         return (
-            f"iteration {attack.iteration} is not saved, {kept}; continue "
-            "with 'mi-nerfattack attack --resume'"
+            f"iteration {attack.iteration} is not saved, {kept}; the same command "
+            "continues"
         )

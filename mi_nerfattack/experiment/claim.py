@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import locks
 
-_REMEDY = (
-    "choose another, or continue the run in it with 'mi-nerfattack attack --resume'"
-)
+#: The file that makes a folder a run's: the scenario, its paths absolute.
+SCENARIO = "scenario.toml"
 
 
-def claimed(folder: Path, resume: bool) -> AbstractContextManager[None]:
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
     """Make a run folder and keep other processes out of it, see `locks.claimed`.
 
     Args:
-        folder: may be missing.
-        resume: whether a run may be in it.
+        folder: missing, empty, or that of a run.
+
+    Raises:
+        InputError: as of `locks.claimed`, or it holds something else than a run.
     """
-    return locks.claimed(folder, None if resume else _REMEDY)
+    with locks.claimed(folder):
+        present = [p for p in folder.iterdir() if not locks.is_partial(p)]
+        if present and folder / SCENARIO not in present:
+            raise InputError(
+                f"{folder}: holds something else than a run; choose another folder"
+            )
+        yield

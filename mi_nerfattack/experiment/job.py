@@ -66,7 +66,7 @@ class Job:
         policy: the policy under test.
         output: the run folder.
         on_progress: told about every time step.
-        on_notice: told what a resumed run ignores, or that there is none.
+        on_notice: told what a run that goes on ignores.
         started: `time.perf_counter()` from which the wall time counts.
         frames: of each case, see ``pictures.frames.frame_steps``; None writes no
             pictures at all: no frames, plots, attribution and page.
@@ -83,24 +83,19 @@ class Job:
     frames: Frames | None = 3
     shared: SharedDrives | None = None
 
-    def run(
-        self, resume: bool = False, force: bool = False, anyway: bool = False
-    ) -> dict[str, Any]:
+    def run(self, force: bool = False, anyway: bool = False) -> dict[str, Any]:
         """Claim the run folder and do the whole job; see :meth:`run_claimed`."""
-        with claimed(self.output, resume):
-            return self.run_claimed(resume, force, anyway)
+        with claimed(self.output):
+            return self.run_claimed(force, anyway)
 
-    def run_claimed(
-        self, resume: bool = False, force: bool = False, anyway: bool = False
-    ) -> dict[str, Any]:
+    def run_claimed(self, force: bool = False, anyway: bool = False) -> dict[str, Any]:
         """Do the whole job and write the run folder, which is claimed.
 
-        A scenario that is refused before its first iteration leaves nothing there.
+        It goes on from what an interrupted run left in the folder. A scenario that is
+        refused before its first iteration leaves nothing there.
 
         Args:
-            resume: go on from what an interrupted run left in the folder; from the
-                beginning if that is nothing.
-            force: resume although scenario, files or versions have changed: the
+            force: go on although scenario, files or versions have changed: the
                 attack goes on, the drives are repeated.
             anyway: go on with a scenario whose attack would prove nothing; what was
                 found stands under ``flags`` in the document.
@@ -120,8 +115,7 @@ class Job:
         strict = self.scenario.attack.deterministic
         folder = RunFolder(self.output, text, identity, route, seed)
         with deterministic() if strict else nullcontext():
-            if resume:
-                folder.read(force, self.on_notice)
+            folder.read(force, self.on_notice)
             world = build_world(self.scenario, self.policy)
             departure_limit(world.route.lane_width_m, self.scenario.vehicle.width_m)
             for label in world.labels:  # what cannot be made is told before hours
@@ -258,7 +252,6 @@ def attack_policy(
     scenario: str | Path,
     folder: str | Path,
     *,
-    resume: bool = False,
     force: bool = False,
     anyway: bool = False,
     frames: Frames | None = 3,
@@ -269,9 +262,8 @@ def attack_policy(
 
     Args:
         scenario: TOML file, or ``bundled:FILE``.
-        folder: the run folder, new or empty.
-        resume: go on from what an interrupted run left in the folder.
-        force: resume although scenario, files or versions have changed.
+        folder: the run folder: new, or of the same attack, which then goes on.
+        force: go on although scenario, files or versions have changed.
         anyway: attack although the checks find that it would prove nothing.
         frames: of each case: ``"all"``, ``"worst"``, or so many, equally spaced; None
             writes no frames, plots, attribution and page.
@@ -284,7 +276,7 @@ def attack_policy(
         SetupError: the scenario is deterministic and the variant cannot be.
     """
     started, output = time.perf_counter(), Path(folder)
-    with claimed(output, resume):
+    with claimed(output):
         metrics = attack_claimed(
             resolve(str(scenario)),
             output,
@@ -292,7 +284,6 @@ def attack_policy(
             frames=frames,
             on_progress=progress,
             on_notice=on_notice,
-            resume=resume,
             force=force,
             anyway=anyway,
         )
@@ -308,7 +299,6 @@ def attack_claimed(
     frames: Frames | None,
     on_progress: OnProgress,
     on_notice: OnNotice,
-    resume: bool,
     force: bool,
     anyway: bool,
 ) -> dict[str, Any]:
@@ -322,7 +312,6 @@ def attack_claimed(
         frames: as of :func:`attack_policy`.
         on_progress: called with stage, steps done, steps in all and a remark.
         on_notice: called with a sentence.
-        resume: as of :func:`attack_policy`.
         force: as of :func:`attack_policy`.
         anyway: as of :func:`attack_policy`.
 
@@ -335,4 +324,4 @@ def attack_claimed(
     with one_thread():
         reports = on_progress, on_notice
         job = Job(described, text, policy, folder, *reports, started, frames)
-        return job.run_claimed(resume=resume, force=force, anyway=anyway)
+        return job.run_claimed(force, anyway)

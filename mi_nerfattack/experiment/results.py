@@ -66,8 +66,8 @@ def write_results(
     except BaseException:
         on_notice(
             f"{path}: holds all figures; pictures are missing: make room if the disk "
-            "is full, and --resume writes them (fewer with --frames, none with "
-            "--no-pictures)"
+            "is full, and the same command writes them (fewer with --frames, none "
+            "with --no-pictures)"
         )
         raise
     return document

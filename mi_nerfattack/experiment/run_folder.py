@@ -14,6 +14,7 @@ from typing import Any
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.checkpoint import CheckpointFile
+from mi_nerfattack.experiment.claim import SCENARIO
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.io import files, locks
@@ -22,7 +23,6 @@ from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM
 CHECKPOINT = "checkpoint.safetensors"
 DRIVES = "drives"
 METRICS = "metrics.json"
-SCENARIO = "scenario.toml"
 _WIDTH = 100  # characters of the table in a notebook
 
 
@@ -41,7 +41,7 @@ def read_finished(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(
             f"{folder}: holds no finished attack, {METRICS} is missing; give run "
-            "folders of 'mi-nerfattack attack', which finishes one with --resume"
+            "folders of 'mi-nerfattack attack', which goes on with an unfinished one"
         )
     document = files.read_json(path)
     validate(document)
@@ -139,7 +139,6 @@ class RunFolder:
                 another scenario or other versions.
         """
         if not self._holds_run(force, on_notice):
-            on_notice(f"{self.path}: holds no run yet; it starts from the beginning")
             return
         of_attack = self.checkpoint.read(force)
         of_drives, ignored = self.drives.read(force)
@@ -167,15 +166,11 @@ class RunFolder:
             (self.path / SCENARIO).unlink()
 
     def _holds_run(self, force: bool, on_notice: Callable[[str], None]) -> bool:
-        """Tell a run from nothing; InputError for something else."""
-        present = [p for p in self.path.iterdir() if not locks.is_partial(p)]
+        """Tell a run from nothing; InputError for another run that did nothing."""
         scenario = self.path / SCENARIO
-        if present and scenario not in present:
-            raise InputError(
-                f"{self.path}: is no run folder; there is nothing to resume"
-            )
+        begun = scenario.exists()
         done = self.checkpoint.path.exists() or self.drives.paths()
-        if present and not done:
+        if begun and not done:
             if files.read_text(scenario) != self._text:
                 what = f"{scenario}: is another scenario, and nothing was done of it"
                 if not force:
@@ -184,4 +179,4 @@ class RunFolder:
                         "it (--force)"
                     )
                 on_notice(f"{what}; replaced, as told")
-        return bool(present)
+        return begun

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from mi_nerfattack.backend.versions import versions
-from mi_nerfattack.errors import InputError
 from mi_nerfattack.fit.options import FitProgress
 from mi_nerfattack.fit.training import Training
 from mi_nerfattack.io import files
@@ -18,8 +17,8 @@ from mi_nerfattack.io.resumable import Record, Unit, check_entries, misfits_told
 
 FORMAT = "mi_nerfattack fit checkpoint 3"
 _REMEDY = (
-    "resume with the same images, depth, options and versions, or delete the file to "
-    "start again"
+    "go on with the same images, depth, options and versions, or start again, which "
+    "removes the file (--force)"
 )
 _EVERY_S = 30.0
 _MAX_SHARE = 0.02  # of the time that may go into writing
@@ -36,26 +35,24 @@ class FitCheckpoint:
     """Keeps the state of a fit on disk.
 
     Args:
-        path: file, replaced atomically.
+        path: file, replaced atomically; if it is there, the fit goes on from it.
         training: the fit.
-        resume: continue from the file if it exists; False refuses one that does.
 
     Attributes:
         elapsed_s: wall time of the fit before it was interrupted.
         history: reports before it was interrupted.
 
     Raises:
-        InputError: the file exists and `resume` is False, cannot be read, or belongs
-            to other images, depth, options or versions.
+        InputError: the file cannot be read, or belongs to other images, depth, options
+            or versions.
     """
 
-    def __init__(self, path: Path, training: Training, resume: bool) -> None:
+    def __init__(self, path: Path, training: Training) -> None:
         self.training = training
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
         identity = {"format": FORMAT, **versions(), "fit": _digest(training)}
         self._unit = Unit(path, identity, FitRecord, _REMEDY)
-        check_unfinished(path, resume)
         kept = self._unit.read()
         if kept is not None:
             check_entries(path, kept.tensors, training.tensors())
@@ -79,20 +76,6 @@ class FitCheckpoint:
         self._unit.write(self.training.tensors(), record)
         self._written = time.perf_counter()
         self._cost_s = self._written - start
-
-
-def check_unfinished(path: Path, resume: bool) -> None:
-    """Raise InputError if there is a checkpoint that is not to be continued.
-
-    Args:
-        path: where the checkpoint of a fit would be.
-        resume: whether to continue from it.
-    """
-    if path.exists() and not resume:
-        raise InputError(
-            f"{path}: an unfinished fit; continue it (--resume), or delete the file "
-            "to start again"
-        )
 
 
 def _digest(training: Training) -> str:

@@ -48,7 +48,6 @@ def fit_ngp(
     cone: float = 1 / 128,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
-    resume: bool = False,
 ) -> FitResult:
     """Fit an NGP with a sky to images of a scene.
 
@@ -66,9 +65,8 @@ def fit_ngp(
         step_m: marching step; None for a thousandth of the longest edge.
         cone: growth of the step with distance.
         progress: called every 25 steps and at the end.
-        checkpoint: file that keeps the state of the fit, for `resume`; it is the
-            caller's to delete once the field is saved.
-        resume: continue from `checkpoint`.
+        checkpoint: file that keeps the state of the fit, which goes on from it if it is
+            there; it is the caller's to delete once the field is saved.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -91,7 +89,7 @@ def fit_ngp(
     if images.channels == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
-    return _run(training, progress, checkpoint, resume)
+    return _run(training, progress, checkpoint)
 
 
 def fit_grid(
@@ -103,7 +101,6 @@ def fit_grid(
     depth: np.ndarray | None = None,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
-    resume: bool = False,
 ) -> FitResult:
     """Fit a decoder-free grid to images of an object with alpha.
 
@@ -117,9 +114,8 @@ def fit_grid(
         layout: None for 16 levels from 16 to 64.
         options: None for the defaults.
         depth: (n, height, width), metres along the ray, infinite beside the object.
-        progress: as of `fit_ngp`, and so are `checkpoint` and `resume`.
+        progress: as of `fit_ngp`.
         checkpoint: likewise.
-        resume: likewise.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -137,7 +133,7 @@ def fit_grid(
         layout or GridLayout(), low, high, density_scale=1 / float((high - low).max())
     )
     training = Training(grid, images, options, depth, box_only=True)
-    return _run(training, progress, checkpoint, resume)
+    return _run(training, progress, checkpoint)
 
 
 def fit_object(
@@ -146,7 +142,6 @@ def fit_object(
     options: FitOptions,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
-    resume: bool = False,
 ) -> FitResult:
     """Fit a grid to views of an object, in a box with room around it.
 
@@ -154,9 +149,8 @@ def fit_object(
         views: with the object's box, which the field's header keeps.
         resolution: of the finest level.
         options: of the fit.
-        progress: as of `fit_ngp`, and so are `checkpoint` and `resume`.
+        progress: as of `fit_ngp`.
         checkpoint: likewise.
-        resume: likewise.
     """
     # room for the outermost vertices' own cells
     room = 2.0 / resolution * float((views.upper - views.lower).max())
@@ -169,7 +163,6 @@ def fit_object(
         views.depth,
         progress,
         checkpoint,
-        resume,
     )
     for name in ("lower", "upper"):
         corner = " ".join(map(repr, getattr(views, name).tolist()))
@@ -178,10 +171,10 @@ def fit_object(
 
 
 def _run(
-    training: Training, progress: ProgressCallback, path: Path | None, resume: bool
+    training: Training, progress: ProgressCallback, path: Path | None
 ) -> FitResult:
     """Do steps until the fit is done; interrupted, keep its state."""
-    checkpoint = None if path is None else FitCheckpoint(path, training, resume)
+    checkpoint = None if path is None else FitCheckpoint(path, training)
     clock = _Clock(training, checkpoint)
     try:
         while not clock.is_over():

@@ -175,14 +175,6 @@ class TestCommand:
             assert message in error and error.count("\n") == 1, error
             assert set(tmp_path.iterdir()) == before, words
 
-    def test_unfinished_fit_is_told_before_anything_is_read(self, tmp_path, capsys):
-        (tmp_path / "a.checkpoint.safetensors").write_text("")
-        source, out = tmp_path / "none.glb", tmp_path / "a.safetensors"
-        code, error = self.call(capsys, source, "-o", out)
-        assert code == 2 and "a.checkpoint.safetensors: an unfinished fit" in error
-        code, error = self.call(capsys, source, "-o", out, "--resume")
-        assert code == 2 and "none.glb: does not exist" in error
-
     def test_interrupted_fit_to_a_mesh_is_resumed(self, tmp_path, monkeypatch, capsys):
         """It is accepted only if the mesh is rendered to the same bytes again."""
 
@@ -204,8 +196,8 @@ class TestCommand:
         assert kept.is_file() and not out.exists()
         source = str(tmp_path / "box.obj")
         with pytest.raises(InputError, match=r"box\.checkpoint\.saf.*\n  fit: "):
-            Asset(source, out, resume=True, **settings | {"turn_deg": 1.0}).run()
-        assert Asset(source, out, resume=True, **settings).run().tell(False) == 0
+            Asset(source, out, **settings | {"turn_deg": 1.0}).run()
+        assert Asset(source, out, **settings).run().tell(False) == 0
         assert out.is_file() and not kept.exists()
         assert "30 steps" in capsys.readouterr().out
 

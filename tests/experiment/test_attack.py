@@ -58,10 +58,13 @@ def test_attack_writes_a_complete_run_folder(scenario_folder, tmp_path, capsys):
     assert np.abs(change).max() > 0.1
     density = attacked.parameters()["density"].numpy()
     assert np.array_equal(density, original.parameters()["density"].numpy())
-    # a second run into the same folder is refused and changes nothing
+    # another attack into the same folder is refused and changes nothing
     before = (output / "metrics.json").read_bytes()
-    assert cli.main(words) == 2
-    assert "not an empty folder" in capsys.readouterr().err
+    other = scenario_folder / "other.toml"
+    text = (scenario_folder / "scenario.toml").read_text()
+    other.write_text(text.replace("[drive]", "[drive]\nstart_m = 0.5"))
+    assert cli.main(["attack", str(other), "-o", str(output)]) == 2
+    assert "scenario.drive.start_m: " in capsys.readouterr().err
     assert (output / "metrics.json").read_bytes() == before
 
 
@@ -132,12 +135,12 @@ def test_interrupted_attack_resumes(scenario_folder, tmp_path):
     assert not (output / "metrics.json").exists()
     # another scenario may not continue it, and changes nothing
     kept = (output / "scenario.toml").read_text()
-    refused = run("attack", other, "-o", output, "--resume", cwd=tmp_path, check=2)
+    refused = run("attack", other, "-o", output, cwd=tmp_path, check=2)
     assert "checkpoint.safetensors" in refused.stderr
     assert (output / "scenario.toml").read_text() == kept
     # the text in the run folder replays the scenario
     again = output / "scenario.toml"
-    run("attack", again, "-o", output, "--resume", cwd=tmp_path, check=0)
+    run("attack", again, "-o", output, cwd=tmp_path, check=0)
     history = json.loads((output / "attack.json").read_text())
     assert [record["iteration"] for record in history] == list(range(10))
     assert (output / "metrics.json").exists()

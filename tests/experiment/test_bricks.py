@@ -77,7 +77,7 @@ def test_an_interrupted_attack_goes_on_in_bricks(folder, tmp_path):
 
         interrupted.on_progress = stop
         interrupted.run(anyway=True)
-    job(folder, output).run(resume=True)
+    job(folder, output).run()
     assert_same_state(output, tmp_path / "whole")
 
 

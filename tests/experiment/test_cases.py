@@ -78,7 +78,7 @@ def test_best_random_is_driven_again_where_the_attack_is_lost(folder, whole, tmp
         if remark != "kept":
             driven.add(stage)
 
-    job(folder, output, on_progress=watch).run(resume=True)
+    job(folder, output, on_progress=watch).run()
     assert driven == {"surrogate: optimisation"} | {
         f"{label}: {case}"
         for label in ("surrogate", "deployment")

@@ -217,14 +217,14 @@ def test_anyway_goes_on_and_the_run_remembers(folder, tmp_path, monkeypatch):
     assert len(drives) == 3
     with monkeypatch.context() as patch:
         patch.setattr(module, "first_findings", None)  # they are not called
-        document = job(folder, output, behind).run(resume=True)
+        document = job(folder, output, behind).run()
     assert document["flags"] == [warning.removeprefix("warning: ")]
     assert all(path.stat().st_mtime_ns == time for path, time in drives.items())
     # by force it is another scenario, which is checked
     aloft = (POSITION, POSITION.replace("1.6", "4.6"))
     before = contents(output)
     with pytest.raises(InputError, match="ball is in the air"):
-        job(folder, output, aloft).run(resume=True, force=True)
+        job(folder, output, aloft).run(force=True)
     kept = {"checkpoint.safetensors", "metrics.json"}
     for path, raw in contents(output).items():
         assert path.name not in kept or raw == before[path]
@@ -246,14 +246,14 @@ def test_command_refuses_and_goes_on_anyway(
     assert not output.exists()
     seen = []
 
-    def run(self, **how):
-        seen.append([name for name, given in how.items() if given])
+    def run(self, force, anyway):
+        seen.append((force, anyway))
         raise InputError("seen")
 
     monkeypatch.setattr(module.Job, "run_claimed", run)
-    for extra in ([], ["--anyway"], ["--resume", "--force"]):
+    for extra in ([], ["--anyway"], ["--force"]):
         cli.main(["attack", str(path), "-o", str(output), *extra])
-    assert seen == [[], ["anyway"], ["resume", "force"]]
+    assert seen == [(False, False), (False, True), (True, False)]
 
 
 @pytest.mark.slow

@@ -141,6 +141,6 @@ def test_an_attack_in_every_environment(folder, tmp_path, monkeypatch):
         ]
         assert abs(images[0] - images[1]).max() > 0.02, label
     # finished, it opens nothing again but for the results
-    again = job(folder, output, (TABLE, SEVERAL)).run(resume=True)
+    again = job(folder, output, (TABLE, SEVERAL)).run()
     assert again["routes"] == document["routes"]
     assert again["replay"] == document["replay"]

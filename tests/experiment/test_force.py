@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from helpers.attack_jobs import checkpoint_of, contents, interrupt, job
 
-from mi_nerfattack import cli
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.experiment import job as module
 from mi_nerfattack.io import files, resumable
@@ -24,7 +23,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     before = contents(output)
     change = ("learning_rate = 0.5", "learning_rate = 0.25\njitter = true")
     with pytest.raises(InputError) as refused:
-        job(folder, output, change).run(resume=True)
+        job(folder, output, change).run()
     message = str(refused.value)
     assert str(output / "checkpoint.safetensors") in message
     assert "scenario.attack.learning_rate: 0.5 -> 0.25" in message
@@ -39,7 +38,7 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
             first.append(done)
 
     run = job(folder, output, change, watch, notices)
-    document = run.run(resume=True, force=True)
+    document = run.run(force=True)
     assert first[0] == 4 * 4 + 1 and len(checkpoint_of(output)["history"]) == 6
     line = "scenario.attack.learning_rate: 0.5 -> 0.25"
     assert line in document["ignored_changes"]
@@ -47,9 +46,9 @@ def test_changed_scenario_is_refused_with_a_diff_unless_forced(folder, tmp_path)
     assert any(line in notice for notice in notices)
     assert "learning_rate = 0.25" in (output / "scenario.toml").read_text()
     # from then on the run is that of the changed scenario, its drives too
-    job(folder, output, change).run(resume=True)
+    job(folder, output, change).run()
     with pytest.raises(InputError, match=r"learning_rate: 0\.25 -> 0\.5"):
-        job(folder, output).run(resume=True)
+        job(folder, output).run()
 
 
 @pytest.mark.usefixtures("no_results")
@@ -60,23 +59,23 @@ def test_changed_file_and_version_are_named(folder, tmp_path, monkeypatch):
     # a field of another name and place but the same content is the same
     shutil.copy(mine / "object.safetensors", mine / "copy.safetensors")
     same = ('"object.safetensors"', '"copy.safetensors"')
-    interrupt(mine, output, "surrogate: optimisation", 4 * 4 + 1, True, change=same)
+    interrupt(mine, output, "surrogate: optimisation", 4 * 4 + 1, change=same)
     tensors, metadata = files.read_safetensors(mine / "object.safetensors")
     tensors["texture"] = tensors["texture"] + 1
     files.write_safetensors(mine / "object.safetensors", tensors, metadata)
     with pytest.raises(InputError) as refused:
-        job(mine, output).run(resume=True)
+        job(mine, output).run()
     assert "objects[0].field: copy.safetensors -> object.safetensors" in str(
         refused.value
     )
     files.write_safetensors(mine / "copy.safetensors", tensors, metadata)
     with pytest.raises(InputError, match=r"content of copy\.safetensors has changed"):
-        job(mine, output, same).run(resume=True)
+        job(mine, output, same).run()
     found = module.versions()
     changed = {**found, "drjit": "0.1"}
     monkeypatch.setattr(module, "versions", lambda: changed)
     with pytest.raises(InputError, match=f"drjit: {found['drjit']} -> 0.1"):
-        job(folder, output).run(resume=True)
+        job(folder, output).run()
 
 
 @pytest.mark.usefixtures("no_results")
@@ -85,7 +84,7 @@ def test_object_of_another_size_does_not_fit_by_force(folder, tmp_path):
     interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     other = ('"object.safetensors"', '"scene.safetensors"')
     with pytest.raises(InputError, match=r"checkpoint\.safetensors: .*this run needs"):
-        job(folder, output, other).run(resume=True, force=True, anyway=True)
+        job(folder, output, other).run(force=True, anyway=True)
 
 
 def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
@@ -104,14 +103,8 @@ def test_scene_counts_with_the_meshes_that_it_names(folder, tmp_path):
     ]
 
 
-def test_force_without_resume_is_refused(folder, tmp_path, capsys):
-    scenario, output = str(folder / "scenario.toml"), tmp_path / "run"
-    assert cli.main(["attack", scenario, "-o", str(output), "--force"]) == 2
-    assert "--resume" in capsys.readouterr().err and not output.exists()
-
-
 def run_forced(folder, output, change, **more):
-    return job(folder, output, change, **more).run(resume=True, force=True)
+    return job(folder, output, change, **more).run(force=True)
 
 
 @pytest.mark.usefixtures("no_results")
@@ -143,7 +136,7 @@ def test_version_alone_keeps_the_best(folder, whole, tmp_path, monkeypatch):
         folder, output, ("", ""), on_progress=lambda stage, *_: stages.add(stage)
     )
     assert "surrogate: best so far" in stages
-    document = job(folder, output).run(resume=True)  # not measured a second time
+    document = job(folder, output).run()  # not measured a second time
     assert document["cost"]["processes"] == 3
     after = checkpoint_of(output)
     for name in ("best.0", "best_objective", "best_mean_m"):

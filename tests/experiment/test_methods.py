@@ -66,7 +66,7 @@ def test_an_interrupted_search_goes_on(folder, tmp_path, no_results, method):
     output = tmp_path / "output"
     stage = "surrogate: optimisation", 9
     interrupt(folder, output, *stage, change=change)
-    resumed = job(folder, output, change).run(resume=True)
+    resumed = job(folder, output, change).run()
     assert_same_drives(resumed["drives"], whole["drives"])
     assert resumed["curve"] == whole["curve"]
     assert resumed["curve"]["frames"] == [2, 4, 6, 8, 10, 12]
@@ -77,7 +77,7 @@ def test_a_search_does_not_go_on_in_another_scenario(folder, tmp_path, no_result
     interrupt(folder, output, "surrogate: optimisation", 9, change=change)
     other = keys("blocks", 14)
     with pytest.raises(InputError, match="another scenario.* start a new run folder"):
-        job(folder, output, (ITERATIONS, other)).run(resume=True, force=True)
+        job(folder, output, (ITERATIONS, other)).run(force=True)
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,7 @@ def test_attack_policy_returns_the_finished_run(scenario_folder, tmp_path):
     stages = {stage for stage, *_ in reports}
     assert {"surrogate: optimisation", "deployment: attack"} <= stages
     assert not list(run.folder.glob("*.png"))  # frames=None
-    with pytest.raises(nf.InputError, match=str(run.folder)):
-        nf.attack_policy(scenario_folder / "scenario.toml", run.folder)
-    again = nf.attack_policy(
-        scenario_folder / "scenario.toml", run.folder, frames=None, resume=True
-    )
+    again = nf.attack_policy(scenario_folder / "scenario.toml", run.folder, frames=None)
     assert again.metrics["routes"] == run.metrics["routes"]
 
 

@@ -41,11 +41,11 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
     whole, output = tmp_path / "whole", tmp_path / "run"
     expected = job(folder, whole, FIFTY).run()
     # 4 steps an iteration: in the drive, and in the derivative
-    for resume, step in ((False, 4 * 17 + 1), (True, 4 * 32 + 3)):
-        interrupt(folder, output, "surrogate: optimisation", step, resume, change=FIFTY)
+    for step in (4 * 17 + 1, 4 * 32 + 3):
+        interrupt(folder, output, "surrogate: optimisation", step, change=FIFTY)
         iteration = len(checkpoint_of(output)["history"])
         assert iteration == step // 4
-    result = job(folder, output, FIFTY).run(resume=True)
+    result = job(folder, output, FIFTY).run()
     assert len(checkpoint_of(output)["history"]) == 50
     assert_same_state(output, whole)
     assert_same_drives(result["drives"], expected["drives"])
@@ -59,7 +59,7 @@ def test_interrupted_deterministic_run_ends_bit_for_bit_as_the_whole(folder, tmp
 def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     output, seen = tmp_path / "run", []
     interrupt(folder, output, "surrogate: random", 7)  # 2 of 2, judged, in the drive
-    interrupt(folder, output, "deployment: attack", 1, resume=True)
+    interrupt(folder, output, "deployment: attack", 1)
     before = checkpoint_of(output)
     written = {path: path.stat().st_mtime_ns for path in output.glob("drives/*")}
     # 2 of each case twice, but for the last
@@ -68,7 +68,7 @@ def test_what_is_finished_is_not_repeated(folder, whole, tmp_path):
     def watch(stage, done, total, remark):
         seen.append((stage, done, remark))
 
-    document = job(folder, output, on_progress=watch).run(resume=True)
+    document = job(folder, output, on_progress=watch).run()
     driven = [line for line in seen if line[2] != "kept"]
     assert driven == [("deployment: attack", k, "") for k in (1, 2, 3, 4)]
     kept = {stage for stage, _, remark in seen if remark == "kept"}
@@ -95,7 +95,7 @@ def test_finished_run_is_resumed_without_a_drive(folder, whole, tmp_path):
     def watch(stage, done, total, remark):
         seen.append(remark)
 
-    job(folder, output, on_progress=watch).run(resume=True)
+    job(folder, output, on_progress=watch).run()
     assert set(seen) == {"kept"}
 
 
@@ -110,7 +110,7 @@ def test_interrupt_within_a_step_leaves_a_whole_state(folder, whole, tmp_path):
         progress = stop_at("surrogate: optimisation", 4 * 4 + 4, press)
         job(folder, output, on_progress=progress).run()
     assert len(checkpoint_of(output)["history"]) == 4
-    job(folder, output).run(resume=True)
+    job(folder, output).run()
     assert_same_state(output, whole[0])
 
 
@@ -135,7 +135,7 @@ def test_error_within_an_update_keeps_the_checkpoint_before(
         with pytest.raises(MemoryError):
             job(folder, output).run()
     assert len(checkpoint_of(output)["history"]) == 3
-    job(folder, output).run(resume=True)
+    job(folder, output).run()
     assert_same_state(output, whole[0])
 
 
@@ -158,7 +158,7 @@ def test_gradient_that_is_not_finite_costs_no_iteration(folder, tmp_path, monkey
         job(folder, output).run()
     monkeypatch.undo()
     assert len(checkpoint_of(output)["history"]) == 5  # checkpoint_every = 3
-    job(folder, output).run(resume=True)
+    job(folder, output).run()
     assert len(checkpoint_of(output)["history"]) == 6
 
 

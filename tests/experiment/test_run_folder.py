@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 @pytest.mark.usefixtures("no_results")
 @pytest.mark.parametrize("left", ["nothing", "partial", "scenario", "drives"])
 def test_run_killed_early_starts_from_the_beginning(folder, whole, tmp_path, left):
-    output, notices = tmp_path / "run", []
+    output = tmp_path / "run"
     partial = output / ".scenario.toml.0123456789ab.tmp"
     if left != "nothing":
         output.mkdir()
@@ -33,10 +33,8 @@ def test_run_killed_early_starts_from_the_beginning(folder, whole, tmp_path, lef
     if left == "drives":
         interrupt(folder, tmp_path / "cut", "surrogate: random", 1)
         shutil.copytree(tmp_path / "cut" / "drives", output / "drives")
-    job(folder, output, notices=notices).run(resume=True)
+    job(folder, output).run()
     assert (output / "metrics.json").exists() and not partial.exists()
-    begins = any("starts from the beginning" in notice for notice in notices)
-    assert begins == (left in ("nothing", "partial"))
 
 
 def test_numbers_come_without_pictures(folder, whole, tmp_path):
@@ -45,7 +43,7 @@ def test_numbers_come_without_pictures(folder, whole, tmp_path):
     (output / "metrics.json").unlink()
     late = job(folder, output)
     late.frames = None
-    document = late.run(resume=True)
+    document = late.run()
     assert document["verdict"] and document["textures"]
     found = {path.name for path in output.iterdir()} - {
         path.name for path in whole[0].iterdir()
@@ -56,13 +54,13 @@ def test_numbers_come_without_pictures(folder, whole, tmp_path):
 @pytest.mark.usefixtures("no_results")
 def test_folder_of_something_else_is_left_alone(folder, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="is no run folder"):
-        job(folder, tmp_path).run(resume=True)
+    with pytest.raises(InputError, match="holds something else than a run"):
+        job(folder, tmp_path).run()
     (tmp_path / "scenario.toml").write_text("# a scenario of my own")
     with pytest.raises(InputError, match=r"scenario\.toml: is another scenario"):
-        job(folder, tmp_path).run(resume=True)
+        job(folder, tmp_path).run()
     with pytest.raises(InputError, match="is not a folder"):
-        job(folder, tmp_path / "notes.txt").run(resume=True)
+        job(folder, tmp_path / "notes.txt").run()
     assert len(list(tmp_path.iterdir())) == 2
     assert (tmp_path / "scenario.toml").read_text() == "# a scenario of my own"
 
@@ -71,7 +69,7 @@ def test_folder_of_something_else_is_left_alone(folder, tmp_path):
 def test_scenario_of_which_nothing_was_done_is_replaced_by_force(folder, tmp_path):
     (tmp_path / "scenario.toml").write_text("# a scenario of a run killed early")
     notices = []
-    job(folder, tmp_path, notices=notices).run(resume=True, force=True)
+    job(folder, tmp_path, notices=notices).run(force=True)
     assert any("replaced, as told" in notice for notice in notices)
     assert 'name = "kill"' in (tmp_path / "scenario.toml").read_text()
     assert (tmp_path / "metrics.json").exists()
@@ -82,8 +80,8 @@ def test_two_processes_do_not_work_in_one_folder(folder, tmp_path):
     output = tmp_path / "run"
     interrupt(folder, output, "surrogate: optimisation", 4 * 3 + 1)
     with locks.exclusive(output), pytest.raises(InputError, match="another process"):
-        job(folder, output).run(resume=True)
-    job(folder, output).run(resume=True)
+        job(folder, output).run()
+    job(folder, output).run()
 
 
 @pytest.mark.usefixtures("no_results")
@@ -104,7 +102,7 @@ def test_damaged_and_foreign_files_are_refused_by_name(folder, tmp_path, name, d
         raw[-9] ^= 1
     (output / name).write_bytes(raw)
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        job(folder, output).run(resume=True)
+        job(folder, output).run()
     assert (output / name).read_bytes() == raw
 
 
@@ -135,12 +133,12 @@ def test_failed_checkpoint_leaves_the_one_before(
         job(folder, output, on_progress=progress).run()
     monkeypatch.undo()
     message = str(failed.value)
-    assert str(path) in message and "--resume" in message
+    assert str(path) in message and "the same command continues" in message
     assert ("no space left" if number == errno.ENOSPC else "read-only") in message
     assert "iteration 6 is not saved" in message
     assert "checkpoint of iteration 3 is intact" in message
     assert contents(output) == kept
-    job(folder, output).run(resume=True)
+    job(folder, output).run()
 
 
 @pytest.mark.usefixtures("no_results")
@@ -173,21 +171,22 @@ def test_what_no_other_scenario_mends_is_kept(folder, tmp_path, step, cause):
 
 def test_a_claimed_folder_is_ours_and_empty_ones_are_removed(tmp_path):
     output = tmp_path / "made" / "run"
-    with claimed(output, False), pytest.raises(InputError, match="another process"):
-        with claimed(output, False):
+    with claimed(output), pytest.raises(InputError, match="another process"):
+        with claimed(output):
             pass
     assert not (tmp_path / "made").exists()
-    with claimed(output, False):
+    with claimed(output):
         (output / "a").write_text("")
-    with pytest.raises(InputError, match="is not an empty folder"):
-        with claimed(output, False):
+    with pytest.raises(InputError, match="holds something else than a run"):
+        with claimed(output):
             pass
-    with claimed(output, True):
+    (output / "scenario.toml").write_text("")
+    with claimed(output):
         pass
     with pytest.raises(InputError, match="is not a folder"):
-        with claimed(output / "a", True):
+        with claimed(output / "a"):
             pass
-    assert list(output.iterdir()) == [output / "a"]
+    assert {path.name for path in output.iterdir()} == {"a", "scenario.toml"}
 
 
 def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):
@@ -206,7 +205,7 @@ def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):
 def test_a_demo_is_refused_before_its_object_is_fitted(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert cli.main(["demo", "-o", str(tmp_path), "--object", "absent.glb"]) == 2
-    assert "not an empty folder" in capsys.readouterr().err
+    assert "holds something else than a run" in capsys.readouterr().err
 
 
 def test_partial_files_of_writers_are_removed_and_no_others(tmp_path):

@@ -35,7 +35,7 @@ def options(**changes: object) -> FitOptions:
     return FitOptions(**settings | changes)
 
 
-def ngp(checkpoint: Path | None = None, resume: bool = False, **more) -> FitResult:
+def ngp(checkpoint: Path | None = None, **more) -> FitResult:
     images, depth = sphere_views(8, alpha=False)
     changes = more.pop("changes", {})
     return fit_ngp(
@@ -47,14 +47,13 @@ def ngp(checkpoint: Path | None = None, resume: bool = False, **more) -> FitResu
         step_m=0.05,
         cone=0.0,
         checkpoint=checkpoint,
-        resume=resume,
         **more,
     )
 
 
-def grid(checkpoint: Path | None = None, resume: bool = False, **more) -> FitResult:
+def grid(checkpoint: Path | None = None, **more) -> FitResult:
     images, depth = sphere_views(8)
-    more |= {"checkpoint": checkpoint, "resume": resume}
+    more |= {"checkpoint": checkpoint}
     return fit_grid(images, *BOX, TINY_GRID, options(), depth, **more)
 
 
@@ -77,7 +76,7 @@ def test_resumed_fit_ends_where_the_whole_one_does(tmp_path, single_thread, fit)
     with pytest.raises(KeyboardInterrupt):
         fit(path, progress=stop_after(50))
     assert path.is_file()
-    result = fit(path, True)
+    result = fit(path)
     assert result.steps == whole.steps == 100
     assert [at.step for at in result.history] == [25, 50, 75, 100]
     for name, value in whole.field.tensors().items():
@@ -90,7 +89,7 @@ def test_killed_fit_goes_on_from_what_was_saved_on_the_way(tmp_path, monkeypatch
     path = tmp_path / "fit.safetensors"
     with pytest.raises(RuntimeError):  # nothing is saved at the end
         ngp(path, progress=stop_after(75, RuntimeError))
-    result = ngp(path, True)
+    result = ngp(path)
     assert [at.step for at in result.history] == [25, 50, 75, 100]
     whole = ngp()
     assert result.psnr_heldout_db == pytest.approx(whole.psnr_heldout_db, abs=0.5)
@@ -103,13 +102,11 @@ def test_unfinished_fit_is_not_overwritten(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         ngp(path, progress=stop_after(25))
     before = path.read_bytes()
-    with pytest.raises(InputError, match=r"fit\.safetensors: an unfinished fit.*--res"):
-        ngp(path)
     with pytest.raises(InputError, match=r"fit\.safetensors: belongs .*\n  fit: "):
-        ngp(path, True, changes={"seed": 1})
+        ngp(path, changes={"seed": 1})
     path.write_bytes(before[: len(before) // 2])
     with pytest.raises(InputError, match="damaged or truncated"):
-        ngp(path, True)
+        ngp(path)
 
 
 def test_interrupted_command_is_resumed(tmp_path, monkeypatch, capsys):
@@ -134,7 +131,7 @@ def test_interrupted_command_is_resumed(tmp_path, monkeypatch, capsys):
             Fit(folder, output, **settings).run()
     kept = tmp_path / "field.checkpoint.safetensors"
     assert sorted(tmp_path.iterdir()) == [kept, folder]
-    resumed = Fit(folder, output, resume=True, **settings).run()
+    resumed = Fit(folder, output, **settings).run()
     assert resumed.tell(as_json=False) == 0
     assert output.is_file() and not kept.exists()
     assert "50 steps" in capsys.readouterr().out
@@ -153,7 +150,7 @@ def test_fit_interrupted_at_once_is_resumed(tmp_path, monkeypatch):
         patch.setattr(Training, "do_step", stop_after(0))
         with pytest.raises(KeyboardInterrupt):
             ngp(path)
-    assert ngp(path, True).steps == 100
+    assert ngp(path).steps == 100
 
 
 def test_fit_interrupted_while_it_is_scored_is_resumed(tmp_path, monkeypatch):
@@ -165,7 +162,7 @@ def test_fit_interrupted_while_it_is_scored_is_resumed(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             ngp(path)
     reports = []
-    result = ngp(path, True, progress=reports.append)
+    result = ngp(path, progress=reports.append)
     assert result.steps == 100 and not reports
     assert np.isfinite(result.psnr_heldout_db)
 
@@ -177,7 +174,7 @@ def test_other_depth_is_refused(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fit_ngp(images, *arguments, depth, checkpoint=path, progress=stop_after(25))
     with pytest.raises(InputError, match=r"fit\.safetensors: belongs .*\n  fit: "):
-        fit_ngp(images, *arguments, depth * 1.001, checkpoint=path, resume=True)
+        fit_ngp(images, *arguments, depth * 1.001, checkpoint=path)
 
 
 def test_room_without_a_sky_becomes_solid():

@@ -83,9 +83,9 @@ def stop_at(stage, step, stop=None):
     return on_progress
 
 
-def interrupt(folder, output, stage, step, resume=False, **more):
+def interrupt(folder, output, stage, step, **more):
     with pytest.raises(KeyboardInterrupt):
-        job(folder, output, on_progress=stop_at(stage, step), **more).run(resume)
+        job(folder, output, on_progress=stop_at(stage, step), **more).run()
 
 
 def checkpoint_of(output):

@@ -41,25 +41,25 @@ def check_output(path: Path) -> None:
 
 
 @contextmanager
-def begun_fit(output: Path, resume: bool) -> Iterator[Path]:
+def begun_fit(output: Path, force: bool) -> Iterator[Path]:
     """Check that a fit may begin, and keep other processes out until it ends.
 
     It claims the folder of its report.
 
     Args:
         output: field file.
-        resume: whether a fit to it may be unfinished.
+        force: forget what an interrupted fit left.
 
     Returns:
         the path of its checkpoint.
     """
-    from mi_nerfattack.fit.checkpoint import check_unfinished
     from mi_nerfattack.io import locks
 
     check_output(output)
     with locks.claimed(report_folder(output)):
         checkpoint = output.with_suffix(".checkpoint.safetensors")
-        check_unfinished(checkpoint, resume)
+        if force:
+            checkpoint.unlink(missing_ok=True)
         yield checkpoint
 
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 def run_scenario(
     path: Path,
     output: Path,
-    resume: bool,
     object_field: Callable[[], Path | None] = lambda: None,
     force: bool = False,
     anyway: bool = False,
@@ -28,10 +27,9 @@ def run_scenario(
     Args:
         path: the scenario file.
         output: the run folder.
-        resume: continue from what an interrupted run left in it.
         object_field: makes, or names, the grid field that replaces the one of every
             object; None leaves them.
-        force: resume although something has changed.
+        force: go on although something has changed.
         anyway: attack although it would prove nothing.
         frames: of each case; None writes no plots, attribution and page, either.
     """
@@ -39,7 +37,7 @@ def run_scenario(
     from mi_nerfattack.commands.shared.progress import StageBars
     from mi_nerfattack.experiment.claim import claimed
 
-    with claimed(output, resume):
+    with claimed(output):
         # seconds, with torch: not before the folder is found to be free
         from mi_nerfattack.experiment.job import attack_claimed
 
@@ -57,7 +55,6 @@ def run_scenario(
                 frames=frames,
                 on_progress=show,
                 on_notice=bars.say,
-                resume=resume,
                 force=force,
                 anyway=anyway,
             )

@@ -65,7 +65,7 @@ def read_run(folder: Path, label: str, repeat: str | None = None) -> RunPart:
         repeat or attack + "RUN",
         pictures,
         scrubbers,
-        _missing(pictures, scrubbers, f"{attack}{shlex.quote(str(folder))} --resume"),
+        _missing(pictures, scrubbers, f"{attack}{shlex.quote(str(folder))}"),
     )
 
 

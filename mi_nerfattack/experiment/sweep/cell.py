@@ -112,7 +112,7 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
     """
     output, scenario = folder_of(sweep, cell), cell.scenario
     locks.wait_for(output)
-    with claimed(output, resume=True):
+    with claimed(output):
         if is_complete(sweep, cell):
             return
         if wrong := changed(cell):
@@ -124,7 +124,7 @@ def run_cell(cell: Cell, sweep: Path, on_step: Callable[[], None]) -> None:
         job = Job(scenario, cell.text, policy, output, lambda *told: on_step())
         job.frames, job.shared = frames, SharedDrives(sweep / SHARED)
         with one_thread():
-            job.run_claimed(resume=True, anyway=cell.anyway)
+            job.run_claimed(anyway=cell.anyway)
         about = asdict(cell) | {"versions": versions()}
         del about["text"]  # the run folder's scenario.toml
         files.write_json(output / PROVENANCE, about)

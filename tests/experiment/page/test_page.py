@@ -104,7 +104,7 @@ def test_several_runs_stand_side_by_side(tmp_path, capsys):
         assert row[7] == f"{means[2] / means[1]:.1f}"
     assert "Damage against frames, straight" in {i["alt"] for i in reader.images}
     # what is missing, and what makes it
-    resume = re.escape(f"{folders[0] / 'scenario.toml'} -o {folders[0]} --resume")
+    resume = re.escape(f"{folders[0] / 'scenario.toml'} -o {folders[0]}")
     assert re.search(f"without pictures; this writes them: .*{resume}", page)
 
 
@@ -171,7 +171,7 @@ def test_what_is_not_finished_is_refused(tmp_path, capsys, make, told):
 @pytest.mark.parametrize(
     ("damage", "told"),
     [
-        (lambda run: (run / "metrics.json").unlink(), "finishes one with --resume"),
+        (lambda run: (run / "metrics.json").unlink(), "goes on with an unfinished one"),
         (lambda run: (run / "scenario.toml").unlink(), "holds no results; give run"),
         (lambda run: (run / "metrics.json").write_text("{}"), "metrics.schema"),
         (lambda run: shutil.rmtree(run), "holds no results; give run"),
