@@ -32,6 +32,11 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
+_FORMER = {
+    "replay": "reproduce",
+    "compare-drives": "car compare",
+    "serve-policy": "car serve",
+}
 _ABOUT = "Find, measure and repair failures of image-based driving policies."
 _HINT = (
     "--debug, anywhere, shows the traceback of an error; --version prints the version."
@@ -124,7 +129,9 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
     except BaseException as err:
         if not (is_interrupt(err) and getattr(command, "continues", False)):
             raise
-        again = f"{prog} {shlex.join(arguments)}"
+        anew = getattr(command, "anew", ())
+        words = shlex.join([word for word in arguments if word not in anew])
+        again = f"{prog} {words}"
         raise _Interrupted(f"; to go on, give it again:\n{again}") from err
 
 
@@ -177,6 +184,8 @@ def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -
         if isinstance(item := commands[name], Group):
             _check_name(more, item.commands, f"{name} ")
         return
+    if name in _FORMER and not group:
+        raise InputError(f"{name!r}: is called {_FORMER[name]!r} now")
     near = difflib.get_close_matches(name, commands)
     words = [name for name, _ in each(commands) if name[-1] == arguments[0]]
     near = [f"{group}{one}" for one in near] or [" ".join(one) for one in words]

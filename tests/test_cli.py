@@ -33,6 +33,8 @@ class Try:
 
     what: str = "succeed"
     """What to do."""
+    force: bool = False
+    """Do it anew."""
 
     def run(self) -> int:
         """Do it."""
@@ -115,6 +117,9 @@ def test_the_last_line_of_an_interruption_is_the_command_that_goes_on(run, monke
     assert code == 130
     assert first == "mi-nerfattack: interrupted; to go on, give it again:"
     assert last == "mi-nerfattack try --what interrupt"
+    monkeypatch.setattr(Try, "anew", ("--force",), raising=False)
+    _, _, err = run("try", "--what", "interrupt", "--force")
+    assert err.splitlines()[-1] == last
 
 
 def test_sigterm_is_an_interruption_and_the_handler_is_put_back(run):
@@ -153,6 +158,7 @@ def test_the_citation_is_of_this_version():
         ("atack", "'atack': is no command; did you mean 'attack'?"),
         ("retarin", "'retarin': is no command; did you mean 'retrain'"),
         ("drive", "'drive': is no command; did you mean 'car drive'?"),
+        ("replay", "'replay': is called 'reproduce' now"),
         ("nonsense", "'nonsense': is no command; one of doctor, demo, "),
     ],
 )

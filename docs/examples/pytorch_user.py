@@ -36,22 +36,25 @@ drives = rollout.Rollout(
 )
 
 
+(key,) = world.surrogate.keys  # of the hydrant's colours, sRGB in (0, 1)
+
+
 @dr.wrap(source="torch", target="drjit")
-def objective(texture, start):
+def objective(colour, start):
     """Sum up costs; smaller where the policy is farther from its lane."""
-    return drives([texture], state_type()(start))
+    return drives({key: colour}, state_type()(start))
 
 
-texture = torch.tensor(world.fields[0].texture.numpy(), requires_grad=True)
-# x, y in metres, heading in radians; several rows are several drives at once
+colour = torch.tensor(world.surrogate.params[key].numpy(), requires_grad=True)
+# x, y in metres, heading in radians; a row a drive
 start = torch.tensor(world.route.pose_at([20.0]), requires_grad=True)
-adam = torch.optim.Adam([texture], lr=0.05)
+adam = torch.optim.Adam([colour], lr=0.05)
 for iteration in range(ITERATIONS + 1):
     adam.zero_grad()
-    value = objective(texture, start.T)
-    value.backward()
+    (value := objective(colour, start.T)).backward()
     adam.step()
+    colour.data.clamp_(0.01, 0.99)
     print(f"iteration {iteration}: mean error {-value.item() / HORIZON:.3f} m")
 
-print("by the texture:", tuple(texture.grad.shape), f"{texture.grad.abs().sum():.2e}")
+print("by the colours:", tuple(colour.grad.shape), f"{colour.grad.abs().sum():.2e}")
 print("by the starting pose:", start.grad[0].numpy().round(2).tolist())

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 
 import drjit as dr
@@ -14,9 +14,12 @@ import mitsuba as mi
 
 import mi_nerfattack
 from mi_nerfattack.backend import llvm
+from mi_nerfattack.errors import SetupError
 
 #: Folders that show results or steer a real car; no result depends on them.
 _INERT = ("commands", "report", "robot")
+#: Packages that lie beside ours in a checkout, and in it when it is installed.
+_ELSEWHERE = ("plugins", "scenes")
 
 
 def versions() -> dict[str, str]:
@@ -39,24 +42,35 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def _own_source() -> str:
-    plugins = importlib.util.find_spec("mi_nerfattack.plugins")
-    beside = plugins and plugins.submodule_search_locations
-    places = [*mi_nerfattack.__path__, *(beside or ())]
-    return digest_code(Path(place) for place in places)
+    places = {"": Path(mi_nerfattack.__path__[0])}
+    for name in _ELSEWHERE:
+        spec = importlib.util.find_spec(f"mi_nerfattack.{name}")
+        found = spec and spec.submodule_search_locations
+        places[name] = Path((found or [places[""] / name])[0])
+    return digest_code(places)
 
 
-def digest_code(folders: Iterable[Path]) -> str:
+def digest_code(places: Mapping[str, Path]) -> str:
     """Hash the Python files that results may depend on, 12 hexadecimal digits.
 
+    Equal for a checkout and for what is installed of it.
+
     Args:
-        folders: of packages; `commands`, `report` and `robot` in them do not count.
+        places: folders by what the names of their modules begin with; of the first,
+            `commands`, `report`, `robot` and the other folders do not count.
+
+    Raises:
+        SetupError: a folder has no Python files.
     """
     total = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
-            name = path.relative_to(folder)
-            if name.parts[0] not in _INERT:
-                total.update(f"{name.as_posix()}\n".encode() + path.read_bytes())
+    for prefix, folder in places.items():
+        found = {path.relative_to(folder): path for path in folder.rglob("*.py")}
+        if not found:
+            raise SetupError(f"{folder}: has no Python files; install the package anew")
+        for name in sorted(found):
+            if prefix or name.parts[0] not in (*_INERT, *places):
+                about = f"{prefix}/{name.as_posix()}\n"
+                total.update(about.encode() + found[name].read_bytes())
     return total.hexdigest()[:12]
 
 

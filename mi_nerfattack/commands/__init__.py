@@ -43,7 +43,8 @@ from mi_nerfattack.commands.view import View
 class Command(Protocol):
     """What the command line calls after it has parsed the arguments.
 
-    One that goes on where it was interrupted also has `continues`, which is true.
+    One that goes on where it was interrupted also has `continues`, which is true, and
+    `anew`, the options that would make it start again.
     """
 
     def run(self) -> int | Result:

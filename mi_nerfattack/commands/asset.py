@@ -30,6 +30,7 @@ class Asset:
     """
 
     continues: ClassVar[bool] = True
+    anew: ClassVar[tuple[str, ...]] = ("--force",)
 
     source: tyro.conf.Positional[str]
     """glTF (.glb, .gltf), OBJ or PLY; a folder with RGBA images and poses, as fit reads
@@ -83,7 +84,7 @@ class Asset:
         """Render or read the views, fit, score and write."""
         from mi_nerfattack.commands.shared.fit_report import begun_fit
 
-        with begun_fit(self.output, self.force) as checkpoint:
+        with begun_fit(self.output) as checkpoint:
             return self._fit(checkpoint)
 
     def _fit(self, checkpoint: Path) -> Result:
@@ -101,6 +102,7 @@ class Asset:
                 self._options(found.depth is not None),
                 partial(show_fit, bars),
                 checkpoint,
+                self.force,
             )
         provenance = {
             "source": Path(self.source).name,

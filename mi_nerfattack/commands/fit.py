@@ -32,7 +32,7 @@ class Fit:
     away from it.
     """
 
-    continues: ClassVar[bool] = True
+    anew: ClassVar[tuple[str, ...]] = ("--force",)
 
     folder: tyro.conf.Positional[Path]
     """Folder with images and transforms.json or a COLMAP model, or the JSON file; or
@@ -121,6 +121,11 @@ class Fit:
             **{name: str(getattr(self, name)) for name in (*names, "spread", "no_sky")},
         }
 
+    @property
+    def continues(self) -> bool:
+        """Whether the same command finds what this one left."""
+        return self.output is not None
+
     def run(self) -> Result:
         """Fit, score, write and compare."""
         from mi_nerfattack import variant
@@ -139,7 +144,7 @@ class Fit:
             return compare_file(self.folder, self.against)
         if self.output is None:
             raise InputError("--output: missing; give the field file to write (-o)")
-        with begun_fit(self.output, self.force) as checkpoint:
+        with begun_fit(self.output) as checkpoint:
             return self._fit(self.output, checkpoint)
 
     def _fit(self, output: Path, checkpoint: Path) -> Result:
@@ -165,6 +170,7 @@ class Fit:
                 step_m=self.step_m,
                 progress=partial(show_fit, bars),
                 checkpoint=checkpoint,
+                anew=self.force,
             )
         provenance = self._provenance(images)
         return finish(

@@ -118,6 +118,7 @@ class RenderPath(_Render):
     """
 
     continues: ClassVar[bool] = True
+    anew: ClassVar[tuple[str, ...]] = ("--force",)
 
     path: Path | None = None
     """Camera path: transforms.json (OpenGL camera to world, images not needed)."""

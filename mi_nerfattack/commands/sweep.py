@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -26,8 +26,6 @@ class Sweep:
     command continues; complete cells are never done again, failed ones are. Ends with
     0, or with 1 if cells failed (with --check, if some would be refused).
     """
-
-    continues: ClassVar[bool] = True
 
     grid: tyro.conf.Positional[Path]
     """Grid file (TOML)."""
@@ -61,6 +59,11 @@ class Sweep:
     """After which SLURM stops a job; it is submitted again, up to three times."""
     json: bool = False
     """End with one line of JSON in place of the sentences."""
+
+    @property
+    def continues(self) -> bool:
+        """Whether the same command finds what this one left."""
+        return not self.check
 
     def run(self) -> Result:
         """Check the grid, or do its cells."""

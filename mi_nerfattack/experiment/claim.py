@@ -9,8 +9,10 @@ from pathlib import Path
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.io import locks
 
-#: The file that makes a folder a run's: the scenario, its paths absolute.
+#: The scenario of a run, its paths absolute.
 SCENARIO = "scenario.toml"
+#: What it was doing, and the folder of its finished drives.
+CHECKPOINT, DRIVES = "checkpoint.safetensors", "drives"
 
 
 @contextmanager
@@ -24,8 +26,9 @@ def claimed(folder: Path) -> Iterator[None]:
         InputError: as of `locks.claimed`, or it holds something else than a run.
     """
     with locks.claimed(folder):
-        present = [p for p in folder.iterdir() if not locks.is_partial(p)]
-        if present and folder / SCENARIO not in present:
+        present = {p.name for p in folder.iterdir() if not locks.is_partial(p)}
+        is_run = SCENARIO in present and present & {DRIVES, CHECKPOINT}
+        if not (is_run or present <= {SCENARIO}):  # a run that was killed at once
             raise InputError(
                 f"{folder}: holds something else than a run; choose another folder"
             )

@@ -52,8 +52,11 @@ def decisive(
     inert, named = [*OF_SEARCH, "seed"], {}
     if in_surrogate:
         inert.append("scene.deployment")
-        own, seed = scenario.attack, scenario.seed
-        named = {"jitter": f"{own.jitter and seed}", "attached": f"{own.attached}"}
+        own = scenario.attack
+        # a Mitsuba scene says itself what is random
+        random = own.jitter or scenario.scene.surrogate is not None
+        seed = f"{scenario.seed}" if random else "none"
+        named = {"random": seed, "attached": f"{own.attached}"}
     else:
         inert += [f"scene.{name}" for name in _OF_SURROGATE]
     return named | {k: v for k, v in identity.items() if not is_within(k, inert)}

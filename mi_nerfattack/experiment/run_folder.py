@@ -14,14 +14,12 @@ from typing import Any
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.evaluation.metrics import validate
 from mi_nerfattack.experiment.checkpoint import CheckpointFile
-from mi_nerfattack.experiment.claim import SCENARIO
+from mi_nerfattack.experiment.claim import CHECKPOINT, DRIVES, SCENARIO
 from mi_nerfattack.experiment.effort import Effort
 from mi_nerfattack.experiment.kept_drives import KeptDrives
 from mi_nerfattack.io import files, locks
 from mi_nerfattack.rollout.drive import ATTACK, BEST_RANDOM
 
-CHECKPOINT = "checkpoint.safetensors"
-DRIVES = "drives"
 METRICS = "metrics.json"
 _WIDTH = 100  # characters of the table in a notebook
 
@@ -135,8 +133,8 @@ class RunFolder:
             on_notice: told about what is taken up and ignored.
 
         Raises:
-            InputError: the folder is no run's, a file is damaged, or the run was of
-                another scenario or other versions.
+            InputError: a file is damaged, or the run was of another scenario or other
+                versions.
         """
         if not self._holds_run(force, on_notice):
             return

@@ -18,7 +18,7 @@ from mi_nerfattack.io.resumable import Record, Unit, check_entries, misfits_told
 FORMAT = "mi_nerfattack fit checkpoint 3"
 _REMEDY = (
     "go on with the same images, depth, options and versions, or start again, which "
-    "removes the file (--force)"
+    "replaces the file (--force)"
 )
 _EVERY_S = 30.0
 _MAX_SHARE = 0.02  # of the time that may go into writing
@@ -37,6 +37,7 @@ class FitCheckpoint:
     Args:
         path: file, replaced atomically; if it is there, the fit goes on from it.
         training: the fit.
+        anew: it does not.
 
     Attributes:
         elapsed_s: wall time of the fit before it was interrupted.
@@ -47,13 +48,13 @@ class FitCheckpoint:
             or versions.
     """
 
-    def __init__(self, path: Path, training: Training) -> None:
+    def __init__(self, path: Path, training: Training, anew: bool = False) -> None:
         self.training = training
         self.elapsed_s = 0.0
         self.history: list[FitProgress] = []
         identity = {"format": FORMAT, **versions(), "fit": _digest(training)}
         self._unit = Unit(path, identity, FitRecord, _REMEDY)
-        kept = self._unit.read()
+        kept = None if anew else self._unit.read()
         if kept is not None:
             check_entries(path, kept.tensors, training.tensors())
             with misfits_told(path):

@@ -48,6 +48,7 @@ def fit_ngp(
     cone: float = 1 / 128,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
+    anew: bool = False,
 ) -> FitResult:
     """Fit an NGP with a sky to images of a scene.
 
@@ -67,6 +68,7 @@ def fit_ngp(
         progress: called every 25 steps and at the end.
         checkpoint: file that keeps the state of the fit, which goes on from it if it is
             there; it is the caller's to delete once the field is saved.
+        anew: start again, and replace the checkpoint with the first that is saved.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -89,7 +91,7 @@ def fit_ngp(
     if images.channels == 4 or not options.sky:
         ngp.set_parameter("sky", dr.full(mi.Float, _BLACK, dr.width(ngp.sky)))
     training = Training(ngp, images, options, depth)
-    return _run(training, progress, checkpoint)
+    return _run(training, progress, checkpoint, anew)
 
 
 def fit_grid(
@@ -101,6 +103,7 @@ def fit_grid(
     depth: np.ndarray | None = None,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
+    anew: bool = False,
 ) -> FitResult:
     """Fit a decoder-free grid to images of an object with alpha.
 
@@ -116,6 +119,7 @@ def fit_grid(
         depth: (n, height, width), metres along the ray, infinite beside the object.
         progress: as of `fit_ngp`.
         checkpoint: likewise.
+        anew: likewise.
 
     Returns:
         the field, and its scores on the held-out images.
@@ -133,7 +137,7 @@ def fit_grid(
         layout or GridLayout(), low, high, density_scale=1 / float((high - low).max())
     )
     training = Training(grid, images, options, depth, box_only=True)
-    return _run(training, progress, checkpoint)
+    return _run(training, progress, checkpoint, anew)
 
 
 def fit_object(
@@ -142,6 +146,7 @@ def fit_object(
     options: FitOptions,
     progress: ProgressCallback = no_progress,
     checkpoint: Path | None = None,
+    anew: bool = False,
 ) -> FitResult:
     """Fit a grid to views of an object, in a box with room around it.
 
@@ -151,6 +156,7 @@ def fit_object(
         options: of the fit.
         progress: as of `fit_ngp`.
         checkpoint: likewise.
+        anew: likewise.
     """
     # room for the outermost vertices' own cells
     room = 2.0 / resolution * float((views.upper - views.lower).max())
@@ -163,6 +169,7 @@ def fit_object(
         views.depth,
         progress,
         checkpoint,
+        anew,
     )
     for name in ("lower", "upper"):
         corner = " ".join(map(repr, getattr(views, name).tolist()))
@@ -171,10 +178,10 @@ def fit_object(
 
 
 def _run(
-    training: Training, progress: ProgressCallback, path: Path | None
+    training: Training, progress: ProgressCallback, path: Path | None, anew: bool
 ) -> FitResult:
     """Do steps until the fit is done; interrupted, keep its state."""
-    checkpoint = None if path is None else FitCheckpoint(path, training)
+    checkpoint = None if path is None else FitCheckpoint(path, training, anew)
     clock = _Clock(training, checkpoint)
     try:
         while not clock.is_over():

@@ -202,6 +202,7 @@ def test_files_beside_the_frames_of_a_video_stay(run):
         ("--seed 1", "seed"),
         ("--size 8 6", "camera"),
         ("--set spp=1", "scene_parameters"),
+        ("--precision float", "precision"),
     ],
 )
 def test_frames_of_something_else_are_not_continued(run, change, key):

@@ -57,12 +57,17 @@ def test_folder_of_something_else_is_left_alone(folder, tmp_path):
     with pytest.raises(InputError, match="holds something else than a run"):
         job(folder, tmp_path).run()
     (tmp_path / "scenario.toml").write_text("# a scenario of my own")
-    with pytest.raises(InputError, match=r"scenario\.toml: is another scenario"):
+    with pytest.raises(InputError, match="holds something else than a run"):
         job(folder, tmp_path).run()
+    (tmp_path / "alone").mkdir()
+    shutil.move(tmp_path / "scenario.toml", tmp_path / "alone")
+    with pytest.raises(InputError, match=r"scenario\.toml: is another scenario"):
+        job(folder, tmp_path / "alone").run()
     with pytest.raises(InputError, match="is not a folder"):
         job(folder, tmp_path / "notes.txt").run()
     assert len(list(tmp_path.iterdir())) == 2
-    assert (tmp_path / "scenario.toml").read_text() == "# a scenario of my own"
+    kept = tmp_path / "alone" / "scenario.toml"
+    assert kept.read_text() == "# a scenario of my own"
 
 
 @pytest.mark.usefixtures("no_results")
@@ -181,12 +186,13 @@ def test_a_claimed_folder_is_ours_and_empty_ones_are_removed(tmp_path):
         with claimed(output):
             pass
     (output / "scenario.toml").write_text("")
+    (output / "drives").mkdir()
     with claimed(output):
         pass
     with pytest.raises(InputError, match="is not a folder"):
         with claimed(output / "a"):
             pass
-    assert {path.name for path in output.iterdir()} == {"a", "scenario.toml"}
+    assert {path.name for path in output.iterdir()} == {"a", "drives", "scenario.toml"}
 
 
 def test_a_second_attack_is_refused_before_anything_is_loaded(tmp_path):

@@ -21,6 +21,16 @@ WAYS = {
     "entity": ("a&b.png", BITMAP.format('value="a&amp;b.png"')),
     "search path": ("in/t.png", '<path value="in"/>' + BITMAP.format('value="t.png"')),
     "included": ("t.png", '<include filename="inner.xml"/>'),
+    "spectrum of a default of defaults": (
+        "s.spd",
+        '<default value="s" name="d"/><default value="$d.spd" name="s"/>'
+        '<bsdf type="conductor" id="c"><spectrum name="eta" filename="$s"/></bsdf>',
+    ),
+    "spectrum with an entity": (
+        "a&b.spd",
+        '<bsdf type="conductor" id="c"><spectrum name="eta" filename="a&amp;b.spd"/>'
+        "</bsdf>",
+    ),
     "spectrum": (
         "s.spd",
         '<default name="s" value="s.spd"/><bsdf type="conductor" id="c">'

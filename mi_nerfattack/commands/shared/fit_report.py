@@ -41,14 +41,13 @@ def check_output(path: Path) -> None:
 
 
 @contextmanager
-def begun_fit(output: Path, force: bool) -> Iterator[Path]:
+def begun_fit(output: Path) -> Iterator[Path]:
     """Check that a fit may begin, and keep other processes out until it ends.
 
     It claims the folder of its report.
 
     Args:
         output: field file.
-        force: forget what an interrupted fit left.
 
     Returns:
         the path of its checkpoint.
@@ -58,8 +57,6 @@ def begun_fit(output: Path, force: bool) -> Iterator[Path]:
     check_output(output)
     with locks.claimed(report_folder(output)):
         checkpoint = output.with_suffix(".checkpoint.safetensors")
-        if force:
-            checkpoint.unlink(missing_ok=True)
         yield checkpoint
 
 

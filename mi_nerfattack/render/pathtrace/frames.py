@@ -111,7 +111,7 @@ class FrameRenderer:
         self._names: list[str] | None = None
         self._lens = _describe_camera(self.sensor)
         self._digests = {"scene": files.sha256(self.path)}
-        for name, file in named_files(self.path).items():
+        for name, file in named_files(self.path, parameters).items():
             self._digests[name] = files.sha256(file)
         self._origin = {
             "scene": self.path.name,

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,6 @@ from mi_nerfattack.scenes import BUNDLED, resolve
 
 _CROP = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 _VALUE = re.compile(r"""=\s*["']([^"'$\n]+)["']""")
-_FILENAME = re.compile(r"""filename\s*=\s*["']([^"']+)["']""")
-_DEFAULT = re.compile(
-    r"""<default\s+name\s*=\s*["']([^"']+)["']\s+value\s*=\s*["']([^"']*)["']"""
-)
 _PARAMETER = re.compile(r"\$(\w+)")
 
 
@@ -88,14 +85,17 @@ def scene_files(path: str | Path) -> list[Path]:
     return list(dict.fromkeys([Path(path).resolve(), *named_files(path).values()]))
 
 
-def named_files(path: str | Path) -> dict[str, Path]:
+def named_files(
+    path: str | Path, parameters: Mapping[str, str] | None = None
+) -> dict[str, Path]:
     """Find all files that a scene's file names, as far as they exist.
 
-    Names are those that Mitsuba reads: with the values of the ``$NAME`` that have a
-    `<default>`, and looked for in the folders of `<path>`, too.
+    Names are those that Mitsuba reads: with the values of ``$NAME``, and looked for in
+    the folders of `<path>`, too.
 
     Args:
         path: XML file; included ones are followed.
+        parameters: as of :func:`load_scene`.
 
     Returns:
         by name: of included files relative to the folder of `path`, of others as they
@@ -106,7 +106,8 @@ def named_files(path: str | Path) -> dict[str, Path]:
     """
     with _resolved_from(path):
         try:
-            state = mi.parser.parse_file(_config(), str(path))
+            given = dict(parameters or {})
+            state = mi.parser.parse_file(_config(), str(path), **given)
         except RuntimeError as error:
             raise InputError(f"{path}: {_in_one_line(path, str(error))}") from error
         texts = [Path(str(name)).resolve() for name in state.files]
@@ -116,8 +117,8 @@ def named_files(path: str | Path) -> dict[str, Path]:
             for key in node.props
             if isinstance(node.props[key], str)
         ]
-        for text in texts:  # the parser replaces a spectrum's file by its numbers
-            names += _spectra(files.read_text(text))
+        # the parser replaces a spectrum's file by its numbers
+        names += _spectra([files.read_text(text) for text in texts], given)
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]
         found = {
             name: resolve(name)
@@ -127,18 +128,47 @@ def named_files(path: str | Path) -> dict[str, Path]:
             if name
         }
     folder = Path(path).resolve().parent
-    included = {os.path.relpath(text, folder): text for text in texts[1:]}
+    included = {_relative(text, folder): text for text in texts[1:]}
     there = {k: file.resolve() for k, file in found.items() if os.path.isfile(file)}
     return included | there
 
 
-def _spectra(text: str) -> list[str]:
-    """Return the file names of spectra in an XML text."""
-    values = dict(_DEFAULT.findall(text))
-    return [
-        _PARAMETER.sub(lambda match: values.get(match[1], match[0]), name)
-        for name in _FILENAME.findall(text)
-    ]
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return os.path.relpath(path, folder)
+    except ValueError:  # on another drive of Windows
+        return str(path)
+
+
+class _Attributes(HTMLParser):
+    """Attributes of elements in a text that is as lax as Mitsuba's parser takes it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.defaults: dict[str, str] = {}
+        self.filenames: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = {name: value or "" for name, value in attrs}
+        if tag == "default" and "name" in found:
+            self.defaults[found["name"]] = found.get("value", "")
+        elif "filename" in found:
+            self.filenames.append(found["filename"])
+
+
+def _spectra(texts: list[str], parameters: Mapping[str, str]) -> list[str]:
+    """Return the file names of spectra in XML texts."""
+    parts = [_Attributes(text) for text in texts]
+    values = {k: v for part in parts for k, v in part.defaults.items()}
+    values |= parameters
+    names = [name for part in parts for name in part.filenames]
+    for _ in range(len(values)):  # a default may name others
+        names = [
+            _PARAMETER.sub(lambda match: values.get(match[1], match[0]), name)
+            for name in names
+        ]
+    return names
 
 
 def _config() -> Any:

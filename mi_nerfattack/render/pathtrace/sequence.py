@@ -19,7 +19,7 @@ from mi_nerfattack.render.pathtrace.frames import (
     write_frame,
 )
 
-# What must agree for a frame to be continued from; the program's version need not.
+# What must agree for a frame to be kept.
 _COMPARED = (
     "digests",
     "scene_parameters",
@@ -28,6 +28,8 @@ _COMPARED = (
     "spp",
     "seed",
     "variant",
+    "versions",
+    "precision",
 )
 
 
@@ -41,8 +43,8 @@ class Shot:
         seed: of the first pose; frame i has `seed + i`, modulo 2^32.
         precision: of colour and opacity in the files.
         anew: render frames that are there again; by default they are kept, and must
-            have been rendered from the same files, pose, camera, samples, seed and
-            variant.
+            have been rendered from the same files, pose, camera, samples and seed, by
+            the same programs, with the same precision.
     """
 
     renderer: FrameRenderer
@@ -136,11 +138,13 @@ def _render(
     for i, (path, pose) in enumerate(zip(paths, shot.camera_to_world, strict=True)):
         seed = (shot.seed + i) % 2**32
         kept = path.is_file() and not shot.anew
+        more = {"precision": shot.precision}
         if kept:
-            check_same(path, shot.renderer.metadata(pose, seed))
+            check_same(path, shot.renderer.metadata(pose, seed) | more)
         else:
             frame = select(shot.renderer.render(pose, seed))
-            write_frame(path, frame, shot.precision)
+            told = replace(frame, metadata={**frame.metadata, **more})
+            write_frame(path, told, shot.precision)
         progress(i + 1, total, kept)
     return paths
 
