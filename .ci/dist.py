@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 DIST, TREE, EMPTY = ROOT / "dist", ROOT / "build" / "tree", ROOT / "build" / "empty"
 MOST_MB = 45
 LEAST_TYPED = 0.9  # of the public names, so that other people's checkers know them
-RENDER = "render bundled:intersection/field.xml -o frame.png --size 48 16 --spp 1"
+RENDER = "render frame bundled:intersection/field.xml -o frame.png --size 48 16 --spp 1"
 
 
 def call(*command: str | Path, where: Path = ROOT) -> str:
