@@ -32,11 +32,6 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-_FORMER = {
-    "replay": "reproduce",
-    "compare-drives": "car compare",
-    "serve-policy": "car serve",
-}
 _ABOUT = "Find, measure and repair failures of image-based driving policies."
 _HINT = (
     "--debug, anywhere, shows the traceback of an error; --version prints the version."
@@ -184,8 +179,6 @@ def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -
         if isinstance(item := commands[name], Group):
             _check_name(more, item.commands, f"{name} ")
         return
-    if name in _FORMER and not group:
-        raise InputError(f"{name!r}: is called {_FORMER[name]!r} now")
     near = difflib.get_close_matches(name, commands)
     words = [name for name, _ in each(commands) if name[-1] == arguments[0]]
     near = [f"{group}{one}" for one in near] or [" ".join(one) for one in words]

@@ -158,7 +158,6 @@ def test_the_citation_is_of_this_version():
         ("atack", "'atack': is no command; did you mean 'attack'?"),
         ("retarin", "'retarin': is no command; did you mean 'retrain'"),
         ("drive", "'drive': is no command; did you mean 'car drive'?"),
-        ("replay", "'replay': is called 'reproduce' now"),
         ("nonsense", "'nonsense': is no command; one of doctor, demo, "),
     ],
 )

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 import mi_nerfattack
-from mi_nerfattack.backend import llvm
+from mi_nerfattack.backend import llvm, variant
 from mi_nerfattack.errors import SetupError
 
 #: Folders that show results or steer a real car; no result depends on them.
@@ -36,7 +36,7 @@ def versions() -> dict[str, str]:
         "numpy": _installed("numpy"),
         "torch": _installed("torch"),
         "llvm": ".".join(map(str, llvm.version() or ())),
-        "variant": str(mi.variant()),
+        "variant": variant.ensure(),
     }
 
 

@@ -1,4 +1,4 @@
-"""``mi-nerfattack export``: an object as a mesh, as pictures, as a field, on paper."""
+"""``mi-nerfattack export``: an object as a mesh, as pictures, on paper."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 class Export:
     """Write an object's field as a coloured mesh (glTF) or as six pictures (PNG).
 
-    Or write the field anew: files of earlier versions become smaller and show the same.
     A run folder of attack holds its attacked objects as fields, objects/ID.safetensors.
     Colours are radiance: reflectance times the light that the object was captured in.
     The attacked cube of a run folder is also put on paper (--print, to cut, fold and
@@ -30,8 +29,7 @@ class Export:
     """Field of an object (.safetensors), as asset and attack write them; with --print
     and --monitor a run folder of attack."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json;
-    FILE.safetensors for a field, which may be the same file."""
+    """FILE.glb for a mesh; a folder for px.png, nx.png ... nz.png and faces.json."""
     mesh: Path | None = None
     """Colour the triangles of this mesh, which the field was fitted to, in place of
     the surface of the field; give the size and axes that were given to asset."""
@@ -66,18 +64,14 @@ class Export:
                 "--monitor"
             )
         output, suffix = self.output, self.output.suffix.lower()
-        if suffix not in (".glb", ".safetensors", ""):
-            raise InputError(
-                f"{output}: give FILE.glb, FILE.safetensors or a folder's name"
-            )
-        self._refuse_unused(output, is_mesh=suffix == ".glb")
+        if suffix not in (".glb", ""):
+            raise InputError(f"{output}: give FILE.glb or a folder's name")
+        self._refuse_unused(output)
         variant.ensure()
         grid = load_grid(self.field)
         if suffix == "":
             return self._write_faces(grid, output)
         files.check_writable(output)
-        if suffix == ".safetensors":
-            return self._write_field(grid, output)
         return self._write_mesh(grid, output)
 
     def _write_box(self) -> Result:
@@ -100,24 +94,6 @@ class Export:
         document = {kind: figures for kind, (figures, _) in found.items()}
         told = [sentence for _, sentence in found.values()]
         return Result(document, lambda: print(*told, sep="\n"))
-
-    def _write_field(self, grid: GridField, output: Path) -> Result:
-        from mi_nerfattack.fields.io import save_field
-
-        before = self.field.stat().st_size
-        save_field(output, grid)
-        document = {
-            "output": str(output),
-            "held_vertices": int(grid.held_vertices().sum()),
-            "vertices": grid.n_vertices,
-            "bytes": output.stat().st_size,
-            "bytes_before": before,
-        }
-        told = (
-            f"Wrote {output}: {document['held_vertices']} of {grid.n_vertices} "
-            f"vertices, {document['bytes']} bytes; {self.field} had {before}"
-        )
-        return Result(document, lambda: print(told))
 
     def _write_mesh(self, grid: GridField, output: Path) -> Result:
         from mi_nerfattack.capture.mesh.gltf_writer import write_glb
@@ -151,11 +127,11 @@ class Export:
         figures = {"size_m": size_m, "pixels_per_m": float(faces.pixels_per_m)}
         return Result({"output": str(output), **figures}, lambda: print(told))
 
-    def _refuse_unused(self, output: Path, is_mesh: bool) -> None:
+    def _refuse_unused(self, output: Path) -> None:
         """Raise InputError for an option that the kind of output has no use for."""
         from mi_nerfattack.errors import InputError
 
-        if not is_mesh and self.mesh is not None:
+        if not output.suffix and self.mesh is not None:
             raise InputError(f"--mesh: is for FILE.glb, not for {output}")
         if output.suffix and self.pixels_per_m is not None:
             raise InputError(f"--pixels-per-m: is for pictures, not for {output}")

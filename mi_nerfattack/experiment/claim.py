@@ -19,9 +19,6 @@ CHECKPOINT, DRIVES = "checkpoint.safetensors", "drives"
 def claimed(folder: Path) -> Iterator[None]:
     """Make a run folder and keep other processes out of it, see `locks.claimed`.
 
-    Args:
-        folder: missing, empty, or that of a run.
-
     Raises:
         InputError: as of `locks.claimed`, or it holds something else than a run.
     """

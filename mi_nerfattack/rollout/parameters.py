@@ -63,11 +63,7 @@ class Differentiated:
         self.keys: tuple[str, ...] = ()
 
     def select(self, keys: Sequence[str]) -> None:
-        """Differentiate by other parameters.
-
-        Raises:
-            InputError: there is no such parameter, or it has no derivative here.
-        """
+        """See :meth:`AbstractDifferentiableSensor.select`."""
         for key in keys:
             if key not in self.params:
                 near = ", ".join(name for name in self.params.keys() if "." in name)
@@ -87,15 +83,7 @@ class Differentiated:
         return {key: self.params[key] for key in self.keys}
 
     def assign(self, values: Mapping[str, Any]) -> None:
-        """Replace parameters by detached values.
-
-        Args:
-            values: by key. A value that the scene has already is left as it is, with
-                its derivatives.
-
-        Raises:
-            InputError: there is no such parameter, or its value is not allowed.
-        """
+        """See :meth:`AbstractDifferentiableSensor.set_parameters`."""
         for key, value in values.items():
             if key not in self.params:
                 raise InputError(f"{key}: no parameter of the scene")
@@ -104,14 +92,7 @@ class Differentiated:
         self.params.update()
 
     def start(self, more: Sequence[str] = ()) -> None:
-        """Let the gradients of the selected parameters be zero.
-
-        Args:
-            more: keys of parameters to differentiate by, too.
-
-        Raises:
-            InputError: a parameter has no derivative; the message names what works.
-        """
+        """See :meth:`AbstractDifferentiableSensor.start_gradient`."""
         self.stop()
         try:
             self._started = tuple(dict.fromkeys([*self.keys, *more]))

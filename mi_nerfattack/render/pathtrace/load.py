@@ -98,8 +98,7 @@ def named_files(
         parameters: as of :func:`load_scene`.
 
     Returns:
-        by name: of included files relative to the folder of `path`, of others as they
-        are written.
+        by name as it is written; included files are numbered.
 
     Raises:
         InputError: the XML cannot be read.
@@ -127,17 +126,9 @@ def named_files(
             for name in names
             if name
         }
-    folder = Path(path).resolve().parent
-    included = {_relative(text, folder): text for text in texts[1:]}
+    included = {f"included {k}": text for k, text in enumerate(texts[1:])}
     there = {k: file.resolve() for k, file in found.items() if os.path.isfile(file)}
     return included | there
-
-
-def _relative(path: Path, folder: Path) -> str:
-    try:
-        return os.path.relpath(path, folder)
-    except ValueError:  # on another drive of Windows
-        return str(path)
 
 
 class _Attributes(HTMLParser):
