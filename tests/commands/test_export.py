@@ -270,8 +270,7 @@ class TestCommand:
                 (good, "-o", tmp_path / "f", "--mesh", "a.glb"),
                 "--mesh: is for FILE.glb",
             ),
-            ((good, "-o", good, "--mesh", "a.glb"), "--mesh: is for FILE.glb"),
-            ((good, "-o", good, "--pixels-per-m", 9), "--pixels-per-m: is for pict"),
+            ((good, "-o", good), "give FILE.glb or a folder's name"),
             ((good, "-o", out, "--mesh", tmp_path / "none.glb"), "none.glb: does not"),
         ):
             code, shown, error = self.call(capsys, *arguments)
