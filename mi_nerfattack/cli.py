@@ -10,19 +10,21 @@ import contextlib
 import difflib
 import errno
 import inspect
+import operator
 import os
 import shlex
 import sys
 import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Union
+from functools import reduce
+from typing import Annotated, Any
 
 import tyro
 
 import mi_nerfattack
 from mi_nerfattack.backend.interrupts import raised_interrupts
-from mi_nerfattack.commands import THEMES, Command, Commands, Group, each
+from mi_nerfattack.commands import THEMES, Command, Commands, Group, each, flat
 from mi_nerfattack.commands.shared.result import stdout_to_stderr
 from mi_nerfattack.errors import InputError, NerfAttackError, is_interrupt
 
@@ -101,7 +103,7 @@ def _run(arguments: list[str], themes: Mapping[str, Commands], prog: str) -> int
     if arguments == ["--version"]:
         print(f"{prog} {mi_nerfattack.__version__}")
         return 0
-    commands = {name: one for theme in themes.values() for name, one in theme.items()}
+    commands = flat(themes)
     _check_name(arguments, commands)
     about, level, rest = _ABOUT, prog, arguments
     if arguments and isinstance(group := commands.get(arguments[0]), Group):
@@ -143,8 +145,7 @@ def _one_of(commands: Commands) -> Any:
         ]
         for name, item in commands.items()
     ]
-    members.append(Annotated[None, tyro.conf.Suppress])  # a union has two at least
-    return Union[tuple(members)]  # noqa: UP007  # of a list
+    return reduce(operator.or_, members)
 
 
 def _overview(themes: Mapping[str, Commands], about: str, prog: str) -> str:
@@ -180,8 +181,8 @@ def _check_name(arguments: Sequence[str], commands: Commands, group: str = "") -
             _check_name(more, item.commands, f"{name} ")
         return
     near = difflib.get_close_matches(name, commands)
-    words = [name for name, _ in each(commands) if name[-1] == arguments[0]]
-    near = [f"{group}{one}" for one in near] or [" ".join(one) for one in words]
+    near = [f"{group}{one}" for one in near]
+    near = near or [" ".join(one) for one, _ in each(commands) if one[-1] == name]
     one_of = f"one of {', '.join(commands)}"
     meant = f"did you mean {' or '.join(map(repr, near))}?" if near else one_of
     raise InputError(f"{group + name!r}: is no command; {meant}")

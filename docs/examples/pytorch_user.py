@@ -34,8 +34,6 @@ drives = rollout.Rollout(
     HORIZON,
     adjoint=rollout.KeptBackgrounds(),
 )
-
-
 (key,) = world.surrogate.keys  # of the hydrant's colours, sRGB in (0, 1)
 
 
@@ -51,7 +49,8 @@ start = torch.tensor(world.route.pose_at([20.0]), requires_grad=True)
 adam = torch.optim.Adam([colour], lr=0.05)
 for iteration in range(ITERATIONS + 1):
     adam.zero_grad()
-    (value := objective(colour, start.T)).backward()
+    value = objective(colour, start.T)
+    value.backward()
     adam.step()
     colour.data.clamp_(0.01, 0.99)
     print(f"iteration {iteration}: mean error {-value.item() / HORIZON:.3f} m")

@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_nerfattack.attack.freedom import Freedom
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.vehicle.route.route import Route
@@ -74,7 +75,7 @@ class AbstractAttack(ABC):
         self.history: list[IterationRecord] = []
         self.best_objective: float = np.inf
         self.best_mean_m: float = 0.0
-        self.best_offsets: np.ndarray = self.offsets()
+        self.best_offsets: np.ndarray = offsets_of(sensor.objects)
         self.whole = True
 
     @property
@@ -152,7 +153,7 @@ class AbstractAttack(ABC):
     def restore_best(self) -> None:
         """Give the objects the parameters of the iteration with the least objective."""
         self.sensor.set_textures(self.best)
-        self.move(self.best_offsets)
+        move_all(self.sensor.objects, self.best_offsets)
 
     def measure_through(self, sensor: AbstractDifferentiableSensor) -> float:
         """Drive in a closed loop through another sensor, with the present textures.
@@ -197,16 +198,6 @@ class AbstractAttack(ABC):
             f"{type(self).__name__}: what it was told is of another scenario, and "
             "counts no longer; start a new run folder"
         )
-
-    def offsets(self) -> np.ndarray:
-        """Return where the objects were moved to, (k, 6): see ``Pose.moved``."""
-        found = [posed.offset for posed in self.sensor.objects]
-        return np.array(found).reshape(-1, 6)
-
-    def move(self, offsets: np.ndarray) -> None:
-        """Move the objects by offsets (k, 6) from where they were put."""
-        for posed, offset in zip(self.sensor.objects, offsets, strict=True):
-            posed.move(offset)
 
 
 def history_tensors(history: Sequence[IterationRecord]) -> dict[str, np.ndarray]:

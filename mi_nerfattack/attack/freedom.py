@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from mi_nerfattack.attack.texture.colours import AbstractColouring, Colours
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.grid import GridField
-from mi_nerfattack.render.camera.pose import offset_gradient
 from mi_nerfattack.rollout.sensor import AbstractDifferentiableSensor
 from mi_nerfattack.rollout.sweep import Gradient
 
@@ -71,14 +68,5 @@ def offset_gradients(
         gradient: with that by their poses among its parameters.
     """
     pairs = zip(sensor.objects, sensor.pose_keys, strict=True)
-    found = [
-        offset_gradient(
-            _matrix(posed.to_world), _matrix(gradient.parameters[key]), posed.offset
-        )
-        for posed, key in pairs
-    ]
+    found = [posed.offset_gradient(gradient.parameters[key]) for posed, key in pairs]
     return np.array(found).reshape(-1, 6)
-
-
-def _matrix(transform: Any) -> np.ndarray:
-    return np.array(dr.detach(transform.matrix), np.float64).reshape(4, 4)

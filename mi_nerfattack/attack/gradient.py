@@ -24,6 +24,7 @@ from mi_nerfattack.attack.schedule import Schedule
 from mi_nerfattack.attack.texture.colours import AbstractColouring
 from mi_nerfattack.backend.adam import adam_tensors, load_adam
 from mi_nerfattack.errors import InputError
+from mi_nerfattack.render.posed import move_all, offsets_of
 from mi_nerfattack.rollout.function import Evaluation, Rollout
 from mi_nerfattack.rollout.sweep import Gradient, differentiable
 from mi_nerfattack.vehicle.route.route import Route
@@ -206,7 +207,7 @@ class GradientAttack(AbstractAttack):
             self.sensor.set_textures([_tensor(texture) for texture in textures])
         if self.freedom.pose_rate is not None:
             offsets = dr.detach(self.optimiser[OFFSETS])
-            self.move(np.array(offsets, np.float64))
+            move_all(self.sensor.objects, np.array(offsets, np.float64))
 
     def _colours(self) -> Parameters:
         """Return what is stepped in, by the optimiser's key."""
@@ -285,7 +286,8 @@ class GradientAttack(AbstractAttack):
         mean, value = float(error.mean()), seen.value
         value += sum(c.penalty(colours[key]) for key, c in self._colourings.items())
         if value < self.best_objective:
-            self._best, self.best_offsets = colours, self.offsets()
+            self._best = colours
+            self.best_offsets = offsets_of(self.sensor.objects)
             self.best_objective, self.best_mean_m = value, mean
         costs = tuple(map(float, seen.costs))
         return IterationRecord(self.iteration, value, mean, float(error.max()), costs)

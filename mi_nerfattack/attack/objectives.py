@@ -127,8 +127,10 @@ class DepartureTime(AbstractObjective):
 
     def evaluate(self, states: StateHistory) -> Any:
         """See :meth:`.AbstractObjective.evaluate`."""
+        # ln p_t of each period
         distance = dr.abs(self.route.cross_track(states.rows))
         stayed = _log_sigmoid((self.limit_m - distance) / self.softness_m)
+        # ln S_t is a running sum
         return states.dt * states.total(dr.exp(states.running(stayed)))
 
 

@@ -99,9 +99,14 @@ THEMES: dict[str, Commands] = {
     "look": {"report": Report, "view": View},
     "car": {"car": _CAR},
 }
-COMMANDS: dict[str, type[Command] | Group] = {
-    name: command for theme in THEMES.values() for name, command in theme.items()
-}
+
+
+def flat(themes: Mapping[str, Commands]) -> dict[str, type[Command] | Group]:
+    """Return what themes name, without them."""
+    return {name: one for theme in themes.values() for name, one in theme.items()}
+
+
+COMMANDS = flat(THEMES)
 
 
 def each(commands: Commands) -> Iterator[tuple[tuple[str, ...], type[Command]]]:
@@ -113,4 +118,4 @@ def each(commands: Commands) -> Iterator[tuple[tuple[str, ...], type[Command]]]:
             yield (name,), item
 
 
-__all__ = ["COMMANDS", "THEMES", "Command", "Commands", "Group", "each"]
+__all__ = ["COMMANDS", "THEMES", "Command", "Commands", "Group", "each", "flat"]

@@ -30,8 +30,7 @@ def verdict(document: Figures, surrogate: str) -> list[str]:
         limit = document["departure_limits_m"][route]
         found.append(_policy(environments, limit))
         for name in sorted(environments, key=lambda name: name != surrogate):
-            over = _over_starts(document, name, environments[name])
-            found += _attack(name, environments[name], name == surrogate, over)
+            found += _attack(document, name, environments[name], name == surrogate)
     for name, replayed in document.get("replay", {}).items():
         found += _replayed(name, replayed)
     found += _search(document)
@@ -59,10 +58,8 @@ def _policy(environments: Figures, limit: float) -> str:
     )
 
 
-def _over_starts(document: Figures, name: str, cases: Figures) -> str:
+def _over_starts(document: Figures, name: str) -> str:
     """Say within what the ratio to random looks lies, by drives of equal starts."""
-    if ATTACK not in cases or RANDOM not in cases:
-        return ""
     attack, random = (
         [
             replace(drive, scenario=f"start {drive.start}")
@@ -78,14 +75,14 @@ def _over_starts(document: Figures, name: str, cases: Figures) -> str:
 
 
 def _attack(
-    name: str, cases: Figures, is_surrogate: bool, over_starts: str
+    document: Figures, name: str, cases: Figures, is_surrogate: bool
 ) -> Iterator[str]:
     if ATTACK not in cases or RANDOM not in cases:
         return
     attack, mean = cases[ATTACK], cases[ATTACK]["cross_track_mean_m"]
     ratio = _ratio(mean, cases[RANDOM]["cross_track_mean_m"])
     text = f"a mean error of {mean:.3f} m, {ratio:.1f} times that of random looks"
-    text += over_starts
+    text += _over_starts(document, name)
     if BEST_RANDOM in cases:
         best = _ratio(mean, cases[BEST_RANDOM]["cross_track_mean_m"])
         text += f" and {best:.1f} times that of the best of them"

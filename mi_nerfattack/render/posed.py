@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -11,7 +12,7 @@ import numpy as np
 
 from mi_nerfattack.errors import InputError
 from mi_nerfattack.fields.base import AbstractField
-from mi_nerfattack.render.camera.pose import Pose
+from mi_nerfattack.render.camera.pose import Pose, offset_gradient
 from mi_nerfattack.render.rays import meet_box
 
 
@@ -105,8 +106,12 @@ class PosedField:
                 "see_all() of the field)"
             )
 
+    def offset_gradient(self, by_pose: Any) -> np.ndarray:
+        """Return the derivative by `offset`, (6,), from that by `to_world`."""
+        return offset_gradient(self._matrix(), _numbers(by_pose), self.offset)
+
     def _matrix(self) -> np.ndarray:
-        return np.array(dr.detach(self.to_world.matrix), np.float64).reshape(4, 4)
+        return _numbers(self.to_world)
 
     def _set(self, pose: Pose) -> None:
         self.pose: Pose = pose
@@ -276,3 +281,18 @@ class PosedField:
         if self._gain is not None:
             radiance *= self._gain
         return self.in_world(density), radiance
+
+
+def offsets_of(objects: Sequence[PosedField]) -> np.ndarray:
+    """Return where objects were moved to, (k, 6): see :meth:`Pose.moved`."""
+    return np.array([posed.offset for posed in objects]).reshape(-1, 6)
+
+
+def move_all(objects: Sequence[PosedField], offsets: np.ndarray) -> None:
+    """Move objects by offsets (k, 6) from where they were put."""
+    for posed, offset in zip(objects, offsets, strict=True):
+        posed.move(offset)
+
+
+def _numbers(transform: Any) -> np.ndarray:
+    return np.array(dr.detach(transform.matrix), np.float64).reshape(4, 4)

@@ -201,8 +201,7 @@ class Rollout:
         Returns:
             one entry, attached to whatever of both is. Reverse mode only.
         """
-        # Mitsuba's parameters and optimisers are no `Mapping` by inheritance
-        every = {key: values[key] for key in values.keys()}  # noqa: SIM118
+        every = dict(values.items())  # also of Mitsuba's parameters and optimisers
         attached = {k: v for k, v in every.items() if dr.grad_enabled(v)}
         others = {k: v for k, v in every.items() if k not in attached}
         return dr.custom(_RolloutOp, _Held(self, others), attached, initial)

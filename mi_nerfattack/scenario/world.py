@@ -23,7 +23,7 @@ from mi_nerfattack.policy.base import AbstractPolicy
 from mi_nerfattack.render.backdrop import Layer
 from mi_nerfattack.render.camera.intrinsics import Camera
 from mi_nerfattack.render.pathtrace.load import load_scene
-from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.posed import PosedField, move_all, offsets_of
 from mi_nerfattack.render.splats import SplatBackground
 from mi_nerfattack.rollout.function import Rollout
 from mi_nerfattack.rollout.loop import ClosedLoop
@@ -139,15 +139,12 @@ class World:
     def appearance(self) -> Appearance:
         """Return how the objects look, and where they stand."""
         textures = [grid.texture.numpy().copy() for grid in self.fields]
-        offsets = [posed.offset for posed in self.surrogate.objects]
-        return Appearance(textures, np.array(offsets).reshape(-1, 6))
+        return Appearance(textures, offsets_of(self.surrogate.objects))
 
     def show(self, appearance: Appearance) -> None:
         """Give the objects their textures and places."""
         self.set_textures(appearance.textures)
-        pairs = zip(self.surrogate.objects, appearance.offsets, strict=True)
-        for posed, offset in pairs:
-            posed.move(offset)
+        move_all(self.surrogate.objects, appearance.offsets)
 
     @property
     def renders(self) -> int:

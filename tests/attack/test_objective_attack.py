@@ -18,6 +18,7 @@ from mi_nerfattack.attack.objectives import (
 )
 from mi_nerfattack.attack.user_cost import UserCost
 from mi_nerfattack.policy.torch_policy import TorchPolicy
+from mi_nerfattack.render.posed import move_all
 from mi_nerfattack.rollout.objective import StageSum, Terminal, WeightedSum
 from mi_nerfattack.rollout.reduction import CVaR, Mean, Worst
 from mi_nerfattack.vehicle.route.route import Route
@@ -137,5 +138,5 @@ def test_what_has_no_gradient_is_told(loop):
         again = GradientAttack(rollout, toy.ROUTE, initial, freedom)
         again.load_tensors(attack.tensors())
         grid.set_parameter("texture", texture)
-        attack.move(np.zeros((1, 6)))
+        move_all(attack.sensor.objects, np.zeros((1, 6)))
         assert attack.without_gradient == again.without_gradient == expected

@@ -23,7 +23,7 @@ def test_what_is_interrupted_leaves_nothing(
     scratch.mkdir()
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
-    source, output = CUBE, folder / "a.safetensors"
+    source, output = CUBE, folder / "a.glb"
     if verb == "report":
         source, output = tmp_path / "run", folder / "a.html"
         make_run(source)

@@ -44,13 +44,14 @@ VERBS = {
     "drive": ["car", "drive", "--policy", "expert", "--simulated", "--log"],
 }
 ENDINGS = {
+    "export": "glb",
     "render": "exr",
     "report": "html",
     "view": "html",
     "check": "png",
     "drive": "mcap",
 }
-FIELDS = ("fit", "bake", "asset", "train", "retrain", "export")
+FIELDS = ("fit", "bake", "asset", "train", "retrain")
 
 
 def test_every_verb_that_writes_is_tried():

@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[2]
 FOUND = {name: findings_in(name, path) for name, path in pages().items()}
 # Pages that do not pass yet, with their number of findings; it may only fall.
 PENDING = {
-    "docs/attack.md": 89,
+    "docs/attack.md": 82,
     "docs/bench.md": 173,
     "docs/environments.md": 36,
-    "docs/faults.md": 17,
+    "docs/faults.md": 15,
     "docs/fields.md": 76,
     "docs/formats.md": 2,
     "docs/loop.md": 13,

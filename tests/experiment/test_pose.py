@@ -36,7 +36,7 @@ def test_moving_an_object_lowers_the_cost_within_its_limits():
         attack.step()
     attack.measure()
     attack.restore_best()
-    offsets = attack.offsets()[0]
+    offsets = attack.sensor.objects[0].offset
     assert attack.best_objective < attack.history[0].objective
     assert np.abs(offsets[:2]).max() == pytest.approx(0.12)
     assert not offsets[2:5].any() and 0 < abs(offsets[5]) <= 0.1 + 1e-7

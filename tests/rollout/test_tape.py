@@ -15,7 +15,7 @@ from mi_nerfattack.attack.freedom import offset_gradients
 from mi_nerfattack.deploy.surrogate.scene import field_sensor
 from mi_nerfattack.fields import GridLayout
 from mi_nerfattack.render.camera.pose import Pose
-from mi_nerfattack.render.posed import PosedField
+from mi_nerfattack.render.posed import PosedField, move_all
 from mi_nerfattack.rollout.sweep import Gradient
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -33,8 +33,7 @@ def test_products_of_the_sensor_are_those_of_the_tape(rng):
     view = old.intrinsics, old.mount
     sensor = field_sensor(old.layers[0], objects, *view, stop=0.0)
     offsets = np.concatenate([OFFSET, -0.5 * OFFSET])
-    for posed, offset in zip(sensor.objects, offsets, strict=True):
-        posed.move(offset)
+    move_all(sensor.objects, offsets)
     seen = sensor.observe(state, 0)
     layers = seen.kept.seen.layers
     both = (layers[1].opacity > 0.1) & (layers[2].opacity > 0.1)

@@ -1,8 +1,7 @@
 """What an attack steps in: the colours of an object, whatever its levels.
 
-A grid field's colour is the sigmoid of a sum over levels, so that equal steps on all of
-them add up, and colours far out on the sigmoid hardly move any more. An attack steps in
-the colours c of one level's vertices instead (sRGB), from the original ones c0::
+An attack steps in the colours c of one level's vertices (sRGB), see `VertexColours`,
+from the original ones c0::
 
     raw(level) = original raw(level) + logit(c) - logit(c0)
 
@@ -117,8 +116,10 @@ class Colours(AbstractColouring):
 
     def gradient(self, value: np.ndarray, by_texture: np.ndarray) -> np.ndarray:
         """See :meth:`AbstractColouring.gradient`."""
+        # d logit(c) = dc / (c (1 - c))
         slope = by_texture[self.level.vertices] / (value * (1 - value))
         slope = slope + self._allowed.penalty(value)[1]
+        # Binomial filter along z, y and x
         cube = slope.reshape((self.level.resolution,) * 3 + (3,))
         for _ in range(self.smoothing):
             for axis in range(3):

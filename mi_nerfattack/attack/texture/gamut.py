@@ -80,8 +80,10 @@ class Gamut:
         found = colours.copy()
         [moved] = (colours != inside).any(axis=1).nonzero()
         for some in np.array_split(moved, len(moved) // _CHUNK + 1):
+            # Signed distances to the hull's planes, positive outside
             near = inside[some] @ self._normals.T + self._offsets
             far = colours[some] @ self._normals.T + self._offsets
+            # The first plane on the way from inside
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.where(far > 0, np.maximum(-near, 0) / (far - near), 1.0)
             least = share.min(axis=1, initial=1.0)[:, None]

@@ -110,6 +110,7 @@ def disturbed(
     """
     kind, shape, value = type(image.array), image.shape, image.array
     if exposures.any() or blurs.any():
+        # Lens and shutter act on linear light
         value = dr.srgb_to_linear(value)
         if blurs.any():
             value = blur(value, shape, blurs)

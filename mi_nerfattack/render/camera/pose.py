@@ -117,6 +117,7 @@ def offset_gradient(
     Source: Chirikjian 2012, "Stochastic Models, Information Theory, and Lie Groups",
     vol. 2, section 10.6 (the left Jacobian of the rotation vector).
     """
+    # Torque about the field's origin
     torque = np.cross(matrix[:3, :3].T, by_matrix[:3, :3].T).sum(0)
     by_turn = left_jacobian(offset[3:]).T @ torque
     return np.concatenate([by_matrix[:3, 3], by_turn])
